@@ -1,0 +1,109 @@
+"""The repository's own `.venv`, made from hashed pins; standard library only.
+
+Interpreters older than the project supports must be able to run this file: they look for a newer one.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import shutil
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import NamedTuple
+
+RUNTIME = "requirements.txt"
+DEV = "requirements-dev.txt"
+
+ROOT = Path(__file__).resolve().parent.parent
+VENV = ROOT / ".venv"
+PYTHON = VENV / ("Scripts/python.exe" if os.name == "nt" else "bin/python")
+STAMP = VENV / "sovereign-netcode.stamp"
+
+
+class Step(NamedTuple):
+    title: str
+    status: int
+    seconds: float
+
+
+def ensure(requirements: str) -> Path:
+    """Return the Python of an environment that holds at least the pins of `requirements`.
+
+    The stamp is absent while a set-up is under way, so an interrupted one is started afresh,
+    whereas changed pins are installed over the old ones.
+    """
+    place, installed, digest = _read_stamp()
+    usable = place == str(ROOT) and PYTHON.exists()
+    if usable and installed == DEV:
+        requirements = DEV
+    wanted = _digest(requirements)
+    if usable and (installed, digest) == (requirements, wanted):
+        return PYTHON
+
+    base = _base_python()
+    print("setting up .venv ... ", end="", flush=True)
+    started = time.perf_counter()
+    if usable:
+        STAMP.unlink()
+    else:
+        _must(base, "-m", "venv", "--clear", str(VENV))
+    pip_install = (str(PYTHON), "-m", "pip", "--disable-pip-version-check", "install", "--quiet")
+    _must(*pip_install, "--require-hashes", "-r", requirements)
+    _must(*pip_install, "--no-deps", "--no-build-isolation", "-e", ".")
+    STAMP.write_text("\n".join((str(ROOT), requirements, wanted)), encoding="utf-8")
+    print(f"done in {time.perf_counter() - started:.0f} s", flush=True)
+    return PYTHON
+
+
+def run(title: str, *args: str) -> Step:
+    """Run the environment's Python with `args` in the repository root, its output going where ours goes."""
+    print(f"\n== {title}", flush=True)
+    started = time.perf_counter()
+    status = subprocess.run([str(PYTHON), *args], cwd=ROOT, check=False).returncode
+    return Step(title, status, time.perf_counter() - started)
+
+
+def _read_stamp() -> tuple[str, str, str]:
+    try:
+        place, requirements, digest = STAMP.read_text(encoding="utf-8").splitlines()
+    except (OSError, ValueError):
+        return "", "", ""
+    return place, requirements, digest
+
+
+def _digest(requirements: str) -> str:
+    sources = (ROOT / requirements, ROOT / "pyproject.toml")
+    return hashlib.sha256(b"\0".join(source.read_bytes() for source in sources)).hexdigest()
+
+
+def _base_python() -> str:
+    names = ("python3.11", "python3.12", "python3.13", "python3.14")
+    for candidate in (sys.executable, *filter(None, map(shutil.which, names))):
+        # A version manager's shim may be on PATH without a Python behind it: ask, do not trust the name.
+        probe = [candidate, "-c", "import sys; sys.exit(sys.version_info < (3, 11))"]
+        if subprocess.run(probe, capture_output=True, check=False).returncode == 0:
+            return candidate
+    version = ".".join(map(str, sys.version_info[:2]))
+    raise _failure(f"Python 3.11 or newer is needed: this is {version}, and PATH has no newer one")
+
+
+def _must(*command: str) -> None:
+    done = subprocess.run(
+        command,
+        cwd=ROOT,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        errors="replace",
+        check=False,
+    )
+    if done.returncode != 0:
+        raise _failure(f"failed\n{done.stdout}\nset-up of .venv failed: {' '.join(command)}")
+
+
+def _failure(message: str) -> SystemExit:
+    print(message, file=sys.stderr)
+    return SystemExit(2)

@@ -1,0 +1,1 @@
+"""The rules: one deterministic world that server and client step alike."""

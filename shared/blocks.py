@@ -1,0 +1,202 @@
+"""World segments: cubes of 32^3 blocks, dense, in one array that the kernel reads.
+
+A segment's digest is the exclusive-or over its solid blocks of a mix of place and kind. It does not depend on
+the order of edits, an edit updates it in a few operations, and two sides can compare terrain by 8 bytes.
+"""
+
+import zlib
+from collections.abc import Iterator
+from typing import TypeVar
+
+import numpy as np
+import numpy.typing as npt
+
+from shared.checks import Cell
+from shared.layout import CELLS
+from shared.units import SEGMENT, SEGMENT_SHIFT
+
+BLOCKS = SEGMENT**3
+AIR = 0
+KIND_MAX = 255
+PACKED_MAX = 48 * 1024
+"""No packed segment is longer, in bytes (noise of 256 kinds packs to 33 KB)."""
+
+_WORD = (1 << 64) - 1
+Kinds = npt.NDArray[np.uint8]
+
+
+def _mix(value: npt.NDArray[np.uint64]) -> npt.NDArray[np.uint64]:
+    """A bijection of 64 bits that looks random (the finalizer of splitmix64)."""
+    value = (value ^ (value >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+    value = (value ^ (value >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+    return value ^ (value >> np.uint64(31))
+
+
+def digest_of(kinds: Kinds) -> int:
+    """The digest of one segment ([32768] kinds): 0 for air."""
+    at = np.flatnonzero(kinds).astype(np.uint64)
+    keys = (at + np.uint64(1)) << np.uint64(8) | kinds[at].astype(np.uint64)
+    return int(np.bitwise_xor.reduce(_mix(keys))) if len(at) else 0
+
+
+def _mix_one(at: int, kind: int) -> int:
+    if kind == AIR:
+        return 0
+    value = (at + 1) << 8 | kind
+    value = (value ^ (value >> 30)) * 0xBF58476D1CE4E5B9 & _WORD
+    value = (value ^ (value >> 27)) * 0x94D049BB133111EB & _WORD
+    return value ^ (value >> 31)
+
+
+def pack(kinds: Kinds) -> bytes:
+    """One segment for the wire or the disk."""
+    return zlib.compress(kinds.tobytes(), 6)
+
+
+def unpack(data: bytes) -> Kinds:
+    """The reverse of `pack`: [32768] kinds.
+
+    Raises:
+        ValueError: `data` is not one packed segment.
+    """
+    if len(data) > PACKED_MAX:
+        raise ValueError(f"packed segment of {len(data)} bytes: longer than {PACKED_MAX}")
+    unpacker = zlib.decompressobj()
+    try:
+        raw = unpacker.decompress(data, BLOCKS + 1)
+    except zlib.error as error:
+        raise ValueError(f"packed segment: {error}") from error
+    if len(raw) != BLOCKS or not unpacker.eof or unpacker.unused_data:
+        raise ValueError("packed segment: not 32768 blocks")
+    return np.frombuffer(raw, np.uint8)
+
+
+def segment_of(x: int, y: int, z: int) -> Cell:
+    """The index of the segment that a block lies in."""
+    return x >> SEGMENT_SHIFT, y >> SEGMENT_SHIFT, z >> SEGMENT_SHIFT
+
+
+def _offset(x: int, y: int, z: int) -> int:
+    inside = SEGMENT - 1
+    return (z & inside) << 10 | (y & inside) << 5 | (x & inside)
+
+
+T = TypeVar("T", bound=np.generic)
+
+
+def grown(array: npt.NDArray[T], fill: int, length: int) -> npt.NDArray[T]:
+    """A copy with another length; what is new holds `fill`."""
+    new = np.full((length, *array.shape[1:]), fill, array.dtype)
+    kept = min(len(array), length)
+    new[:kept] = array[:kept]
+    return new
+
+
+class Blocks:
+    """The loaded segments. Rows are never reused while the world lives, except by `restore`."""
+
+    def __init__(self) -> None:
+        self.count = 0
+        self.rows: dict[Cell, int] = {}
+        self.kinds: Kinds = np.zeros((0, BLOCKS), np.uint8)
+        self.segments = np.zeros((0, 3), np.int64)
+        self.digests = np.zeros(0, np.uint64)
+        self.heads = np.full(0, -1, np.int64)
+        self.table = np.zeros(2, np.int64)
+        self.near = np.full(4, 1 << 40, np.int64)
+        self._free: list[int] = []
+
+    def __contains__(self, index: Cell) -> bool:
+        return index in self.rows
+
+    def __iter__(self) -> Iterator[Cell]:
+        return iter(self.rows)
+
+    def load(self, index: Cell, kinds: Kinds) -> bool:
+        """Adds or replaces a segment; whether the arrays had to move."""
+        moved = False
+        row = self.rows.get(index)
+        if row is None:
+            if not self._free and self.count == len(self.kinds):
+                self._grow(max(8, 2 * self.count))
+                moved = True
+            row = self._free.pop() if self._free else self.count
+            self.count = max(self.count, row + 1)
+            self.rows[index] = row
+            self.segments[row] = index
+            moved = self._enter(row) or moved
+        self.kinds[row] = kinds
+        self.digests[row] = digest_of(kinds)
+        return moved
+
+    def unload(self, index: Cell) -> None:
+        """Forgets a segment, which is solid from then on; its entities must have left or been removed."""
+        row = self.rows.pop(index)
+        self._free.append(row)
+        self.digests[row] = 0
+        self._rebuild(len(self.table))
+
+    def get(self, x: int, y: int, z: int) -> int | None:
+        """The kind of a block; None where no segment is loaded."""
+        row = self.rows.get(segment_of(x, y, z))
+        return None if row is None else int(self.kinds[row, _offset(x, y, z)])
+
+    def set(self, x: int, y: int, z: int, kind: int) -> None:
+        """Changes one block of a loaded segment."""
+        row, at = self.rows[segment_of(x, y, z)], _offset(x, y, z)
+        change = _mix_one(at, int(self.kinds[row, at])) ^ _mix_one(at, kind)
+        self.kinds[row, at] = kind
+        self.digests[row] ^= np.uint64(change)
+
+    def segment(self, index: Cell) -> Kinds:
+        """The blocks of a loaded segment, [z, y, x], read-only."""
+        view: Kinds = self.kinds[self.rows[index]].reshape(SEGMENT, SEGMENT, SEGMENT)
+        view.flags.writeable = False
+        return view
+
+    def digest(self, index: Cell) -> int:
+        """The digest of a loaded segment."""
+        return int(self.digests[self.rows[index]])
+
+    def restore(self, other: "Blocks") -> bool:
+        """Becomes equal to `other`, copying only segments that differ; whether the arrays had to move."""
+        if self.rows == other.rows and len(self.kinds) == len(other.kinds):
+            for row in np.flatnonzero(self.digests[: self.count] != other.digests[: self.count]):
+                self.kinds[row] = other.kinds[row]
+            self.digests[:] = other.digests
+            return False
+        self.count, self.rows, self._free = other.count, dict(other.rows), list(other._free)
+        for name in ("kinds", "segments", "digests", "heads", "table", "near"):
+            setattr(self, name, getattr(other, name).copy())
+        return True
+
+    def _enter(self, row: int) -> bool:
+        self.near[0] = 1 << 40
+        if 2 * (len(self.rows) + 1) > len(self.table):
+            self._rebuild(2 * len(self.table))
+            return True
+        self._insert(row)
+        return False
+
+    def _insert(self, row: int) -> None:
+        x, y, z = (int(part) for part in self.segments[row])
+        mask = len(self.table) - 1
+        at = (x * 73856093 ^ y * 19349663 ^ z * 83492791) & mask
+        while self.table[at]:
+            at = (at + 1) & mask
+        self.table[at] = row + 1
+
+    def _rebuild(self, size: int) -> None:
+        self.near[0] = 1 << 40
+        if size == len(self.table):
+            self.table[:] = 0
+        else:
+            self.table = np.zeros(size, np.int64)
+        for row in self.rows.values():
+            self._insert(row)
+
+    def _grow(self, size: int) -> None:
+        self.kinds = grown(self.kinds, 0, size)
+        self.segments = grown(self.segments, 0, size)
+        self.digests = grown(self.digests, 0, size)
+        self.heads = grown(self.heads, -1, size * CELLS)

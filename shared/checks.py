@@ -1,0 +1,62 @@
+"""Checks of values that come from people: each error names the field and the value."""
+
+import math
+from typing import Any
+
+Vec = tuple[float, float, float]
+Cell = tuple[int, int, int]
+
+
+class SceneError(ValueError):
+    """A value that no world can hold; the message names the field and the value."""
+
+
+def finite(value: object, field: str) -> float:
+    """`value` as a finite float.
+
+    Raises:
+        SceneError: not a number, NaN or infinite.
+    """
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise SceneError(f"{field} = {value!r}: must be a number")
+    if not math.isfinite(value):
+        raise SceneError(f"{field} = {value!r}: must be finite")
+    return float(value)
+
+
+def text(value: object, at: str) -> None:
+    if not isinstance(value, str) or not 1 <= len(value) <= 64:
+        raise SceneError(f"{at} = {value!r}: must be a text of 1 to 64 characters")
+
+
+def boolean(value: object, at: str) -> None:
+    if not isinstance(value, bool):
+        raise SceneError(f"{at} = {value!r}: must be true or false")
+
+
+def whole(value: object, at: str, low: int, high: int) -> int:
+    if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= high:
+        raise SceneError(f"{at} = {value!r}: must be a whole number from {low} to {high}")
+    return value
+
+
+def items(value: object, at: str) -> list[Any]:
+    if not isinstance(value, list | tuple):
+        raise SceneError(f"{at} = {value!r}: must be a list")
+    return list(value)
+
+
+def vector(value: object, at: str) -> Vec:
+    parts = items(value, at)
+    if len(parts) != 3:
+        raise SceneError(f"{at} = {value!r}: must have three numbers")
+    x, y, z = (finite(part, f"{at}.{axis}") for axis, part in zip("xyz", parts, strict=True))
+    return x, y, z
+
+
+def cell(value: object, at: str, low: int, high: int) -> Cell:
+    parts = items(value, at)
+    if len(parts) != 3:
+        raise SceneError(f"{at} = {value!r}: must have three whole numbers")
+    x, y, z = (whole(part, f"{at}.{axis}", low, high) for axis, part in zip("xyz", parts, strict=True))
+    return x, y, z

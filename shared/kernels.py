@@ -1,0 +1,40 @@
+"""One kernel source, two speeds: `PLAIN`, and `compiled()` where Numba is installed.
+
+`shared/kernel.py` is loaded a second time under another name, in which its functions are jitted; so there is
+one source, and neither instance can drift from the other.
+"""
+
+import functools
+import importlib.util
+import sys
+from types import ModuleType
+
+from shared import kernel
+
+PLAIN: ModuleType = kernel
+
+
+def available() -> bool:
+    """Whether Numba is installed, without importing it."""
+    return importlib.util.find_spec("numba") is not None
+
+
+@functools.cache
+def compiled() -> ModuleType:
+    """The compiled kernel.
+
+    Raises:
+        ImportError: Numba is not installed.
+    """
+    name = "shared.kernel_compiled"
+    spec = importlib.util.spec_from_file_location(name, kernel.__file__)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[name] = module
+    try:
+        spec.loader.exec_module(module)
+    except ImportError:
+        del sys.modules[name]
+        raise
+    return module

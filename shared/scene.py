@@ -1,0 +1,268 @@
+"""What exists in a world and by which numbers: validated, and the same on both sides by fingerprint."""
+
+import functools
+import hashlib
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields
+from pathlib import Path
+from typing import Any
+
+import msgpack
+import numpy as np
+
+from shared import layout
+from shared.checks import Cell, SceneError, Vec, boolean, cell, finite, items, text, vector, whole
+from shared.inputs import MOVE_MAX
+from shared.units import RANGE_BLOCKS, SEGMENT, SPEED, rounded, to_position, to_velocity
+
+TICK_RATE_MAX = 240
+TEMPLATES_MAX = 255
+SEGMENTS_MAX = 1 << 16
+BOX_MAX = 32.0
+"""No box is longer, in blocks."""
+INTEGRATORS = ("mean", "semi")
+
+SCENES = Path(__file__).parent / "scenes"
+
+
+@dataclass(frozen=True)
+class Template:
+    """A kind of entity. Lengths in blocks, speeds in blocks/s.
+
+    Args:
+        box_offset: displacement of the box's corner from the entity's position.
+        box_size: the sides of the box; a negative one extends the box the other way (the seed's y).
+        walk_speed: an entity of this template moves by its move intent; 0: it keeps its velocity instead.
+        jump_speed: upward speed of a jump; 0: it cannot.
+        solid: whether solid entities stop each other (and stand on each other); blocks stop all.
+    """
+
+    name: str
+    box_offset: Vec = (-0.3, -0.3, 0.0)
+    box_size: Vec = (0.6, 0.6, 1.8)
+    walk_speed: float = 0.0
+    jump_speed: float = 0.0
+    solid: bool = True
+
+    def __post_init__(self) -> None:
+        at = f"templates.{self.name}"
+        text(self.name, "templates.name")
+        offset = vector(self.box_offset, f"{at}.box_offset")
+        size = vector(self.box_size, f"{at}.box_size")
+        for axis, offset_k, size_k in zip("xyz", offset, size, strict=True):
+            if to_position(size_k, f"{at}.box_size.{axis}") == 0:
+                raise SceneError(f"{at}.box_size.{axis} = {size_k!r}: must not be zero")
+            if abs(size_k) > BOX_MAX or abs(offset_k) > BOX_MAX:
+                raise SceneError(f"{at}.box: {axis} reaches further than {BOX_MAX:g} blocks")
+        for name in ("walk_speed", "jump_speed"):
+            if to_velocity(getattr(self, name), f"{at}.{name}") < 0:
+                raise SceneError(f"{at}.{name} = {getattr(self, name)!r}: must not be negative")
+        boolean(self.solid, f"{at}.solid")
+        object.__setattr__(self, "box_offset", offset)
+        object.__setattr__(self, "box_size", size)
+
+    def row(self) -> list[int]:
+        """The row of `layout.Arrays.templates`: the box normalised to its low corner and positive sides."""
+        low, sides = [], []
+        for axis, offset, size in zip("xyz", self.box_offset, self.box_size, strict=True):
+            ends = sorted((to_position(offset, axis), to_position(offset, axis) + to_position(size, axis)))
+            low.append(ends[0])
+            sides.append(ends[1] - ends[0])
+        return [*low, *sides, self.solid, self.walk_speed > 0, to_velocity(self.jump_speed, "jump_speed")]
+
+
+@dataclass(frozen=True)
+class Scene:
+    """The rules and the extent of a world. What is switched off costs nothing.
+
+    Args:
+        tick_rate: ticks per second, 1 to 240.
+        gravity: downward acceleration in blocks/s^2; 0: there is no gravity (nor support, nor jumps).
+        terminal_speed: the fastest fall, in blocks/s.
+        integrator: "mean" moves by the mean of the old and the new fall speed (exact for constant acceleration),
+            "semi" by the new one (the seed's rule).
+        entity_collision: whether solid entities stop each other.
+        size: the extent of the world in segments of 32 blocks; (0, 0, 0) has its low corner at `origin`.
+        origin: index of the lowest segment.
+        terrain: the generator's name under "generator", and its parameters.
+        spawns: where players appear, in turn.
+        player: the name of the template of players.
+    """
+
+    name: str
+    templates: tuple[Template, ...] = (Template("player", walk_speed=3.0, jump_speed=8.0),)
+    tick_rate: int = 32
+    gravity: float = 18.0
+    terminal_speed: float = 16.0
+    integrator: str = "mean"
+    entity_collision: bool = True
+    size: Cell = (4, 4, 1)
+    origin: Cell = (0, 0, 0)
+    terrain: Mapping[str, Any] = field(default_factory=lambda: {"generator": "flat"})
+    spawns: tuple[Vec, ...] = ((64.0, 64.0, 8.0),)
+    player: str = "player"
+
+    def __post_init__(self) -> None:
+        text(self.name, "name")
+        whole(self.tick_rate, "tick_rate", 1, TICK_RATE_MAX)
+        for name in ("gravity", "terminal_speed"):
+            if finite(getattr(self, name), name) < 0:
+                raise SceneError(f"{name} = {getattr(self, name)!r}: must not be negative")
+        to_velocity(self.terminal_speed, "terminal_speed")
+        to_velocity(self.gravity / self.tick_rate, "gravity")
+        if self.gravity > 0 and rounded(self.gravity * SPEED / self.tick_rate) == 0:
+            raise SceneError(f"gravity = {self.gravity!r}: vanishes in one tick; 0 switches it off")
+        if self.gravity > 0 and self.terminal_speed == 0:
+            raise SceneError("terminal_speed = 0: nothing could fall; set gravity = 0 instead")
+        if self.integrator not in INTEGRATORS:
+            raise SceneError(f"integrator = {self.integrator!r}: must be one of {', '.join(INTEGRATORS)}")
+        boolean(self.entity_collision, "entity_collision")
+        object.__setattr__(self, "size", cell(self.size, "size", 1, SEGMENTS_MAX))
+        limit = RANGE_BLOCKS // SEGMENT
+        object.__setattr__(self, "origin", cell(self.origin, "origin", -limit, limit - 1))
+        if self.size[0] * self.size[1] * self.size[2] > SEGMENTS_MAX:
+            raise SceneError(f"size = {self.size}: more than {SEGMENTS_MAX} segments")
+        terrain: object = self.terrain
+        if not isinstance(terrain, Mapping) or not isinstance(terrain.get("generator"), str):
+            raise SceneError(f"terrain = {self.terrain!r}: must be a table with a generator")
+        if not self.spawns or not isinstance(self.spawns, list | tuple):
+            raise SceneError(f"spawns = {self.spawns!r}: must list at least one position")
+        spawns = tuple(vector(spawn, f"spawns[{i}]") for i, spawn in enumerate(self.spawns))
+        for i, spawn in enumerate(spawns):
+            for axis, value in zip("xyz", spawn, strict=True):
+                to_position(value, f"spawns[{i}].{axis}")
+        object.__setattr__(self, "spawns", spawns)
+        if not 1 <= len(self.templates) <= TEMPLATES_MAX:
+            raise SceneError(f"templates: {len(self.templates)} of them; must be 1 to {TEMPLATES_MAX}")
+        object.__setattr__(self, "templates", tuple(self.templates))
+        names = [template.name for template in self.templates]
+        if len(set(names)) < len(names):
+            raise SceneError(f"templates: two have the same name ({', '.join(names)})")
+        if self.player not in names:
+            raise SceneError(f"player = {self.player!r}: no such template (there are {', '.join(names)})")
+
+    @classmethod
+    def from_table(cls, table: Mapping[str, Any]) -> "Scene":
+        """A scene from what TOML or the wire gives.
+
+        Raises:
+            SceneError: a field is unknown, missing or out of range; the message names it.
+        """
+        known = {f.name for f in fields(cls)}
+        for key in table:
+            if key not in known:
+                raise SceneError(f"{key}: no such field (there are {', '.join(sorted(known))})")
+        if "name" not in table:
+            raise SceneError("name: missing")
+        values = dict(table)
+        if "templates" in values:
+            values["templates"] = tuple(_template(entry) for entry in items(values["templates"], "templates"))
+        if "spawns" in values:
+            values["spawns"] = tuple(items(values["spawns"], "spawns"))
+        return cls(**values)
+
+    def to_table(self) -> dict[str, Any]:
+        """The reverse of `from_table`: plain lists, tables, strings and numbers."""
+        table = {f.name: _plain(getattr(self, f.name)) for f in fields(self)}
+        table["templates"] = [
+            {f.name: _plain(getattr(entry, f.name)) for f in fields(entry)} for entry in self.templates
+        ]
+        return table
+
+    @functools.cached_property
+    def fingerprint(self) -> bytes:
+        """16 bytes: two sides with the same one compute the same world."""
+        return hashlib.blake2b(msgpack.packb(_sorted(self.to_table())), digest_size=16).digest()
+
+    @functools.cached_property
+    def index_of(self) -> dict[str, int]:
+        """Template names to their numbers."""
+        return {template.name: i for i, template in enumerate(self.templates)}
+
+    def segments(self) -> list[Cell]:
+        """The index of every segment of the world, in ascending order of z, y, x."""
+        (ox, oy, oz), (nx, ny, nz) = self.origin, self.size
+        return [(ox + x, oy + y, oz + z) for z in range(nz) for y in range(ny) for x in range(nx)]
+
+    def differences(self, other: "Scene") -> list[str]:
+        """The names of the fields in which two scenes differ."""
+        mine, theirs = self.to_table(), other.to_table()
+        return [name for name in mine if mine[name] != theirs[name]]
+
+    def kernel_tables(self) -> tuple[layout.Int64s, layout.Int64s, layout.Int64s]:
+        """Templates, walk velocities and parameters as `layout.Arrays` wants them, each rounded once."""
+        templates = np.array([template.row() for template in self.templates], np.int64)
+        walk = np.array(
+            [
+                [rounded(t.walk_speed * SPEED * move / MOVE_MAX) for move in range(-MOVE_MAX, MOVE_MAX + 1)]
+                for t in self.templates
+            ],
+            np.int64,
+        )
+        p = np.zeros(layout.PARAMETERS, np.int64)
+        p[layout.GRAVITY] = rounded(self.gravity * SPEED / self.tick_rate)
+        p[layout.TERMINAL] = to_velocity(self.terminal_speed, "terminal_speed")
+        p[layout.RATE] = self.tick_rate
+        p[layout.EXACT] = 128 // self.tick_rate if 128 % self.tick_rate == 0 else 0
+        p[layout.MEAN] = self.integrator == "mean"
+        p[layout.PAIRS] = self.entity_collision
+        p[layout.FLOOR] = self.origin[2] * SEGMENT
+        low, high = templates[:, :3], templates[:, :3] + templates[:, 3:6]
+        p[layout.REACH_LO : layout.REACH_LO + 3] = (-low).max(axis=0)
+        p[layout.REACH_HI : layout.REACH_HI + 3] = high.max(axis=0)
+        return templates, walk, p
+
+
+def load_scene(name_or_path: str) -> Scene:
+    """A scene that comes with the package, by name, or any other by the path of its TOML file.
+
+    Raises:
+        SceneError: there is no such scene, or its file is broken; the message says where.
+    """
+    path = SCENES / f"{name_or_path}.toml"
+    if not path.is_file():
+        path = Path(name_or_path)
+    try:
+        table = tomllib.loads(path.read_text("utf-8"))
+    except (OSError, UnicodeDecodeError) as error:
+        names = ", ".join(sorted(file.stem for file in SCENES.glob("*.toml")))
+        raise SceneError(f"scene {name_or_path!r}: cannot be read ({error}); built in are {names}") from error
+    except tomllib.TOMLDecodeError as error:
+        raise SceneError(f"scene {path}: not valid TOML ({error})") from error
+    try:
+        return Scene.from_table({"name": path.stem} | table)
+    except SceneError as error:
+        raise SceneError(f"scene {path}: {error}") from error
+
+
+def _template(entry: object) -> Template:
+    if not isinstance(entry, Mapping):
+        raise SceneError(f"templates: {entry!r} must be a table")
+    known = {f.name for f in fields(Template)}
+    for key in entry:
+        if key not in known:
+            raise SceneError(f"templates.{key}: no such field (there are {', '.join(sorted(known))})")
+    if "name" not in entry:
+        raise SceneError("templates.name: missing")
+    return Template(**entry)
+
+
+def _plain(value: Any) -> Any:
+    """Lists for tuples, tables for mappings, all the way down."""
+    if isinstance(value, Mapping):
+        return {key: _plain(value[key]) for key in value}
+    if isinstance(value, list | tuple):
+        return [_plain(part) for part in value]
+    return value
+
+
+def _sorted(value: Any) -> Any:
+    """Tables with their keys in order, and whole floats as floats: 18 and 18.0 are one number."""
+    if isinstance(value, Mapping):
+        return {key: _sorted(value[key]) for key in sorted(value)}
+    if isinstance(value, list):
+        return [_sorted(part) for part in value]
+    if isinstance(value, int) and not isinstance(value, bool):
+        return float(value)
+    return value

@@ -1,0 +1,467 @@
+"""A world: blocks, entities and a tick, and the one function that takes it to the next.
+
+    world = World(load_scene("hills"))
+    world.load_terrain()
+    player = world.spawn("player", (64, 64, 30))
+    world.step({player: make_input(1, 0, jump=True)})
+
+The world changes only here: by the methods below between ticks, and by `step`. Two worlds of one scene that
+are told the same in the same order have the same `state_hash()` at every tick, on every machine, compiled or not.
+"""
+
+import hashlib
+import struct
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+import numpy as np
+
+from shared import blocks, kernels, layout, terrain
+from shared.checks import Cell, SceneError
+from shared.inputs import Input
+from shared.layout import ENTITY, FALLING, FLAGS, ID, NEXT, PREV, TEMPLATE, VX, Arrays, X
+from shared.scene import Scene
+from shared.units import BLOCK, SEGMENT, SPEED, to_position, to_velocity
+
+STATES = layout.CELL
+"""Columns of an entity's state: id, template, flags, x, y, z, vx, vy, vz, move_x, move_y, buttons."""
+ID_MAX = (1 << 31) - 1
+
+
+class OverlapError(SceneError):
+    """A place is taken: by a block, or by a solid entity."""
+
+
+class World:
+    """All of a scene's state at one tick.
+
+    Args:
+        scene: the rules.
+        compiled: run the kernel compiled by Numba; None: where Numba is installed.
+    """
+
+    def __init__(self, scene: Scene, *, compiled: bool | None = None) -> None:
+        self.scene = scene
+        self.tick = 0
+        self.blocks = blocks.Blocks()
+        self.compiled = kernels.available() if compiled is None else compiled
+        self._kernel: Any = kernels.compiled() if self.compiled else kernels.PLAIN
+        self._templates, self._walk, self._parameters = scene.kernel_tables()
+        self._row_of: dict[int, int] = {}
+        self._next_id = 1
+        self._rows = 0  # rows ever used
+        self._free: list[int] = []
+        self._limbo: list[int] = []  # freed since the last step: still in the kernel's lists
+        self._lengths = np.zeros(layout.LENGTHS, np.int64)
+        self._box = np.zeros(6, np.int64)
+        self._inputs = np.zeros((8, 4), np.int64)
+        self._entities = np.zeros((0, len(layout.COLUMNS)), np.int64)
+        self._awake = self._next_awake = self._woken = self._later = np.zeros(0, np.int64)
+        self._changed = self._fell = np.zeros(0, np.int64)
+        self._allocate(8)
+        self._bind()
+
+    # -- reading -------------------------------------------------------------------------------------------
+
+    def __len__(self) -> int:
+        return len(self._row_of)
+
+    def __contains__(self, entity: int) -> bool:
+        return entity in self._row_of
+
+    @property
+    def entities(self) -> np.ndarray[Any, np.dtype[Any]]:
+        """Every entity as a structured array (`layout.ENTITY`, grid steps), in ascending order of id. A copy."""
+        return self.rows(sorted(self._row_of)).view(ENTITY).reshape(-1)
+
+    def rows(self, entities: Iterable[int]) -> layout.Int64s:
+        """Some entities as an int64 matrix [n, 16] in the order asked for (columns as in `layout`). A copy.
+
+        Raises:
+            KeyError: there is no such entity.
+        """
+        return self._entities[[self._row_of[entity] for entity in entities]]
+
+    def state(self, entity: int) -> tuple[int, ...]:
+        """The whole state of one entity as 12 whole numbers (the columns before `cell`).
+
+        Raises:
+            KeyError: there is no such entity.
+        """
+        state = self._entities[self._row_of[entity], :STATES].copy()
+        state[FLAGS] &= FALLING
+        return tuple(state.tolist())
+
+    def position(self, entity: int) -> tuple[float, float, float]:
+        """Where an entity is, in blocks."""
+        x, y, z = self._entities[self._row_of[entity], X : X + 3].tolist()
+        return x / BLOCK, y / BLOCK, z / BLOCK
+
+    def velocity(self, entity: int) -> tuple[float, float, float]:
+        """How fast an entity is, in blocks/s."""
+        x, y, z = self._entities[self._row_of[entity], VX : VX + 3].tolist()
+        return x / SPEED, y / SPEED, z / SPEED
+
+    def falling(self, entity: int) -> bool:
+        """Whether the gravity flag of an entity is up."""
+        return bool(self._entities[self._row_of[entity], FLAGS] & FALLING)
+
+    def awake(self, entity: int) -> bool:
+        """Whether an entity will have a turn in the next tick without an input."""
+        return bool(self._entities[self._row_of[entity], FLAGS] & layout.AWAKE)
+
+    @property
+    def awake_count(self) -> int:
+        """How many entities have a turn in the next tick."""
+        return int(self._lengths[layout.N_AWAKE] + self._lengths[layout.N_WOKEN])
+
+    @property
+    def changed(self) -> layout.Int64s:
+        """The entities whose state the latest step changed, [n, 16]. A copy."""
+        return self._entities[self._changed[: self._lengths[layout.N_CHANGED]]]
+
+    @property
+    def fell(self) -> list[int]:
+        """The entities that the latest step left below the scene's floor."""
+        return [int(entity) for entity in self._fell[: self._lengths[layout.N_FELL]]]
+
+    def in_segment(self, index: Cell) -> layout.Int64s:
+        """The entities whose position lies in a loaded segment, [n, 16], ascending by id. A copy."""
+        row = self.blocks.rows[index]
+        found: list[int] = []
+        heads = self.blocks.heads[row * layout.CELLS : (row + 1) * layout.CELLS]
+        for head in heads[heads >= 0].tolist():
+            while head >= 0:
+                found.append(head)
+                head = int(self._entities[head, NEXT])
+        rows = self._entities[found]
+        return rows[np.argsort(rows[:, ID])]
+
+    def state_hash(self, entities: Iterable[int] | None = None) -> bytes:
+        """16 bytes over the tick, all blocks and all entities (or just some, and then no blocks)."""
+        digest = hashlib.blake2b(struct.pack("<q", self.tick), digest_size=16)
+        if entities is None:
+            entities = self._row_of
+            for index in sorted(self.blocks):
+                digest.update(struct.pack("<qqqQ", *index, self.blocks.digest(index)))
+        states = self.rows(sorted(entities))[:, :STATES]
+        states[:, FLAGS] &= FALLING
+        digest.update(states.astype("<i8").tobytes())
+        return digest.digest()
+
+    # -- blocks --------------------------------------------------------------------------------------------
+
+    def load_terrain(self, indices: Iterable[Cell] | None = None) -> None:
+        """Generates segments by the scene's generator (all of the scene's by default)."""
+        for index in self.scene.segments() if indices is None else indices:
+            self.load_segment(index, terrain.generate(self.scene.terrain, index))
+
+    def load_segment(self, index: Cell, kinds: blocks.Kinds) -> None:
+        """Adds or replaces a segment ([32768] kinds) and wakes what may stand on it or have waited for it."""
+        if self.blocks.load(index, kinds):
+            self._bind()
+        if self._lengths[layout.N_HOMELESS]:
+            self._kernel.relink_range(self._arrays, 0, self._rows)
+        low = [part * SEGMENT * BLOCK for part in index]
+        self._kernel.wake_in(self._arrays, *low, *(part + SEGMENT * BLOCK for part in low))
+
+    def unload_segment(self, index: Cell) -> None:
+        """Forgets a segment; it is solid from then on.
+
+        Raises:
+            OverlapError: entities are still in it.
+        """
+        if len(self.in_segment(index)):
+            raise OverlapError(f"segment {index}: entities are in it")
+        self.blocks.unload(index)
+
+    def set_block(self, x: int, y: int, z: int, kind: int) -> bool:
+        """Places (kind 1 to 255) or removes (0) a block; whether anything changed.
+
+        Raises:
+            OverlapError: a solid entity is there.
+            SceneError: not a kind, or no segment is loaded there.
+        """
+        return self.fill((x, y, z), (x + 1, y + 1, z + 1), kind) > 0
+
+    def fill(self, low: Cell, high: Cell, kind: int) -> int:
+        """Sets every block of the box between two corners (`high` excluded), or none; how many changed.
+
+        Raises:
+            OverlapError: a solid entity is in the way.
+            SceneError: not a kind, or no segment is loaded there.
+        """
+        if not 0 <= kind <= blocks.KIND_MAX:
+            raise SceneError(f"kind = {kind!r}: must be 0 to {blocks.KIND_MAX}")
+        cells = [
+            (x, y, z) for z in range(low[2], high[2]) for y in range(low[1], high[1]) for x in range(low[0], high[0])
+        ]
+        for cell in cells:
+            if blocks.segment_of(*cell) not in self.blocks:
+                raise SceneError(f"block {cell}: its segment is not loaded")
+        if kind != blocks.AIR and cells:
+            corners = [part * BLOCK for part in (*low, *high)]
+            in_the_way = self._overlapping(-1, corners)
+            if in_the_way:
+                raise OverlapError(f"blocks {low} to {high}: entity {in_the_way[0]} is there")
+        changed = 0
+        for x, y, z in cells:
+            before = self.blocks.get(x, y, z)
+            if before == kind:
+                continue
+            self.blocks.set(x, y, z, kind)
+            changed += 1
+            if kind == blocks.AIR:
+                face = (x * BLOCK, y * BLOCK, (x + 1) * BLOCK, (y + 1) * BLOCK, (z + 1) * BLOCK)
+                self._kernel.wake_on(self._arrays, -1, *face)
+        return changed
+
+    # -- entities ------------------------------------------------------------------------------------------
+
+    def spawn(
+        self,
+        template: str,
+        position: tuple[float, float, float],
+        velocity: tuple[float, float, float] = (0.0, 0.0, 0.0),
+        *,
+        push: bool = False,
+    ) -> int:
+        """Adds an entity and returns its id; ids ascend and are never used again.
+
+        Args:
+            template: its name in the scene.
+            position: in blocks, rounded to the grid.
+            velocity: in blocks/s, rounded to the grid.
+            push: if the place is taken, use the nearest free one, at most a block away along one axis.
+
+        Raises:
+            OverlapError: the place is taken (and, with `push`, so is everything near).
+            SceneError: a value is not finite or out of range, or there is no such template.
+        """
+        kind = self._template(template)
+        at = self._free_place(-1, kind, position, push)
+        speed = _velocity(velocity)
+        if self._next_id > ID_MAX:
+            raise SceneError("ids: used up")
+        entity = self._next_id
+        self.put([(entity, kind, FALLING if speed[2] > 0 else 0, *at, *speed, 0, 0, 0)])
+        return entity
+
+    def place(self, entity: int, position: tuple[float, float, float], *, push: bool = False) -> None:
+        """Teleports an entity, which keeps its velocity. Raises as `spawn` does, and `KeyError`."""
+        row = self._row_of[entity]
+        state = list(self.state(entity))
+        state[X : X + 3] = self._free_place(row, state[TEMPLATE], position, push)
+        self._leave(row)
+        self.put([tuple(state)])
+
+    def set_velocity(self, entity: int, velocity: tuple[float, float, float]) -> None:
+        """Throws an entity, in blocks/s; upwards raises its gravity flag. Raises as `spawn` does, and `KeyError`."""
+        state = list(self.state(entity))
+        state[VX : VX + 3] = _velocity(velocity)
+        if state[VX + 2] > 0:
+            state[FLAGS] = FALLING
+        self.put([tuple(state)])
+
+    def set_template(self, entity: int, template: str) -> None:
+        """Changes what an entity is, and so its box. Raises as `spawn` does, and `KeyError`."""
+        row = self._row_of[entity]
+        state = list(self.state(entity))
+        state[TEMPLATE] = self._template(template)
+        box = self._box_at(state[TEMPLATE], state[X : X + 3])
+        if self._taken(row, state[TEMPLATE], box):
+            raise OverlapError(f"entity {entity}: no room for the box of {template!r}")
+        self._leave(row)
+        self.put([tuple(state)])
+
+    def remove(self, entity: int) -> None:
+        """Takes an entity out of the world and wakes what stood on it.
+
+        Raises:
+            KeyError: there is no such entity.
+        """
+        row = self._row_of.pop(entity)
+        self._leave(row)
+        self._kernel.unlink(self._arrays, row)
+        self._lengths[layout.N_HOMELESS] -= 1
+        self._entities[row, ID] = 0
+        (self._limbo if self._entities[row, FLAGS] & layout.AWAKE else self._free).append(row)
+
+    def put(self, states: Iterable[tuple[int, ...]] | layout.Int64s) -> None:
+        """Writes whole states ([n, 12], as `state` gives them), new or known: what a snapshot says, verbatim."""
+        new = np.array(states if isinstance(states, np.ndarray) else list(states), np.int64).reshape(-1, STATES)
+        rows = np.array([self._row(entity) for entity in new[:, ID].tolist()], np.int64)
+        self._kernel.store(self._arrays, self._lent(rows), self._lent(new), len(rows), self.tick)
+
+    # -- time ----------------------------------------------------------------------------------------------
+
+    def step(self, inputs: Mapping[int, Input] | None = None) -> None:
+        """One tick: `inputs` by entity id; an entity without one goes on with its latest.
+
+        Raises:
+            KeyError: an input for an entity that does not exist.
+        """
+        n = len(inputs) if inputs else 0
+        if inputs:
+            if n > len(self._inputs):
+                self._inputs = np.zeros((2 * n, 4), np.int64)
+            self._inputs[:n] = [(self._row_of[entity], *wish) for entity, wish in inputs.items()]
+        self.tick += 1
+        self._kernel.step(self._arrays, self._lent(self._inputs), n, self.tick)
+        if self._limbo:
+            self._free += self._limbo
+            self._limbo.clear()
+
+    def copy(self) -> "World":
+        """Another world in the same state."""
+        other = World(self.scene, compiled=self.compiled)
+        other.restore(self)
+        return other
+
+    def restore(self, other: "World") -> None:
+        """Becomes equal to `other`, a world of the same scene; cheap where little differs."""
+        if len(self._entities) != len(other._entities):
+            self._allocate(len(other._entities))
+        else:
+            cells = self._entities[: self._rows, layout.CELL]
+            self.blocks.heads[cells[cells >= 0]] = -1
+        self.tick, self._next_id, self._rows = other.tick, other._next_id, other._rows
+        self._row_of, self._free, self._limbo = dict(other._row_of), list(other._free), list(other._limbo)
+        n = self._rows
+        self._entities[:n] = other._entities[:n]
+        self._entities[n:, ID] = 0
+        self._lengths[:] = other._lengths
+        for name, length in (("_awake", layout.N_AWAKE), ("_woken", layout.N_WOKEN)):
+            count = int(self._lengths[length])
+            getattr(self, name)[:count] = getattr(other, name)[:count]
+        self._lengths[layout.N_CHANGED] = self._lengths[layout.N_FELL] = 0
+        self.blocks.restore(other.blocks)
+        rows = self._entities[:n]
+        first = np.flatnonzero((rows[:, layout.CELL] >= 0) & (rows[:, PREV] < 0) & (rows[:, ID] != 0))
+        self.blocks.heads[rows[first, layout.CELL]] = first
+        self._bind()
+
+    # -- inside --------------------------------------------------------------------------------------------
+
+    def _allocate(self, rows: int) -> None:
+        """Makes room for this many entities, keeping those there are."""
+        self._entities = blocks.grown(self._entities, 0, rows)
+        for name in ("_awake", "_next_awake", "_woken", "_later", "_changed", "_fell"):
+            setattr(self, name, blocks.grown(getattr(self, name), 0, rows + 1))
+        self._candidates = np.zeros((rows + 1, 7), np.int64)
+
+    def _bind(self) -> None:
+        """Hands the kernel the arrays as they lie now."""
+        b = self.blocks
+        arrays: tuple[np.ndarray[Any, Any], ...] = (
+            self._entities, self._templates, self._walk, self._parameters, b.kinds, b.segments, b.table, b.heads,
+            self._awake, self._next_awake, self._woken, self._later, self._candidates, self._changed, self._fell,
+            self._lengths, b.near, self._box,
+        )  # fmt: skip
+        self._arrays = Arrays(*(self._lent(array) for array in arrays))
+
+    def _lent(self, array: np.ndarray[Any, Any]) -> Any:
+        """An array as the kernel wants it: memoryviews give the plain source Python's own whole numbers."""
+        return array if self.compiled else memoryview(array)  # type: ignore[arg-type]
+
+    def _row(self, entity: int) -> int:
+        """The row of an entity, a new one if it is not known."""
+        row = self._row_of.get(entity)
+        if row is None:
+            if self._free:
+                row = self._free.pop()
+            else:
+                row = self._rows
+                if row == len(self._entities):
+                    self._allocate(2 * row)
+                    self._bind()
+                self._rows += 1
+            self._entities[row] = 0
+            self._entities[row, layout.CELL] = -1
+            self._lengths[layout.N_HOMELESS] += 1
+            self._row_of[entity] = row
+            self._next_id = max(self._next_id, entity + 1)
+        return row
+
+    def _template(self, name: str) -> int:
+        kind = self.scene.index_of.get(name)
+        if kind is None:
+            raise SceneError(f"template = {name!r}: no such template (there are {', '.join(self.scene.index_of)})")
+        return kind
+
+    def _box_at(self, kind: int, position: Iterable[int]) -> list[int]:
+        """Low and high corner of a template's box at a position."""
+        row = self._templates[kind].tolist()
+        low = [part + row[layout.LO_X + k] for k, part in enumerate(position)]
+        return low + [part + row[layout.SIZE_X + k] for k, part in enumerate(low)]
+
+    def _overlapping(self, but: int, box: list[int]) -> list[int]:
+        """The ids of the solid entities that overlap a box, ascending (`but`: a row left out, or -1)."""
+        near = self._candidates[: self._kernel.gather(self._arrays, but, True, *box)]
+        low, high = np.array(box[:3]), np.array(box[3:])
+        hits = (near[:, :3] < high).all(axis=1) & (near[:, 3:6] > low).all(axis=1)
+        return sorted(self._entities[near[hits, 6], ID].tolist())
+
+    def _taken(self, row: int, kind: int, box: list[int]) -> bool:
+        if self._kernel.blocks_in(self._arrays, *box):
+            return True
+        return self._meets(kind) and bool(self._overlapping(row, box))
+
+    def _meets(self, kind: int) -> bool:
+        """Whether entities of a template are stopped by solid entities."""
+        return bool(self._parameters[layout.PAIRS] and self._templates[kind, layout.SOLID])
+
+    def _free_place(self, row: int, kind: int, position: Iterable[float], push: bool) -> list[int]:
+        parts = tuple(position)
+        if len(parts) != 3:
+            raise SceneError(f"position = {position!r}: must have three numbers")
+        at = [to_position(part, f"position.{axis}") for axis, part in zip("xyz", parts, strict=True)]
+        if not self._taken(row, kind, self._box_at(kind, at)):
+            return at
+        pushed = [moved for axis, sign in PUSHES if (moved := self._pushed(row, kind, at, axis, sign)) is not None]
+        if not push or not pushed:
+            near = " nor within a block of it" if push else ""
+            raise OverlapError(f"position = {parts}: no room for a {self.scene.templates[kind].name!r} there{near}")
+        return min(pushed, key=lambda moved: sum(abs(a - b) for a, b in zip(moved, at, strict=True)))
+
+    def _pushed(self, row: int, kind: int, at: list[int], axis: int, sign: int) -> list[int] | None:
+        """The nearest free position along one axis, at most a block away."""
+        start = self._box_at(kind, at)
+        stops = self._stops(row, kind, start, axis, sign)
+        for stop in stops:
+            distance = (stop - start[axis]) if sign > 0 else (start[axis + 3] - stop)
+            if not 0 < distance <= BLOCK:
+                continue
+            moved = list(at)
+            moved[axis] += sign * distance
+            if not self._taken(row, kind, self._box_at(kind, moved)):
+                return moved
+        return None
+
+    def _stops(self, row: int, kind: int, box: list[int], axis: int, sign: int) -> list[int]:
+        """The faces within a block that a pushed box could come to rest against, nearest first."""
+        face = box[axis] if sign > 0 else box[axis + 3]
+        first = -(-face // BLOCK) if sign > 0 else face // BLOCK
+        faces = [first * BLOCK, (first + sign) * BLOCK]
+        if self._meets(kind):
+            reach = list(box)
+            reach[axis + 3 if sign > 0 else axis] += sign * BLOCK
+            near = self._candidates[: self._kernel.gather(self._arrays, row, True, *reach)]
+            faces += near[:, axis + 3 if sign > 0 else axis].tolist()
+        return sorted(set(faces), reverse=sign < 0)
+
+    def _leave(self, row: int) -> None:
+        """Wakes what stands on an entity that is about to go or to change."""
+        box = self._box_at(int(self._entities[row, TEMPLATE]), self._entities[row, X : X + 3].tolist())
+        self._kernel.wake_on(self._arrays, row, box[0], box[1], box[3], box[4], box[5])
+
+
+PUSHES = ((2, 1), (0, -1), (0, 1), (1, -1), (1, 1), (2, -1))
+"""Where an overlapping box is pushed, in the order of preference at equal distance: axis and sign."""
+
+
+def _velocity(velocity: Iterable[float]) -> list[int]:
+    parts = tuple(velocity)
+    if len(parts) != 3:
+        raise SceneError(f"velocity = {velocity!r}: must have three numbers")
+    return [to_velocity(part, f"velocity.{axis}") for axis, part in zip("xyz", parts, strict=True)]
