@@ -44,8 +44,7 @@ from shared.layout import (
     N_CHANGED,
     N_FELL,
     N_HOMELESS,
-    N_LATER,
-    N_WOKEN,
+    N_LATER, N_STEPPED, N_WOKEN,
     NEXT,
     PAIRS,
     PREV,
@@ -494,7 +493,10 @@ def turn(w: Arrays, row: int, key: int, tick: int) -> bool:
 
 @inlined
 def mark(w: Arrays, row: int, tick: int) -> None:
-    """Notes that the state of an entity changed in this tick."""
+    """Notes that the state of an entity changed in this tick, or before its step."""
+    if w.lengths[N_STEPPED] != 0:
+        w.lengths[N_STEPPED] = 0
+        w.lengths[N_CHANGED] = 0
     if w.entities[row, CHANGED] != tick:
         w.entities[row, CHANGED] = tick
         w.changed[w.lengths[N_CHANGED]] = row
@@ -508,7 +510,9 @@ def mark(w: Arrays, row: int, tick: int) -> None:
 def step(w: Arrays, inputs: Any, n_inputs: int, tick: int) -> None:
     """One tick. `inputs`: [n, 4] row, move_x, move_y, buttons; an entity without one keeps its latest."""
     e, n = w.entities, w.lengths
-    n[N_CHANGED] = 0
+    if n[N_STEPPED] != 0:
+        n[N_CHANGED] = 0
+    n[N_STEPPED] = 0
     n[N_FELL] = 0
     for i in range(n_inputs):
         row = inputs[i, 0]
@@ -544,6 +548,7 @@ def step(w: Arrays, inputs: Any, n_inputs: int, tick: int) -> None:
         push(w.woken, i, w.later[i])
     n[N_WOKEN] = n[N_LATER]
     n[N_LATER] = 0
+    n[N_STEPPED] = 1
 
 
 # -- rows written from outside -------------------------------------------------------------------------------
@@ -551,7 +556,7 @@ def step(w: Arrays, inputs: Any, n_inputs: int, tick: int) -> None:
 
 @jit
 def store(w: Arrays, rows: Any, states: Any, n: int, tick: int) -> None:
-    """Writes `n` whole states ([n, 12], the state columns) into rows, and wakes them."""
+    """Writes `n` whole states ([n, 12], the state columns) into rows ahead of `tick`, and wakes them."""
     e = w.entities
     for i in range(n):
         row = rows[i]
@@ -559,6 +564,6 @@ def store(w: Arrays, rows: Any, states: Any, n: int, tick: int) -> None:
         for k in range(CELL):
             e[row, k] = states[i, k]
         e[row, FLAGS] |= awake
-        e[row, CHANGED] = tick
+        mark(w, row, tick)
         relink(w, row)
         wake(w, row, -1)

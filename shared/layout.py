@@ -33,8 +33,8 @@ REACH_LO, REACH_HI = 7, 10  # how far any box reaches below and above its positi
 PARAMETERS = 13
 
 # Lengths of the lists that the kernel keeps.
-N_AWAKE, N_WOKEN, N_CHANGED, N_FELL, N_LATER, N_HOMELESS = range(6)
-LENGTHS = 6
+N_AWAKE, N_WOKEN, N_CHANGED, N_FELL, N_LATER, N_HOMELESS, N_STEPPED = range(7)
+LENGTHS = 7
 
 CELL_SHIFT = 2
 """A cell of the entity index is a cube of 4 blocks; a segment has 8 x 8 x 8 of them."""
@@ -61,6 +61,6 @@ class Arrays(NamedTuple):
     candidates: Any  # [rows + 1, 7] row and box of the entities near the one whose turn it is
     changed: Any  # [rows + 1] rows whose state the step changed
     fell: Any  # [rows + 1] ids below the scene's floor
-    lengths: Any  # [6], N_HOMELESS counts the entities that are in no cell
+    lengths: Any  # [7]; N_HOMELESS counts the entities in no cell, N_STEPPED says nothing changed since a step
     near: Any  # [4] the segment looked up last: index and row
     box: Any  # [6] low and high corner of the box whose turn it is

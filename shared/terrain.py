@@ -66,7 +66,8 @@ GENERATORS: dict[str, Generator] = {"flat": flat, "hills": hills, "boxes": boxes
 
 def _columns(segment: Cell) -> tuple[Ints, Ints]:
     """World x and y of every column of a segment, [y, x]."""
-    y, x = np.indices((SEGMENT, SEGMENT), np.int64)
+    at: Ints = np.indices((SEGMENT, SEGMENT))
+    y, x = at
     return x + segment[0] * SEGMENT, y + segment[1] * SEGMENT
 
 

@@ -117,8 +117,9 @@ class World:
 
     @property
     def changed(self) -> layout.Int64s:
-        """The entities whose state the latest step changed, [n, 16]. A copy."""
-        return self._entities[self._changed[: self._lengths[layout.N_CHANGED]]]
+        """The entities that the latest step changed, or that were written since the one before it, [n, 16]. A copy."""
+        rows = self._entities[self._changed[: self._lengths[layout.N_CHANGED]]]
+        return rows[rows[:, ID] != 0]
 
     @property
     def fell(self) -> list[int]:
@@ -291,7 +292,7 @@ class World:
         """Writes whole states ([n, 12], as `state` gives them), new or known: what a snapshot says, verbatim."""
         new = np.array(states if isinstance(states, np.ndarray) else list(states), np.int64).reshape(-1, STATES)
         rows = np.array([self._row(entity) for entity in new[:, ID].tolist()], np.int64)
-        self._kernel.store(self._arrays, self._lent(rows), self._lent(new), len(rows), self.tick)
+        self._kernel.store(self._arrays, self._lent(rows), self._lent(new), len(rows), self.tick + 1)
 
     # -- time ----------------------------------------------------------------------------------------------
 
