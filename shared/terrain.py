@@ -66,9 +66,9 @@ GENERATORS: dict[str, Generator] = {"flat": flat, "hills": hills, "boxes": boxes
 
 def _columns(segment: Cell) -> tuple[Ints, Ints]:
     """World x and y of every column of a segment, [y, x]."""
-    at: Ints = np.indices((SEGMENT, SEGMENT))
-    y, x = at
-    return x + segment[0] * SEGMENT, y + segment[1] * SEGMENT
+    at = np.arange(SEGMENT, dtype=np.int64)
+    x, y = np.meshgrid(at + segment[0] * SEGMENT, at + segment[1] * SEGMENT)
+    return x, y
 
 
 def _ground(segment: Cell, height: Ints) -> Kinds:

@@ -118,8 +118,9 @@ class World:
     @property
     def changed(self) -> layout.Int64s:
         """The entities that the latest step changed, or that were written since the one before it, [n, 16]. A copy."""
-        rows = self._entities[self._changed[: self._lengths[layout.N_CHANGED]]]
-        return rows[rows[:, ID] != 0]
+        rows: layout.Int64s = self._entities[self._changed[: self._lengths[layout.N_CHANGED]]]
+        alive: layout.Int64s = rows[rows[:, ID] != 0]
+        return alive
 
     @property
     def fell(self) -> list[int]:
