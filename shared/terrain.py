@@ -82,11 +82,15 @@ def _noise(x: Ints, y: Ints, scale: int, seed: int) -> Ints:
     """Value noise in -4096..4096, smooth between lattice points `scale` blocks apart."""
     i, j = x // scale, y // scale
     # Position within the lattice square in 1/4096, eased by t^2 (3 - 2t).
-    u, v = ((part % scale) * 4096 // scale for part in (x, y))
-    u, v = (t * t // 4096 * (3 * 4096 - 2 * t) // 4096 for t in (u, v))
+    u, v = _eased(x % scale, scale), _eased(y % scale, scale)
     south = _lattice(i, j, seed) * (4096 - u) + _lattice(i + 1, j, seed) * u
     north = _lattice(i, j + 1, seed) * (4096 - u) + _lattice(i + 1, j + 1, seed) * u
-    return (south // 4096 * (4096 - v) + north // 4096 * v) // 4096
+    return ((south >> 12) * (4096 - v) + (north >> 12) * v) >> 12
+
+
+def _eased(t: Ints, scale: int) -> Ints:
+    t = (t << 12) // scale
+    return (t * t >> 12) * (3 * 4096 - 2 * t) >> 12
 
 
 def _lattice(i: Ints, j: Ints, seed: int) -> Ints:
