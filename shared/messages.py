@@ -1,0 +1,240 @@
+"""The wire: every message there is, drawn.
+
+A message is one binary WebSocket message: a MessagePack array `[kind, field, ...]`. Whatever is numerous
+travels as packed little-endian records in a MessagePack `bin`.
+
+    client -> server                                     server -> client
+      1 Hello    version scene name                        17 Welcome   version tick entity scene
+      2 Inputs   first acked rows                          18 Snapshot  tick newest margins first fates drops segment*
+      3 Ping     sent                                      19 Terrain   x y z tick packed
+      4 Bye      code reason wait                          20 Pong      sent tick
+                                                            4 Bye       code reason wait
+
+    Inputs.rows    n * [i8 move_x, i8 move_y, u8 buttons], for the ticks first, first + 1, ...
+    Snapshot       the state at the end of `tick`; how early the client's inputs came (margins, n * i16 in 1/256
+                   tick, for the ticks up to `newest`); what became of those from `first` on (fates, n * u8); which
+                   segments it no longer sees (drops, n * [i32 x, y, z]); then each segment in which anything
+                   changed (`shared.snapshot`).
+    Pong.tick      the server's time in ticks when it answered: 17.25 is a quarter of a tick after tick 17.
+
+`decode(any bytes)` gives a message whose every field has been checked, or raises `ProtocolError`.
+"""
+
+import math
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import msgpack
+
+from shared.blocks import PACKED_MAX
+
+VERSION = 1
+
+MESSAGE_MAX = 256 * 1024
+"""No message of the server is longer, in bytes."""
+CLIENT_MESSAGE_MAX = 8 * 1024
+"""No message of a client is longer, in bytes."""
+INPUT_ROWS_MAX = 64
+INPUT_ROW_BYTES = 3
+NAME_MAX = 32
+SCENE_FIELDS_MAX = 32
+REASON_MAX = 500
+FATES_MAX = 256
+DROPS_MAX = 4096
+SEGMENTS_MAX = 1024
+TICK_MAX = (1 << 53) - 1
+ENTITY_MAX = (1 << 31) - 1
+
+# The fate of an input, as the server tells it for each tick.
+USED, REPEATED, NEUTRALISED, IDLE = range(4)
+"""USED: the client's own input of that tick. REPEATED: it was missing, the latest to arrive was used again.
+NEUTRALISED: missing for so long that the entity stood still. IDLE: the client had not begun."""
+REPEATS_MAX = 10
+"""A missing input is repeated at most so many ticks."""
+AHEAD_MAX = 64
+"""An input for more than so many ticks from now is refused."""
+MARGIN_ONE = 256
+"""A margin of one tick."""
+MARGIN_REFUSED = -(1 << 15)
+"""Stands for the margin of an input that was refused."""
+
+# Close codes.
+GOING_AWAY, PROTOCOL, TEXT, TOO_BIG, INTERNAL = 1001, 1002, 1003, 1009, 1011
+WRONG_VERSION, WRONG_SCENE, MALFORMED, FULL, TOO_SLOW, NO_HELLO = range(4001, 4007)
+
+
+class ProtocolError(ValueError):
+    """The peer sent something that is not a message; the text says what."""
+
+
+class Hello(NamedTuple):
+    """A client introduces itself. `scene`: digests of the scene it was built for; empty: it takes the server's."""
+
+    version: int
+    scene: dict[str, bytes]
+    name: str
+
+
+class Inputs(NamedTuple):
+    """Inputs for consecutive ticks, and the newest snapshot the client has applied."""
+
+    first: int
+    acked: int
+    rows: bytes
+
+
+class Ping(NamedTuple):
+    """Asks for the server's time; `sent` is any number of the client's and comes back."""
+
+    sent: float
+
+
+class Bye(NamedTuple):
+    """Goes before the connection closes. `wait`: come back in so many seconds; negative: do not."""
+
+    code: int
+    reason: str
+    wait: float
+
+
+class Welcome(NamedTuple):
+    """The client is in: its entity and the rules."""
+
+    version: int
+    tick: int
+    entity: int
+    scene: dict[str, Any]
+
+
+class Snapshot(NamedTuple):
+    """The world at the end of `tick`, as far as it changed for this client since the one before.
+
+    `newest` is the highest tick that an input has come for, -1 before the first.
+    """
+
+    tick: int
+    newest: int
+    margins: bytes
+    first: int
+    fates: bytes
+    drops: bytes
+    segments: tuple[list[Any], ...]
+
+
+class Terrain(NamedTuple):
+    """All blocks of one segment as they are at the end of `tick`."""
+
+    x: int
+    y: int
+    z: int
+    tick: int
+    packed: bytes
+
+
+class Pong(NamedTuple):
+    """The server's time in ticks."""
+
+    sent: float
+    tick: float
+
+
+Message = Hello | Inputs | Ping | Bye | Welcome | Snapshot | Terrain | Pong
+Check = Callable[[Any], bool]
+
+
+def _whole(low: int, high: int) -> Check:
+    return lambda value: type(value) is int and low <= value <= high
+
+
+def _bytes(longest: int, of: int = 1) -> Check:
+    return lambda value: type(value) is bytes and len(value) <= longest and len(value) % of == 0
+
+
+def _text(longest: int) -> Check:
+    return lambda value: type(value) is str and len(value) <= longest
+
+
+def _finite(value: Any) -> bool:
+    return type(value) in (int, float) and math.isfinite(value)
+
+
+def _digests(value: Any) -> bool:
+    return (
+        type(value) is dict
+        and len(value) <= SCENE_FIELDS_MAX
+        and all(type(name) is str and type(digest) is bytes and len(digest) <= 8 for name, digest in value.items())
+    )
+
+
+_tick = _whole(-1, TICK_MAX)
+_segment = _whole(-(1 << 23), (1 << 23) - 1)
+
+KINDS: dict[int, tuple[type[Any], tuple[Check, ...]]] = {
+    1: (Hello, (_whole(0, 1 << 31), _digests, _text(NAME_MAX))),
+    2: (Inputs, (_whole(0, TICK_MAX), _tick, _bytes(INPUT_ROWS_MAX * INPUT_ROW_BYTES, INPUT_ROW_BYTES))),
+    3: (Ping, (_finite,)),
+    4: (Bye, (_whole(0, 4999), _text(REASON_MAX), _finite)),
+    17: (
+        Welcome,
+        (_whole(0, 1 << 31), _tick, _whole(1, ENTITY_MAX), lambda value: type(value) is dict),
+    ),
+    18: (
+        Snapshot,
+        (_tick, _tick, _bytes(FATES_MAX * 2, 2), _tick, _bytes(FATES_MAX), _bytes(DROPS_MAX * 12, 12)),
+    ),
+    19: (Terrain, (_segment, _segment, _segment, _tick, _bytes(PACKED_MAX))),
+    20: (Pong, (_finite, _finite)),
+}
+CLIENT_KINDS = frozenset({1, 2, 3, 4})
+SERVER_KINDS = frozenset({4, 17, 18, 19, 20})
+_KIND_OF = {kind: number for number, (kind, _) in KINDS.items()}
+_SNAPSHOT = _KIND_OF[Snapshot]
+
+
+def encode(message: Message) -> bytes:
+    """One message as bytes."""
+    kind = _KIND_OF[type(message)]
+    fields = (*message[:-1], *message.segments) if isinstance(message, Snapshot) else message
+    return msgpack.packb((kind, *fields))  # type: ignore[no-any-return]
+
+
+def join_snapshot(header: tuple[int, int, bytes, int, bytes, bytes], segments: list[bytes]) -> bytes:
+    """A snapshot from its first six fields and segments that are encoded already (shared by many clients)."""
+    n = 1 + len(header) + len(segments)
+    return b"".join((b"\xdc" + n.to_bytes(2, "big"), *map(msgpack.packb, (_SNAPSHOT, *header)), *segments))
+
+
+def decode(data: bytes, kinds: frozenset[int], longest: int) -> Message:
+    """The message in `data`, which must be one of `kinds` and at most `longest` bytes.
+
+    Raises:
+        ProtocolError: for anything else, whatever the bytes are.
+    """
+    if len(data) > longest:
+        raise ProtocolError(f"message of {len(data)} bytes: longer than {longest}")
+    try:
+        parts = msgpack.unpackb(data, use_list=True, strict_map_key=True)
+    except Exception as error:  # msgpack raises some ten kinds for bytes that are not MessagePack
+        raise ProtocolError(f"not MessagePack ({type(error).__name__})") from error
+    if type(parts) is not list or not parts or type(parts[0]) is not int or parts[0] not in kinds:
+        raise ProtocolError("not a message of this side")
+    kind, checks = KINDS[parts[0]]
+    values = parts[1:]
+    if kind is Snapshot and len(checks) <= len(values) <= len(checks) + SEGMENTS_MAX:
+        values[len(checks) :] = [tuple(values[len(checks) :])]
+    elif len(values) != len(checks):
+        raise ProtocolError(f"{kind.__name__}: {len(values)} fields instead of {len(checks)}")
+    for name, value, check in zip(kind._fields, values, checks, strict=False):
+        if not check(value):
+            raise ProtocolError(f"{kind.__name__}.{name} = {str(value)[:40]}: not allowed")
+    return kind(*values)  # type: ignore[no-any-return]
+
+
+def decode_from_client(data: bytes) -> Message:
+    """What a server may receive. Raises `ProtocolError`."""
+    return decode(data, CLIENT_KINDS, CLIENT_MESSAGE_MAX)
+
+
+def decode_from_server(data: bytes) -> Message:
+    """What a client may receive. Raises `ProtocolError`."""
+    return decode(data, SERVER_KINDS, MESSAGE_MAX)
