@@ -96,12 +96,12 @@ class Blocks:
     """The loaded segments. Rows are never reused while the world lives, except by `restore`."""
 
     def __init__(self) -> None:
-        self.count = 0
+        self.count = 1  # row 0 is layout.NOWHERE
         self.rows: dict[Cell, int] = {}
-        self.kinds: Kinds = np.zeros((0, BLOCKS), np.uint8)
-        self.segments = np.zeros((0, 3), np.int64)
-        self.digests = np.zeros(0, np.uint64)
-        self.heads = np.full(0, -1, np.int64)
+        self.kinds: Kinds = np.zeros((1, BLOCKS), np.uint8)
+        self.segments = np.zeros((1, 3), np.int64)
+        self.digests = np.zeros(1, np.uint64)
+        self.heads = np.full(CELLS, -1, np.int64)
         self.table = np.zeros(2, np.int64)
         self.near = np.full(4, 1 << 40, np.int64)
         self._free: list[int] = []

@@ -48,6 +48,7 @@ from shared.layout import (
     N_STEPPED,
     N_WOKEN,
     NEXT,
+    NOWHERE,
     PAIRS,
     PREV,
     RATE,
@@ -151,13 +152,14 @@ def gather(w: Arrays, but: int, solid: bool, x0: int, y0: int, z0: int, x1: int,
     for cz in range((z0 - p[REACH_HI + 2]) >> shift, ((z1 + p[REACH_LO + 2]) >> shift) + 1):
         for cy in range((y0 - p[REACH_HI + 1]) >> shift, ((y1 + p[REACH_LO + 1]) >> shift) + 1):
             for cx in range((x0 - p[REACH_HI]) >> shift, ((x1 + p[REACH_LO]) >> shift) + 1):
-                segment = segment_row(w, cx >> 3, cy >> 3, cz >> 3)
-                if segment < 0:
-                    continue
+                segment = max(segment_row(w, cx >> 3, cy >> 3, cz >> 3), NOWHERE)
                 row = w.heads[segment * CELLS + ((cz & 7) << 6 | (cy & 7) << 3 | (cx & 7))]
                 while row >= 0:
                     kind = e[row, TEMPLATE]
-                    if row != but and (not solid or t[kind, SOLID] != 0):
+                    here = segment != NOWHERE or (
+                        e[row, X] >> shift == cx and e[row, Y] >> shift == cy and e[row, Z] >> shift == cz
+                    )
+                    if here and row != but and (not solid or t[kind, SOLID] != 0):
                         x = e[row, X] + t[kind, LO_X]
                         y = e[row, Y] + t[kind, LO_X + 1]
                         z = e[row, Z] + t[kind, LO_X + 2]
@@ -186,9 +188,7 @@ def cell_of(w: Arrays, row: int) -> int:
     x = e[row, X] >> (BLOCK_SHIFT + CELL_SHIFT)
     y = e[row, Y] >> (BLOCK_SHIFT + CELL_SHIFT)
     z = e[row, Z] >> (BLOCK_SHIFT + CELL_SHIFT)
-    segment = segment_row(w, x >> 3, y >> 3, z >> 3)
-    if segment < 0:
-        return -1
+    segment = max(segment_row(w, x >> 3, y >> 3, z >> 3), NOWHERE)
     return segment * CELLS + ((z & 7) << 6 | (y & 7) << 3 | (x & 7))
 
 
@@ -207,7 +207,8 @@ def unlink(w: Arrays, row: int) -> None:
     if after >= 0:
         e[after, PREV] = before
     e[row, CELL] = -1
-    w.lengths[N_HOMELESS] += 1
+    if cell < CELLS:
+        w.lengths[N_HOMELESS] -= 1
 
 
 @jit
@@ -218,8 +219,6 @@ def relink(w: Arrays, row: int) -> None:
     if cell == e[row, CELL]:
         return
     unlink(w, row)
-    if cell < 0:
-        return
     first = w.heads[cell]
     e[row, CELL] = cell
     e[row, PREV] = -1
@@ -227,7 +226,8 @@ def relink(w: Arrays, row: int) -> None:
     if first >= 0:
         e[first, PREV] = row
     w.heads[cell] = row
-    w.lengths[N_HOMELESS] -= 1
+    if cell < CELLS:
+        w.lengths[N_HOMELESS] += 1
 
 
 @jit

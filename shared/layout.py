@@ -39,6 +39,8 @@ LENGTHS = 7
 CELL_SHIFT = 2
 """A cell of the entity index is a cube of 4 blocks; a segment has 8 x 8 x 8 of them."""
 CELLS = 512
+NOWHERE = 0
+"""The segment row whose cells hold the entities of all segments that are not loaded: they are still obstacles."""
 
 Int64s = npt.NDArray[np.int64]
 
@@ -61,6 +63,6 @@ class Arrays(NamedTuple):
     candidates: Any  # [rows + 1, 7] row and box of the entities near the one whose turn it is
     changed: Any  # [rows + 1] rows whose state the step changed
     fell: Any  # [rows + 1] ids below the scene's floor
-    lengths: Any  # [7]; N_HOMELESS counts the entities in no cell, N_STEPPED says nothing changed since a step
+    lengths: Any  # [7]; N_HOMELESS counts the entities nowhere, N_STEPPED says nothing changed since a step
     near: Any  # [4] the segment looked up last: index and row
     box: Any  # [6] low and high corner of the box whose turn it is

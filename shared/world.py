@@ -82,6 +82,14 @@ class World:
         """
         return self._entities[[self._row_of[entity] for entity in entities]]
 
+    def states(self) -> layout.Int64s:
+        """The whole states of all entities, [n, 12], ascending by id: equal worlds have equal ones. A copy."""
+        rows: layout.Int64s = self._entities[: self._rows, :STATES]
+        rows = rows[rows[:, ID] != 0]
+        rows = rows[np.argsort(rows[:, ID])]
+        rows[:, FLAGS] &= FALLING
+        return rows
+
     def state(self, entity: int) -> tuple[int, ...]:
         """The whole state of one entity as 12 whole numbers (the columns before `cell`).
 
@@ -285,7 +293,6 @@ class World:
         row = self._row_of.pop(entity)
         self._leave(row)
         self._kernel.unlink(self._arrays, row)
-        self._lengths[layout.N_HOMELESS] -= 1
         self._entities[row, ID] = 0
         (self._limbo if self._entities[row, FLAGS] & layout.AWAKE else self._free).append(row)
 
@@ -294,6 +301,31 @@ class World:
         new = np.array(states if isinstance(states, np.ndarray) else list(states), np.int64).reshape(-1, STATES)
         rows = np.array([self._row(entity) for entity in new[:, ID].tolist()], np.int64)
         self._kernel.store(self._arrays, self._lent(rows), self._lent(new), len(rows), self.tick + 1)
+
+    def write_blocks(self, segment: Cell, offsets: Iterable[int], kinds: Iterable[int]) -> None:
+        """Changes blocks of a loaded segment (by index z << 10 | y << 5 | x): what a snapshot says, verbatim."""
+        for at, kind in zip(offsets, kinds, strict=True):
+            x, y, z = (
+                part * SEGMENT + ((at >> shift) & (SEGMENT - 1))
+                for part, shift in zip(segment, (0, 5, 10), strict=True)
+            )
+            self.blocks.set(x, y, z, kind)
+            self._kernel.wake_on(
+                self._arrays, -1, x * BLOCK, y * BLOCK, (x + 1) * BLOCK, (y + 1) * BLOCK, (z + 1) * BLOCK
+            )
+
+    def rebase(self, tick: int) -> None:
+        """Declares what has been written to be the world at the end of `tick`, without a step."""
+        self.tick = tick
+        self._lengths[layout.N_CHANGED] = self._lengths[layout.N_FELL] = 0
+        if self._limbo:
+            for name, length in (("_awake", layout.N_AWAKE), ("_woken", layout.N_WOKEN)):
+                keys = getattr(self, name)[: self._lengths[length]]
+                alive = np.sort(keys[self._entities[keys & 0xFFFFFFFF, ID] == keys >> 32])
+                getattr(self, name)[: len(alive)] = alive
+                self._lengths[length] = len(alive)
+            self._free += self._limbo
+            self._limbo.clear()
 
     # -- time ----------------------------------------------------------------------------------------------
 
@@ -322,21 +354,19 @@ class World:
 
     def restore(self, other: "World") -> None:
         """Becomes equal to `other`, a world of the same scene; cheap where little differs."""
+        cells = self._entities[: self._rows, layout.CELL]
+        self.blocks.heads[cells[cells >= 0]] = -1
         if len(self._entities) != len(other._entities):
             self._allocate(len(other._entities))
-        else:
-            cells = self._entities[: self._rows, layout.CELL]
-            self.blocks.heads[cells[cells >= 0]] = -1
         self.tick, self._next_id, self._rows = other.tick, other._next_id, other._rows
         self._row_of, self._free, self._limbo = dict(other._row_of), list(other._free), list(other._limbo)
         n = self._rows
         self._entities[:n] = other._entities[:n]
         self._entities[n:, ID] = 0
         self._lengths[:] = other._lengths
-        for name, length in (("_awake", layout.N_AWAKE), ("_woken", layout.N_WOKEN)):
+        for name, length in LISTS:
             count = int(self._lengths[length])
             getattr(self, name)[:count] = getattr(other, name)[:count]
-        self._lengths[layout.N_CHANGED] = self._lengths[layout.N_FELL] = 0
         self.blocks.restore(other.blocks)
         rows = self._entities[:n]
         first = np.flatnonzero((rows[:, layout.CELL] >= 0) & (rows[:, PREV] < 0) & (rows[:, ID] != 0))
@@ -380,7 +410,6 @@ class World:
                 self._rows += 1
             self._entities[row] = 0
             self._entities[row, layout.CELL] = -1
-            self._lengths[layout.N_HOMELESS] += 1
             self._row_of[entity] = row
             self._next_id = max(self._next_id, entity + 1)
         return row
@@ -457,6 +486,11 @@ class World:
         box = self._box_at(int(self._entities[row, TEMPLATE]), self._entities[row, X : X + 3].tolist())
         self._kernel.wake_on(self._arrays, row, box[0], box[1], box[3], box[4], box[5])
 
+
+LISTS = (
+    ("_awake", layout.N_AWAKE), ("_woken", layout.N_WOKEN), ("_changed", layout.N_CHANGED), ("_fell", layout.N_FELL),
+)  # fmt: skip
+"""What a world lists between two steps, and where the length of each list is kept."""
 
 PUSHES = ((2, 1), (0, -1), (0, 1), (1, -1), (1, 1), (2, -1))
 """Where an overlapping box is pushed, in the order of preference at equal distance: axis and sign."""

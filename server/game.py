@@ -1,0 +1,337 @@
+"""The authoritative game: external events are filed, the tick acts.
+
+Theory of operation. Whatever arrives is checked and filed with its session; the world changes in `tick` and
+nowhere else, in the order in which that function reads. A tick never waits for a client: each is sent the newest
+snapshot if its link has room for one, and otherwise nothing (it gets the union of what it missed with the next).
+A peer's mistake closes its connection with a code and a reason; no input of a peer raises.
+"""
+
+import dataclasses
+from collections.abc import Iterator
+from itertools import count
+from typing import Any
+
+import numpy as np
+
+from server import interest
+from server.limits import Limits
+from server.replication import KEYFRAME, ChangeLog
+from server.session import Link, Session
+from shared import messages
+from shared.inputs import Input
+from shared.messages import Bye, Hello, Inputs, Ping, Pong, ProtocolError, Welcome, decode_from_client, encode
+from shared.scene import Scene
+from shared.world import OverlapError, World
+
+SPAWN_RINGS = 24
+"""Where a spawn is taken, others are tried in rings around it, two blocks apart."""
+
+
+@dataclasses.dataclass
+class Counters:
+    """What has happened since the start."""
+
+    joined: int = 0
+    left: int = 0
+    refused: int = 0
+    malformed: int = 0
+    kicked: int = 0
+    inputs_used: int = 0
+    inputs_late: int = 0
+    inputs_substituted: int = 0
+    inputs_refused: int = 0
+    snapshots_sent: int = 0
+    snapshots_skipped: int = 0
+    snapshot_bytes: int = 0
+    terrain_bytes: int = 0
+    fell_out: int = 0
+
+
+class Game:
+    """One world and its clients.
+
+    Args:
+        scene: the rules; its terrain is generated at once.
+        limits: bounds.
+        compiled: as for `World`.
+    """
+
+    def __init__(self, scene: Scene, *, limits: Limits | None = None, compiled: bool | None = None) -> None:
+        self.scene = scene
+        self.limits = limits or Limits()
+        self.world = World(scene, compiled=compiled)
+        self.world.load_terrain()
+        self.log = ChangeLog(self.world)
+        self.counters = Counters()
+        self.sessions: list[Session] = []
+        self._numbers = count(1)
+        self._leaving: list[Session] = []
+        self._respawn: list[int] = []
+        self._deadline = 0.0
+        self._spawned = 0
+
+    # -- what arrives is filed -----------------------------------------------------------------------------
+
+    def open(self, link: Link, now: float) -> Session:
+        """A connection is there; its client has to say hello."""
+        session = Session(next(self._numbers), link, now)
+        self.sessions.append(session)
+        if len(self.sessions) > self.limits.clients_max:
+            self._refuse(session, messages.FULL, f"the server is full ({self.limits.clients_max} clients)")
+        return session
+
+    def receive(self, session: Session, data: bytes, now: float) -> None:
+        """One message of a client."""
+        if session.closed:
+            return
+        session.heard = now
+        session.allowance -= 1
+        if session.allowance < -32 * self.limits.messages_per_tick:
+            self._kick(session, messages.MALFORMED, "too many messages")
+            return
+        try:
+            message = decode_from_client(data)
+        except ProtocolError as error:
+            self.counters.malformed += 1
+            self._kick(session, messages.MALFORMED, str(error))
+            return
+        if isinstance(message, Inputs) and session.entity:
+            session.inputs.file(message, self.world.tick, self._ticks_left(now))
+            session.acked = max(session.acked, min(message.acked, session.tick))
+        elif isinstance(message, Ping):
+            tick = self.world.tick + 1 - self._ticks_left(now)
+            session.link.send(encode(Pong(message.sent, tick)))
+        elif isinstance(message, Hello) and not session.entity and not session.joining:
+            self._hello(session, message)
+        elif isinstance(message, Bye):
+            session.close(messages.GOING_AWAY, "goodbye")
+        else:
+            self._kick(session, messages.MALFORMED, f"{type(message).__name__} at this point")
+
+    def lost(self, session: Session, now: float) -> None:
+        """The connection of a session is gone."""
+        session.closed = True
+        if session in self.sessions:
+            self.sessions.remove(session)
+            self._leaving.append(session)
+
+    def shut_down(self, reason: str, wait: float) -> None:
+        """Tells every client, with the seconds after which to come back, and closes the connections."""
+        for session in self.sessions:
+            if not session.closed:
+                session.link.send(encode(Bye(messages.GOING_AWAY, reason, wait)))
+                session.close(messages.GOING_AWAY, reason)
+
+    # -- the tick acts -------------------------------------------------------------------------------------
+
+    def tick(self, deadline: float, now: float) -> None:
+        """One tick. `deadline`: the time it was due, by the same clock as `now`; it ends tick T at `deadline`."""
+        self._deadline = deadline
+        self._leave()
+        self._join()
+        self._revive()
+        inputs = self._take_inputs()
+        self.world.step(inputs)
+        self.log.record()
+        self._fell_out()
+        self._send(now)
+        self._check_clocks(now)
+
+    def _leave(self) -> None:
+        for session in self._leaving:
+            if session.entity:
+                self.counters.left += 1
+                self.world.remove(session.entity)
+                self.log.note_removal(session.entity)
+            queue = session.inputs
+            self.counters.inputs_used += queue.used
+            self.counters.inputs_late += queue.late
+            self.counters.inputs_refused += queue.refused
+            self.counters.inputs_substituted += queue.substituted
+        self._leaving.clear()
+
+    def _join(self) -> None:
+        for session in self.sessions:
+            if not session.joining or session.closed:
+                continue
+            session.joining = False
+            entity = self._spawn()
+            if entity is None:
+                self._refuse(session, messages.FULL, "no room to spawn")
+                continue
+            session.entity = entity
+            self.counters.joined += 1
+            welcome = Welcome(messages.VERSION, self.world.tick, entity, self.scene.to_table())
+            session.link.send(encode(welcome))
+
+    def _revive(self) -> None:
+        for entity in self._respawn:
+            if entity in self.world:
+                self._to_spawn(entity)
+        self._respawn.clear()
+
+    def _take_inputs(self) -> dict[int, Input]:
+        tick = self.world.tick + 1
+        return {session.entity: session.inputs.take(tick) for session in self.sessions if session.entity}
+
+    def _fell_out(self) -> None:
+        """Who is below the floor comes back at a spawn, in the next tick."""
+        self._respawn = self.world.fell
+        self.counters.fell_out += len(self._respawn)
+
+    def _send(self, now: float) -> None:
+        for session in self.sessions:
+            session.allowance = min(session.allowance + self.limits.messages_per_tick, 0.0)
+            if not session.entity or session.closed:
+                continue
+            self._look_around(session)
+            on_the_way = session.link.outstanding()
+            if on_the_way > max(self.limits.gate_bytes, 2 * session.snapshot_bytes):
+                session.skipped += 1
+                self.counters.snapshots_skipped += 1
+                continue
+            session.sent_at = now
+            self._send_snapshot(session)
+            self._send_terrain(session)
+
+    def _look_around(self, session: Session) -> None:
+        centre = self.log.segment(session.entity)
+        if centre == session.centre:
+            return
+        session.centre = centre
+        exists = self.world.blocks.__contains__
+        added, dropped = interest.update(session.sees, centre, self.limits.see_radius, self.limits.keep_radius, exists)
+        session.sees.difference_update(dropped)
+        session.fresh.difference_update(dropped)
+        session.drops += dropped
+        session.terrain_due = type(session.terrain_due)(s for s in session.terrain_due if s in session.sees)
+        session.sees.update(added)
+        session.fresh.update(added)
+        session.terrain_due.extend(segment for segment in added if exists(segment))
+
+    def _send_snapshot(self, session: Session) -> None:
+        tick, inputs = self.world.tick, session.inputs
+        changed = self.log.changed_segments(session.tick) if session.tick >= 0 else set()
+        if changed is None:  # too far behind to catch up: everything anew
+            session.fresh.update(session.sees)
+            session.terrain_due.extend(s for s in session.sees if s in self.world.blocks)
+            changed = set()
+        parts = [self.log.part(segment, KEYFRAME) for segment in session.fresh]
+        parts += [
+            self.log.part(segment, session.tick)
+            for segment in changed
+            if segment in session.sees and segment not in session.fresh
+        ]
+        margins = np.array(inputs.margins, "<i2").tobytes()
+        drops = np.array(session.drops, "<i4").tobytes()
+        header = (tick, inputs.newest, margins, tick - len(inputs.fates) + 1, bytes(inputs.fates), drops)
+        message = messages.join_snapshot(header, parts)
+        session.link.send(message)
+        session.tick = tick
+        session.snapshot_bytes = len(message)
+        session.fresh.clear()
+        session.drops.clear()
+        inputs.told()
+        self.counters.snapshots_sent += 1
+        self.counters.snapshot_bytes += len(message)
+
+    def _send_terrain(self, session: Session) -> None:
+        budget = self.limits.terrain_bytes_per_tick
+        while session.terrain_due and budget > 0:
+            message = self.log.terrain(session.terrain_due.popleft())
+            session.link.send(message)
+            budget -= len(message)
+            self.counters.terrain_bytes += len(message)
+
+    def _check_clocks(self, now: float) -> None:
+        for session in self.sessions:
+            if session.closed:
+                continue
+            if not session.entity:
+                if now - session.opened > self.limits.hello_s:
+                    self._kick(session, messages.NO_HELLO, f"no hello within {self.limits.hello_s:g} s")
+            elif now - session.heard > self.limits.silence_s:
+                self._kick(session, messages.TOO_SLOW, f"nothing heard for {self.limits.silence_s:g} s")
+            elif now - session.sent_at > self.limits.stalled_s:
+                self._kick(session, messages.TOO_SLOW, f"nothing read for {self.limits.stalled_s:g} s")
+
+    # -- inside --------------------------------------------------------------------------------------------
+
+    def _ticks_left(self, now: float) -> float:
+        """Ticks until the next tick's deadline."""
+        return 1.0 - (now - self._deadline) * self.scene.tick_rate
+
+    def _hello(self, session: Session, hello: Hello) -> None:
+        if hello.version != messages.VERSION:
+            reason = f"protocol version {hello.version}: this server speaks {messages.VERSION}"
+            self._refuse(session, messages.WRONG_VERSION, reason)
+            return
+        mine = self.scene.digests
+        differ = sorted(name for name in mine | hello.scene if mine.get(name) != hello.scene.get(name))
+        if hello.scene and differ:
+            reason = f"another scene: {', '.join(name[:40] for name in differ)} differ(s)"
+            self._refuse(session, messages.WRONG_SCENE, reason)
+            return
+        session.name = hello.name
+        session.joining = True
+
+    def _refuse(self, session: Session, code: int, reason: str) -> None:
+        self.counters.refused += 1
+        self._end(session, code, reason)
+
+    def _kick(self, session: Session, code: int, reason: str) -> None:
+        self.counters.kicked += 1
+        self._end(session, code, reason)
+
+    def _end(self, session: Session, code: int, reason: str) -> None:
+        reason = reason[: messages.REASON_MAX]
+        session.link.send(encode(Bye(code, reason, -1.0)))
+        session.close(code, reason)
+
+    def _spawn(self) -> int | None:
+        for place in self._places():
+            try:
+                return self.world.spawn(self.scene.player, place, push=True)
+            except OverlapError:
+                continue
+        return None
+
+    def _to_spawn(self, entity: int) -> None:
+        for place in self._places():
+            try:
+                self.world.place(entity, place, push=True)
+                self.world.set_velocity(entity, (0.0, 0.0, 0.0))
+            except OverlapError:
+                continue
+            return
+
+    def _places(self) -> Iterator[Vec]:
+        """Where to try to spawn: the scene's spawns in turn, then ever wider around one of them."""
+        self._spawned += 1
+        spawns = self.scene.spawns
+        turn = self._spawned % len(spawns)
+        yield from spawns[turn:] + spawns[:turn]
+        x, y, z = spawns[turn]
+        for ring in range(1, SPAWN_RINGS):
+            for i in range(-ring, ring + 1):
+                for j in range(-ring, ring + 1):
+                    if max(abs(i), abs(j)) == ring:
+                        yield x + 2 * i, y + 2 * j, z
+
+    def stats(self) -> dict[str, Any]:
+        """Counters, with those of the clients that are connected."""
+        totals = dataclasses.asdict(self.counters)
+        for session in self.sessions:
+            queue = session.inputs
+            totals["inputs_used"] += queue.used
+            totals["inputs_late"] += queue.late
+            totals["inputs_refused"] += queue.refused
+            totals["inputs_substituted"] += queue.substituted
+        return totals | {
+            "tick": self.world.tick,
+            "tick_rate": self.scene.tick_rate,
+            "clients": sum(session.entity > 0 for session in self.sessions),
+            "entities": len(self.world),
+            "entities_awake": self.world.awake_count,
+            "segments": len(self.world.blocks.rows),
+        }

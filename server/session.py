@@ -1,0 +1,125 @@
+"""One client as the server knows it: its inputs and their fates on one side, what it has been sent on the other."""
+
+from collections import deque
+from typing import Protocol
+
+from shared.checks import Cell
+from shared.inputs import NEUTRAL, Input, clamp
+from shared.messages import (
+    AHEAD_MAX,
+    FATES_MAX,
+    IDLE,
+    INPUT_ROW_BYTES,
+    MARGIN_ONE,
+    MARGIN_REFUSED,
+    NEUTRALISED,
+    REPEATED,
+    REPEATS_MAX,
+    USED,
+    Inputs,
+)
+from shared.ring import Ring
+
+
+class Link(Protocol):
+    """What a session needs of a transport."""
+
+    def send(self, message: bytes) -> None:
+        """Queues one message; never blocks."""
+
+    def outstanding(self) -> int:
+        """Bytes handed over that the peer has not yet acknowledged."""
+        ...
+
+    def close(self, code: int, reason: str) -> None:
+        """Closes once what was sent has gone out."""
+
+
+class InputQueue:
+    """The inputs of one player: exactly one is taken per tick, and each one's fate is kept until it is told."""
+
+    def __init__(self) -> None:
+        self._ring: Ring[Input] = Ring(AHEAD_MAX + 1)
+        self._held = NEUTRAL  # the latest to arrive whose tick has come
+        self._missing = 0
+        self.newest = -1
+        self.margins: deque[int] = deque(maxlen=FATES_MAX)
+        self.fates: deque[int] = deque(maxlen=FATES_MAX)
+        self.late = self.refused = self.used = self.substituted = 0
+
+    def file(self, message: Inputs, tick: int, ahead: float) -> None:
+        """Takes a message at tick `tick`; the next tick's deadline is `ahead` ticks away."""
+        rows = memoryview(message.rows).cast("b")
+        for i in range(len(rows) // INPUT_ROW_BYTES):
+            at = message.first + i
+            if at <= self.newest:  # a duplicate, or an order that TCP cannot produce
+                self.refused += 1
+                continue
+            move_x, move_y, buttons = rows[3 * i : 3 * i + 3].tolist()
+            wish = clamp(Input(move_x, move_y, buttons & 0xFF))
+            # Every tick between the newest and this one has a margin of its own, so that they can be counted off.
+            self.margins.extend([MARGIN_REFUSED] * min(at - self.newest - 1, FATES_MAX) if self.newest >= 0 else ())
+            self.newest = at
+            if at > tick + AHEAD_MAX:
+                self.refused += 1
+                self.margins.append(MARGIN_REFUSED)
+                continue
+            margin = int((at - tick - 1 + ahead) * MARGIN_ONE)
+            self.margins.append(max(MARGIN_REFUSED + 1, min(margin, -MARGIN_REFUSED - 1)))
+            if at <= tick:
+                self.late += 1
+                self._held = wish
+            else:
+                self._ring.put(at, wish)
+
+    def take(self, tick: int) -> Input:
+        """The input for a tick whose time has come."""
+        wish = self._ring.get(tick)
+        if wish is not None:
+            fate, self._missing, self._held = USED, 0, wish
+            self.used += 1
+        elif self.newest < 0:
+            fate = IDLE
+        else:
+            self._missing += 1
+            self.substituted += 1
+            fate = REPEATED if self._missing <= REPEATS_MAX else NEUTRALISED
+        self.fates.append(fate)
+        return NEUTRAL if fate == NEUTRALISED else self._held
+
+    def told(self) -> None:
+        """Margins and fates have been sent."""
+        self.margins.clear()
+        self.fates.clear()
+
+
+class Session:
+    """One connection, from the handshake to its end."""
+
+    def __init__(self, number: int, link: Link, now: float) -> None:
+        self.number = number
+        self.link = link
+        self.name = ""
+        self.entity = 0
+        """The player's entity; 0 before the client has joined."""
+        self.opened = self.heard = self.sent_at = now
+        self.allowance = 0.0
+        self.joining = False
+        self.closed = False
+        self.inputs = InputQueue()
+        self.acked = -1
+        # What it has been sent:
+        self.tick = -1
+        self.snapshot_bytes = 0
+        self.sees: set[Cell] = set()
+        self.fresh: set[Cell] = set()
+        self.drops: list[Cell] = []
+        self.terrain_due: deque[Cell] = deque()
+        self.centre: Cell | None = None
+        self.skipped = 0
+
+    def close(self, code: int, reason: str) -> None:
+        """Ends the connection; nothing is taken from it or sent to it any more."""
+        if not self.closed:
+            self.closed = True
+            self.link.close(code, reason)
