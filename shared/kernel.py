@@ -557,15 +557,32 @@ def step(w: Arrays, inputs: Any, n_inputs: int, tick: int) -> None:
 
 
 @jit
+def leave(w: Arrays, row: int, states: Any, i: int) -> None:
+    """Wakes what stands on an entity that state `i` moves or changes."""
+    e, t = w.entities, w.templates
+    kind = e[row, TEMPLATE]
+    same = kind == states[i, TEMPLATE]
+    for k in range(X, X + 3):
+        same = same and e[row, k] == states[i, k]
+    if not same:
+        x = e[row, X] + t[kind, LO_X]
+        y = e[row, Y] + t[kind, LO_X + 1]
+        top = e[row, Z] + t[kind, LO_X + 2] + t[kind, SIZE_X + 2]
+        wake_on(w, row, x, y, x + t[kind, SIZE_X], y + t[kind, SIZE_X + 1], top)
+
+
+@jit
 def store(w: Arrays, rows: Any, states: Any, n: int, tick: int) -> None:
-    """Writes `n` whole states ([n, 12], the state columns) into rows ahead of `tick`, and wakes them."""
+    """Writes `n` whole states ([n, 12], the state columns) into rows ahead of `tick`, wakes them and their riders."""
     e = w.entities
     for i in range(n):
         row = rows[i]
+        if e[row, CELL] >= 0:
+            leave(w, row, states, i)
         awake = e[row, FLAGS] & AWAKE
         for k in range(CELL):
             e[row, k] = states[i, k]
-        e[row, FLAGS] |= awake
+        e[row, FLAGS] = e[row, FLAGS] & FALLING | awake
         mark(w, row, tick)
         relink(w, row)
         wake(w, row, -1)

@@ -262,7 +262,6 @@ class World:
         row = self._row_of[entity]
         state = list(self.state(entity))
         state[X : X + 3] = self._free_place(row, state[TEMPLATE], position, push)
-        self._leave(row)
         self.put([tuple(state)])
 
     def set_velocity(self, entity: int, velocity: tuple[float, float, float]) -> None:
@@ -281,7 +280,6 @@ class World:
         box = self._box_at(state[TEMPLATE], state[X : X + 3])
         if self._taken(row, state[TEMPLATE], box):
             raise OverlapError(f"entity {entity}: no room for the box of {template!r}")
-        self._leave(row)
         self.put([tuple(state)])
 
     def remove(self, entity: int) -> None:

@@ -1,0 +1,226 @@
+"""The physics contract a second time, in exact rationals and with nothing clever: the judge of the product.
+
+No grid integers, no cells, no sleep: blocks are a set, entities a dictionary, and every entity has its whole turn
+in every tick, in ascending order of id. An obstacle is a box; a move is the shortest way to the first one of them.
+Only `fractions.Fraction` decides; whole numbers (`near`) merely skip what is provably out of reach.
+
+    1  supported?   a solid block or a solid entity touches the underside exactly, with an area
+    2  input        walkers: horizontal velocity = intent x walk speed; jump only when supported
+    3  gravity      v' = max(v - g dt, -v_t), with the flag up
+    4  move         z, x, y: displacement rounded once to 2^-24 block, clamped to the first face newly reached
+    5  flag         cleared only when a downward motion was stopped
+"""
+
+import math
+from dataclasses import dataclass, field
+from fractions import Fraction
+
+Block = tuple[int, int, int]
+Box = tuple[list[Fraction], list[Fraction]]
+
+STEP = Fraction(1, 1 << 24)
+SPEED_STEP = Fraction(1, 1 << 16)
+SEGMENT = 32
+HALF = Fraction(1, 2)
+
+
+def nearest(value: Fraction, width: Fraction) -> Fraction:
+    """The nearest multiple of `width`, halves away from zero."""
+    whole = math.floor(abs(value) / width + HALF)
+    return whole * width if value >= 0 else -whole * width
+
+
+@dataclass
+class Kind:
+    """A template entity: the box relative to the position, what it may do."""
+
+    offset: list[Fraction]
+    size: list[Fraction]
+    walk: Fraction
+    jump: Fraction
+    solid: bool
+
+    def corners(self) -> Box:
+        """The box as low and high corner: a negative side extends it the other way."""
+        ends = [o + s for o, s in zip(self.offset, self.size, strict=True)]
+        return [min(pair) for pair in zip(self.offset, ends, strict=True)], [
+            max(pair) for pair in zip(self.offset, ends, strict=True)
+        ]
+
+
+@dataclass
+class Body:
+    """An entity."""
+
+    kind: int
+    position: list[Fraction]
+    velocity: list[Fraction]
+    falling: bool = False
+    move: tuple[int, int] = (0, 0)
+    buttons: int = 0
+    near: list[int] = field(default_factory=list)
+
+
+class Oracle:
+    """A world of the contract.
+
+    Args:
+        kinds: the templates, in the scene's order; lengths and speeds as their people gave them.
+        rate: ticks per second.
+        lowest: z of the lowest block: below it there is the void.
+    """
+
+    def __init__(
+        self,
+        kinds: list[Kind],
+        *,
+        rate: int,
+        gravity: Fraction,
+        terminal: Fraction,
+        mean: bool,
+        pairs: bool,
+        lowest: int,
+    ) -> None:
+        self.kinds = kinds
+        self.dt = Fraction(1, rate)
+        self.fall = nearest(gravity / rate, SPEED_STEP)
+        self.terminal = nearest(terminal, SPEED_STEP)
+        self.mean = mean
+        self.pairs = pairs
+        self.lowest = lowest
+        self.loaded: set[Block] = set()
+        self.solid: set[Block] = set()
+        self.bodies: dict[int, Body] = {}
+        self.fell: list[int] = []
+        self._corners = [self._rounded(kind) for kind in kinds]
+        self._reach = 2 + max(math.ceil(abs(part)) for low, high in self._corners for part in (*low, *high))
+
+    def is_solid(self, block: Block) -> bool:
+        """Whether a block stops things: what is not loaded does, the void does not."""
+        if (block[0] // SEGMENT, block[1] // SEGMENT, block[2] // SEGMENT) not in self.loaded:
+            return block[2] >= self.lowest
+        return block in self.solid
+
+    def box(self, body: Body) -> Box:
+        low, high = self._corners[body.kind]
+        return [p + a for p, a in zip(body.position, low, strict=True)], [
+            p + b for p, b in zip(body.position, high, strict=True)
+        ]
+
+    def step(self, inputs: dict[int, tuple[int, int, int]]) -> None:
+        """One tick: inputs by id; who has none goes on with its latest."""
+        for entity, (x, y, buttons) in inputs.items():
+            self.bodies[entity].move = x, y
+            self.bodies[entity].buttons = buttons
+        self.fell = []
+        for body in self.bodies.values():
+            body.near = [math.floor(part) for part in body.position]
+        for entity in sorted(self.bodies):
+            self._turn(self.bodies[entity])
+            if self.box(self.bodies[entity])[0][2] < self.lowest:
+                self.fell.append(entity)
+
+    def taken(self, body: Body) -> bool:
+        """Whether a body overlaps a block, or an entity that it would meet."""
+        low, high = self.box(body)
+        if any(self.is_solid(block) for block in _cells(low, high)):
+            return True
+        meets = self.pairs and self.kinds[body.kind].solid
+        return meets and any(
+            other is not body
+            and self.kinds[other.kind].solid
+            and all(c < b and d > a for a, b, c, d in zip(low, high, *self.box(other), strict=True))
+            for other in self.bodies.values()
+        )
+
+    def _turn(self, body: Body) -> None:
+        kind = self.kinds[body.kind]
+        low, high = self.box(body)
+        v = body.velocity
+        if kind.walk > 0:
+            v[0], v[1] = (nearest(kind.walk * part / 127, SPEED_STEP) for part in body.move)
+        old = v[2]
+        if self.fall > 0:
+            jump = nearest(kind.jump, SPEED_STEP) if body.buttons & 1 else Fraction(0)
+            if self._supported(body, low, high):
+                if jump > 0:
+                    body.falling = True
+                    old = v[2] = jump
+            else:
+                body.falling = True
+            if body.falling:
+                v[2] = max(v[2] - self.fall, -self.terminal)
+            if not self.mean:
+                old = v[2]
+        wish = [
+            nearest(v[0] * self.dt, STEP),
+            nearest(v[1] * self.dt, STEP),
+            nearest((old + v[2]) / 2 * self.dt, STEP),
+        ]
+        others = self._others(body, max(abs(part) for part in wish)) if any(wish) else []
+        for k in (2, 0, 1):
+            went = self._way(low, high, k, wish[k], others) if wish[k] else wish[k]
+            low[k] += went
+            high[k] += went
+            body.position[k] += went
+            if went != wish[k]:
+                v[k] = Fraction(0)
+                if k == 2 and wish[k] < 0:
+                    body.falling = False
+        body.near = [math.floor(part) for part in body.position]
+
+    def _supported(self, body: Body, low: list[Fraction], high: list[Fraction]) -> bool:
+        if low[2].denominator == 1:
+            under = [low[0], low[1], low[2] - 1], [high[0], high[1], low[2]]
+            if any(self.is_solid(block) for block in _cells(*under)):
+                return True
+        return any(
+            d[2] == low[2] and c[0] < high[0] and d[0] > low[0] and c[1] < high[1] and d[1] > low[1]
+            for c, d in self._others(body, Fraction(0))
+        )
+
+    def _others(self, body: Body, wish: Fraction) -> list[Box]:
+        """The boxes of the solid entities that a body meets, if it could reach them."""
+        if not self.pairs or not self.kinds[body.kind].solid:
+            return []
+        x, y, z = body.near
+        reach = 2 * self._reach + math.ceil(wish)
+        return [
+            self.box(other)
+            for other in self.bodies.values()
+            if abs(other.near[2] - z) <= reach
+            and abs(other.near[0] - x) <= reach
+            and abs(other.near[1] - y) <= reach
+            and other is not body
+            and self.kinds[other.kind].solid
+        ]
+
+    def _way(self, low: list[Fraction], high: list[Fraction], k: int, wish: Fraction, others: list[Box]) -> Fraction:
+        """How far a box gets along axis k: to the nearest face that was not behind its leading one."""
+        ahead_low, ahead_high = list(low), list(high)
+        if wish > 0:
+            ahead_low[k], ahead_high[k] = high[k], high[k] + wish
+        else:
+            ahead_low[k], ahead_high[k] = low[k] + wish, low[k]
+        faces = [block[k] + (wish < 0) for block in _cells(ahead_low, ahead_high) if self.is_solid(block)]
+        i, j = (k + 1) % 3, (k + 2) % 3
+        near = [
+            c[k] if wish > 0 else d[k]
+            for c, d in others
+            if c[i] < high[i] and d[i] > low[i] and c[j] < high[j] and d[j] > low[j]
+        ]
+        stops: list[Fraction | int] = [*faces, *near]
+        if wish > 0:
+            return min([wish, *(stop - high[k] for stop in stops if stop >= high[k])])
+        return max([wish, *(stop - low[k] for stop in stops if stop <= low[k])])
+
+    def _rounded(self, kind: Kind) -> Box:
+        offset = [nearest(part, STEP) for part in kind.offset]
+        size = [nearest(part, STEP) for part in kind.size]
+        return Kind(offset, size, kind.walk, kind.jump, kind.solid).corners()
+
+
+def _cells(low: list[Fraction], high: list[Fraction]) -> list[Block]:
+    """The blocks that the open box between two corners overlaps."""
+    spans = [range(math.floor(a), math.ceil(b)) for a, b in zip(low, high, strict=True)]
+    return [(x, y, z) for z in spans[2] for y in spans[1] for x in spans[0]]
