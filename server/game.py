@@ -18,6 +18,7 @@ from server.limits import Limits
 from server.replication import KEYFRAME, ChangeLog
 from server.session import Link, Session
 from shared import messages
+from shared.checks import Vec
 from shared.inputs import Input
 from shared.messages import Bye, Hello, Inputs, Ping, Pong, ProtocolError, Welcome, decode_from_client, encode
 from shared.scene import Scene

@@ -42,7 +42,7 @@ class InputQueue:
         self._ring: Ring[Input] = Ring(AHEAD_MAX + 1)
         self._held = NEUTRAL  # the latest to arrive whose tick has come
         self._missing = 0
-        self.newest = -1
+        self.first = self.newest = -1
         self.margins: deque[int] = deque(maxlen=FATES_MAX)
         self.fates: deque[int] = deque(maxlen=FATES_MAX)
         self.late = self.refused = self.used = self.substituted = 0
@@ -60,6 +60,8 @@ class InputQueue:
             # Every tick between the newest and this one has a margin of its own, so that they can be counted off.
             self.margins.extend([MARGIN_REFUSED] * min(at - self.newest - 1, FATES_MAX) if self.newest >= 0 else ())
             self.newest = at
+            if self.first < 0:
+                self.first = at
             if at > tick + AHEAD_MAX:
                 self.refused += 1
                 self.margins.append(MARGIN_REFUSED)
@@ -78,7 +80,7 @@ class InputQueue:
         if wish is not None:
             fate, self._missing, self._held = USED, 0, wish
             self.used += 1
-        elif self.newest < 0:
+        elif self.first < 0 or tick < self.first:
             fate = IDLE
         else:
             self._missing += 1

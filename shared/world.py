@@ -172,8 +172,7 @@ class World:
             self._bind()
         if self._lengths[layout.N_HOMELESS]:
             self._kernel.relink_range(self._arrays, 0, self._rows)
-        low = [part * SEGMENT * BLOCK for part in index]
-        self._kernel.wake_in(self._arrays, *low, *(part + SEGMENT * BLOCK for part in low))
+        self._wake_segment(index)
 
     def unload_segment(self, index: Cell) -> None:
         """Forgets a segment; it is solid from then on.
@@ -184,6 +183,7 @@ class World:
         if len(self.in_segment(index)):
             raise OverlapError(f"segment {index}: entities are in it")
         self.blocks.unload(index)
+        self._wake_segment(index)  # below the scene's floor, what is not loaded is void
 
     def set_block(self, x: int, y: int, z: int, kind: int) -> bool:
         """Places (kind 1 to 255) or removes (0) a block; whether anything changed.
@@ -478,6 +478,11 @@ class World:
             near = self._candidates[: self._kernel.gather(self._arrays, row, True, *reach)]
             faces += near[:, axis + 3 if sign > 0 else axis].tolist()
         return sorted(set(faces), reverse=sign < 0)
+
+    def _wake_segment(self, index: Cell) -> None:
+        """Wakes what overlaps or touches a segment."""
+        low = [part * SEGMENT * BLOCK for part in index]
+        self._kernel.wake_in(self._arrays, *low, *(part + SEGMENT * BLOCK for part in low))
 
     def _leave(self, row: int) -> None:
         """Wakes what stands on an entity that is about to go or to change."""

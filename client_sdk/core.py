@@ -1,0 +1,388 @@
+"""A client without its socket: bytes and times in, bytes, events and a picture out.
+
+    joining   hello and pings are out; the welcome, the terrain around the player and the server's time come in
+    playing   every tick: step the predicted world with the wish, send the wish; every snapshot: reconcile
+    closed    it is over
+
+`now` is always float seconds of any one monotonic clock.
+"""
+
+import math
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+
+from client_sdk.clock import LeadController, QuantileLead, ServerClock, Timeline
+from client_sdk.events import Corrected, Event, Joined, Left, Resynchronised, SegmentLoaded, Stats
+from client_sdk.interpolation import Interpolation
+from client_sdk.prediction import Prediction, check_scene
+from client_sdk.smoothing import Smoothing
+from shared import messages
+from shared.blocks import unpack
+from shared.checks import Cell, Vec
+from shared.inputs import NEUTRAL, Input, clamp
+from shared.layout import ID, TEMPLATE, VX, X
+from shared.messages import (
+    MARGIN_ONE,
+    MARGIN_REFUSED,
+    NEUTRALISED,
+    REPEATED,
+    Bye,
+    Hello,
+    Inputs,
+    Ping,
+    Pong,
+    ProtocolError,
+    Snapshot,
+    Terrain,
+    Welcome,
+    decode_from_server,
+    encode,
+)
+from shared.ring import Ring
+from shared.scene import Scene
+from shared.units import BLOCK, BLOCK_SHIFT, SEGMENT_SHIFT, SPEED
+
+TICKS_PER_UPDATE_MAX = 16
+"""A program that was away for longer does not catch up tick by tick: it begins anew."""
+UNCONFIRMED_MAX = 96
+"""So many ticks beyond the newest snapshot, prediction waits."""
+EVENTS_MAX = 1000
+
+
+@dataclass(frozen=True)
+class Figure:
+    """One entity as it is to be drawn: position in blocks, velocity in blocks/s."""
+
+    entity: int
+    template: int
+    position: Vec
+    velocity: Vec
+
+
+@dataclass(frozen=True)
+class View:
+    """What to draw at one moment. `me` is the own entity, `others` are the rest, ascending by id."""
+
+    tick: float
+    me: Figure | None
+    others: list[Figure]
+
+
+class Core:
+    """The client as a state machine.
+
+    Args:
+        name: shown to others.
+        scene: the scene this program was built for, checked by the server; None: the server's is taken.
+        compiled: run the physics compiled by Numba; None: where it is installed.
+        lead: decides how far to live ahead of the server.
+    """
+
+    def __init__(
+        self,
+        name: str = "",
+        scene: Scene | None = None,
+        *,
+        compiled: bool | None = None,
+        lead: LeadController | None = None,
+    ) -> None:
+        self.name = name
+        self.scene = scene
+        self.entity = 0
+        self.state = "joining"
+        self.close_request: tuple[int, str] | None = None
+        """The code and reason with which the connection should be closed now, if any."""
+        self.stats = Stats()
+        self.clock = ServerClock()
+        self.prediction: Prediction | None = None
+        self.timeline: Timeline | None = None
+        self._compiled = compiled
+        self._lead = lead or QuantileLead()
+        self.wish = NEUTRAL
+        self._out: list[bytes] = []
+        self._events: deque[Event] = deque(maxlen=EVENTS_MAX)
+        self._phases: Ring[float] = Ring(256)
+        self._late: Ring[bool] = Ring(256)
+        self._newest = -1
+        self._interpolation: Interpolation | None = None
+        self._smoothing = Smoothing()
+        self._open = False
+
+    # -- what comes in -------------------------------------------------------------------------------------
+
+    def open(self, now: float) -> None:
+        """The connection is there: says hello."""
+        self._open = True
+        self._send(Hello(messages.VERSION, self.scene.digests if self.scene else {}, self.name[: messages.NAME_MAX]))
+
+    def receive(self, data: bytes, now: float) -> None:
+        """One message of the server. One that is malformed closes the connection."""
+        if self.state == "closed":
+            return
+        self.stats.bytes_down += len(data)
+        try:
+            self._take(decode_from_server(data), now)
+        except ProtocolError as error:
+            self._fail(messages.MALFORMED, f"the server sent something malformed: {error}")
+
+    def lost(self, code: int, reason: str, now: float) -> None:
+        """The connection is gone."""
+        self._end(Left(code, reason))
+
+    def close(self) -> None:
+        """Says goodbye."""
+        if self.state != "closed":
+            if self._open:
+                self._send(Bye(messages.GOING_AWAY, "", -1.0))
+            self.close_request = (1000, "")
+            self._end(Left(1000, "closed by this client"))
+
+    def set_input(self, wish: Input) -> None:
+        """What the player wishes from the next tick on, until told otherwise."""
+        self.wish = clamp(wish)
+
+    # -- time ----------------------------------------------------------------------------------------------
+
+    def update(self, now: float) -> None:
+        """Sends pings that are due, and predicts every tick whose time has come."""
+        if self.state == "closed" or not self._open:
+            return
+        if self.clock.due(now):
+            self._send(Ping(now))
+        if self.state == "joining":
+            self._try_to_join(now)
+        if self.state != "playing":
+            return
+        assert self.timeline is not None
+        assert self.prediction is not None
+        assert self._interpolation is not None
+        target = self._lead.target(now)
+        if target is not None and self.timeline.steer(target, now):
+            self._restart(now)
+        self._interpolation.advance(self.clock.tick(now), now)
+        self._predict(math.floor(self.timeline.tick(now)), now)
+
+    def next_update(self, now: float) -> float:
+        """The local time at which `update` has something to do."""
+        due = self.clock.next_ping
+        if self.timeline is not None and self.prediction is not None:
+            due = min(due, self.timeline.when(self.prediction.predicted.tick + 1))
+        return max(due, now)  # inf: only once something has come in
+
+    # -- what goes out -------------------------------------------------------------------------------------
+
+    def outgoing(self) -> list[bytes]:
+        """The messages to send since the last call."""
+        out, self._out = self._out, []
+        self.stats.bytes_up += sum(map(len, out))
+        return out
+
+    def events(self) -> list[Event]:
+        """What has happened since the last call."""
+        events = list(self._events)
+        self._events.clear()
+        return events
+
+    def view(self, now: float) -> View:
+        """What to draw now: the own entity predicted, the others as they were a moment ago."""
+        if self.prediction is None or self.timeline is None or self._interpolation is None:
+            return View(0.0, None, [])
+        tick = self.timeline.tick(now)
+        states, places = self._interpolation.sample(self.clock.tick(now))
+        others = [
+            figure(state, place)
+            for state, place in zip(states.tolist(), places.tolist(), strict=True)
+            if state[ID] != self.entity
+        ]
+        return View(tick, self._me(tick, now), others)
+
+    # -- inside --------------------------------------------------------------------------------------------
+
+    def _take(self, message: messages.Message, now: float) -> None:
+        match message:
+            case Snapshot():
+                self._snapshot(message, now)
+            case Pong():
+                if self.clock.rate:
+                    self.clock.answered(message.sent, message.tick, now)
+            case Terrain():
+                self._terrain(message)
+            case Welcome():
+                self._welcome(message)
+            case Bye():
+                self._end(Left(message.code, message.reason, message.wait))
+            case _:
+                raise ProtocolError(f"{type(message).__name__} from a server")
+
+    def _welcome(self, welcome: Welcome) -> None:
+        if self.entity:
+            raise ProtocolError("a second Welcome")
+        scene = check_scene(welcome.scene)
+        if self.scene is not None and scene.digests != self.scene.digests:
+            raise ProtocolError("Welcome.scene: not the scene that was asked for")
+        self.scene = scene
+        self.entity = welcome.entity
+        self.prediction = Prediction(scene, welcome.entity, compiled=self._compiled)
+        self._interpolation = Interpolation(scene.tick_rate)
+        self.clock.rate = float(scene.tick_rate)
+
+    def _terrain(self, terrain: Terrain) -> None:
+        if self.prediction is None:
+            raise ProtocolError("Terrain before Welcome")
+        try:
+            kinds = unpack(terrain.packed)
+        except ValueError as error:
+            raise ProtocolError(f"Terrain.packed: {error}") from error
+        segment = (terrain.x, terrain.y, terrain.z)
+        self.prediction.load_segment(segment, kinds)
+        self._events.append(SegmentLoaded(segment))
+
+    def _snapshot(self, snapshot: Snapshot, now: float) -> None:
+        prediction = self.prediction
+        if prediction is None or self._interpolation is None:
+            raise ProtocolError("Snapshot before Welcome")
+        if snapshot.tick <= prediction.confirmed.tick:
+            raise ProtocolError(f"Snapshot.tick = {snapshot.tick}: not newer than the one before")
+        self.stats.snapshots += 1
+        if self.stats.snapshots > 1:
+            self.stats.snapshots_skipped += snapshot.tick - prediction.confirmed.tick - 1
+        self._fates(snapshot, now)
+        prediction.apply(snapshot)
+        self._interpolation.push(snapshot.tick, prediction.confirmed.states())
+        done = prediction.reconcile(self._cause(snapshot.tick))
+        self.stats.replayed_ticks += done.replayed
+        self.stats.repredictions += done.repredicted
+        if done.replayed:
+            self._smoothing.add(done.offset, now)
+        if done.correction:
+            self._corrected(done.correction)
+
+    def _fates(self, snapshot: Snapshot, now: float) -> None:
+        """How the inputs up to `newest` fared: feeds the lead."""
+        margins = np.frombuffer(snapshot.margins, "<i2").tolist()
+        for i, margin in enumerate(margins):
+            tick = snapshot.newest - len(margins) + 1 + i
+            phase = self._phases.get(tick)
+            late = margin < 0
+            self.stats.inputs_late += late
+            self._late.put(tick, late)
+            if phase is not None and margin != MARGIN_REFUSED:
+                self._lead.observe(tick, margin / MARGIN_ONE, phase, now)
+        for i, fate in enumerate(snapshot.fates):
+            if fate in (REPEATED, NEUTRALISED):
+                self.stats.inputs_substituted += 1
+                self._late.put(snapshot.first + i, True)
+
+    def _cause(self, tick: int) -> str:
+        """Why the own entity may differ: an input was not used, or something that only the server knew."""
+        recent = range(tick - 8, tick + 1)
+        return "late input" if any(self._late.get(at) for at in recent) else "other"
+
+    def _corrected(self, correction: Corrected) -> None:
+        stats = self.stats
+        stats.corrections += 1
+        stats.corrections_by_cause[correction.cause] = stats.corrections_by_cause.get(correction.cause, 0) + 1
+        stats.correction_blocks.append(correction.blocks)
+        del stats.correction_blocks[:-EVENTS_MAX]
+        self._events.append(correction)
+
+    def _try_to_join(self, now: float) -> None:
+        """Begins to play once the time, the own entity and the ground around it are known."""
+        prediction = self.prediction
+        if prediction is None or self.scene is None or not self.clock.ready:
+            return
+        if self.entity not in prediction.confirmed or not self._grounded():
+            return
+        clock = self.clock
+        # Until the server has told how early inputs come: half the round trip, all its jitter, and two ticks.
+        ahead = (clock.rtt_s / 2 + clock.spread_s) * clock.rate + 2.0
+        self.timeline = Timeline(clock.rate, clock.phase + ahead, now)
+        self._restart(now)
+        self.state = "playing"
+        self._events.append(Joined(self.entity, self.scene, prediction.predicted.tick))
+
+    def _grounded(self) -> bool:
+        """Whether every segment that exists around the own entity has been loaded."""
+        assert self.prediction is not None
+        assert self.scene is not None
+        x, y, z = self._segment()
+        near = ((x + i, y + j, z + k) for i in (-1, 0, 1) for j in (-1, 0, 1) for k in (-1, 0, 1))
+        exist = set(self.scene.segments())
+        return all(segment in self.prediction.confirmed.blocks for segment in near if segment in exist)
+
+    def _segment(self) -> Cell:
+        assert self.prediction is not None
+        x, y, z = (
+            part >> (BLOCK_SHIFT + SEGMENT_SHIFT) for part in self.prediction.confirmed.state(self.entity)[X : X + 3]
+        )
+        return x, y, z
+
+    def _restart(self, now: float) -> None:
+        """Begins the prediction at the timeline's tick."""
+        assert self.timeline is not None
+        assert self.prediction is not None
+        tick = max(math.floor(self.timeline.tick(now)), self.prediction.confirmed.tick, self._newest)
+        skipped = tick - self.prediction.predicted.tick
+        if self.prediction.begun:
+            self.stats.resyncs += 1
+            self._events.append(Resynchronised(tick, skipped))
+        self.prediction.begin(tick)
+
+    def _predict(self, to: int, now: float) -> None:
+        prediction, timeline = self.prediction, self.timeline
+        assert prediction is not None
+        assert timeline is not None
+        if to - prediction.predicted.tick > TICKS_PER_UPDATE_MAX:
+            if to - prediction.confirmed.tick <= UNCONFIRMED_MAX:
+                self._restart(now)
+            return
+        first = prediction.predicted.tick + 1
+        rows = bytearray()
+        while prediction.predicted.tick < to:
+            if prediction.predicted.tick - prediction.confirmed.tick >= UNCONFIRMED_MAX:
+                break
+            prediction.step(self.wish)
+            self._phases.put(prediction.predicted.tick, timeline.phase)
+            rows += bytes(part & 0xFF for part in self.wish)
+        if rows:
+            self._newest = prediction.predicted.tick
+            self.stats.inputs_sent += len(rows) // messages.INPUT_ROW_BYTES
+            self.stats.rtt_s = self.clock.rtt_s
+            self.stats.lead_ticks = timeline.phase - self.clock.phase
+            self._send(Inputs(first, prediction.confirmed.tick, bytes(rows)))
+
+    def _me(self, tick: float, now: float) -> Figure | None:
+        """The own entity between its last two predicted ticks, with what smoothing adds."""
+        prediction = self.prediction
+        if prediction is None or self.entity not in prediction.predicted:
+            return None
+        state = prediction.predicted.state(self.entity)
+        before = prediction.state_before(self.entity) or state
+        share = min(max(tick - prediction.predicted.tick, 0.0), 1.0)
+        offset = self._smoothing.offset(now)
+        x, y, z = (
+            (a + (b - a) * share) / BLOCK + off
+            for a, b, off in zip(before[X : X + 3], state[X : X + 3], offset, strict=True)
+        )
+        return figure(list(state), (x, y, z))
+
+    def _send(self, message: messages.Message) -> None:
+        self._out.append(encode(message))
+
+    def _fail(self, code: int, reason: str) -> None:
+        self.close_request = (code, reason[:100])
+        self._end(Left(code, reason))
+
+    def _end(self, left: Left) -> None:
+        if self.state != "closed":
+            self.state = "closed"
+            self._events.append(left)
+
+
+def figure(state: list[int], place: tuple[float, float, float] | list[float]) -> Figure:
+    """A state with the position to draw it at."""
+    x, y, z = place
+    vx, vy, vz = (part / SPEED for part in state[VX : VX + 3])
+    return Figure(state[ID], state[TEMPLATE], (x, y, z), (vx, vy, vz))

@@ -1,0 +1,78 @@
+"""What happens to a client, as values: `poll()` gives them in order, a `match` statement tells them apart."""
+
+from dataclasses import dataclass, field
+
+from shared.checks import Cell
+from shared.scene import Scene
+
+
+@dataclass(frozen=True)
+class Joined:
+    """The player is in: inputs count from here on."""
+
+    entity: int
+    scene: Scene
+    tick: int
+
+
+@dataclass(frozen=True)
+class Left:
+    """It is over. `wait`: come back in so many seconds; negative: do not."""
+
+    code: int
+    reason: str
+    wait: float = -1.0
+
+
+@dataclass(frozen=True)
+class Corrected:
+    """The server's world differed from the prediction of the own entity.
+
+    `fields` names what differed at `tick`; `blocks` is how far the position was off then, `ticks` how many were
+    replayed, and `cause` the best explanation.
+    """
+
+    tick: int
+    fields: tuple[str, ...]
+    blocks: float
+    ticks: int
+    cause: str
+
+
+@dataclass(frozen=True)
+class Resynchronised:
+    """Prediction was given up for a while (a long silence, a suspended program) and has begun anew."""
+
+    tick: int
+    skipped: int
+
+
+@dataclass(frozen=True)
+class SegmentLoaded:
+    """The blocks of a segment are there."""
+
+    segment: Cell
+
+
+Event = Joined | Left | Corrected | Resynchronised | SegmentLoaded
+
+
+@dataclass
+class Stats:
+    """Counters since the start. Lengths in blocks, times in seconds."""
+
+    snapshots: int = 0
+    snapshots_skipped: int = 0
+    bytes_down: int = 0
+    bytes_up: int = 0
+    inputs_sent: int = 0
+    inputs_late: int = 0
+    inputs_substituted: int = 0
+    corrections: int = 0
+    corrections_by_cause: dict[str, int] = field(default_factory=dict)
+    correction_blocks: list[float] = field(default_factory=list)
+    repredictions: int = 0
+    replayed_ticks: int = 0
+    resyncs: int = 0
+    rtt_s: float = 0.0
+    lead_ticks: float = 0.0

@@ -1,0 +1,211 @@
+"""A match in simulated time: the real server core and real SDK cores, one `now`, one seed.
+
+Nothing sleeps and nothing depends on the machine: every delivery, tick and frame is an entry in one queue, ordered
+by simulated time. A `Wire` is one direction of a TCP connection: nothing is lost or reordered, but sometimes late.
+"""
+
+import heapq
+import random
+from collections import deque
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from itertools import count
+
+from client_sdk.core import Core
+from client_sdk.events import Event
+from server.game import Game
+from server.limits import Limits
+from server.session import Session
+from shared.inputs import Input
+from shared.scene import Scene
+
+Policy = Callable[[Core, random.Random], Input]
+
+
+@dataclass(frozen=True)
+class Path:
+    """How a connection behaves, each way. Times in seconds."""
+
+    delay_s: float = 0.0
+    jitter_s: float = 0.0
+
+
+class Wire:
+    """One direction: in order, each message delayed by the path."""
+
+    def __init__(self, match: "Match", path: Path, rng: random.Random, deliver: Callable[[bytes], None]) -> None:
+        self._match, self._path, self._rng, self._deliver = match, path, rng, deliver
+        self._last = 0.0
+        self._unacked: deque[tuple[float, int]] = deque()  # when the acknowledgement is back, bytes
+        self._bytes = 0
+
+    def send(self, message: bytes) -> None:
+        """Delivers in order, after the path's delay."""
+        now = self._match.now
+        way = self._path.delay_s + self._rng.random() * self._path.jitter_s
+        self._last = max(self._last, now + way)
+        self._unacked.append((self._last + self._path.delay_s, len(message)))
+        self._bytes += len(message)
+        self._match.at(self._last, lambda: self._deliver(message))
+
+    def outstanding(self) -> int:
+        """Bytes sent and not yet acknowledged."""
+        while self._unacked and self._unacked[0][0] <= self._match.now:
+            self._bytes -= self._unacked.popleft()[1]
+        return self._bytes
+
+
+class Player:
+    """One client: its core, its clock, its policy, its two wires. It is the server's `Link`, too."""
+
+    def __init__(self, match: "Match", core: Core, path: Path, policy: Policy, seed: int) -> None:
+        self.match, self.core, self.policy = match, core, policy
+        self.rng = random.Random(seed)
+        self.drift = self.rng.uniform(-200e-6, 200e-6)
+        self.clock_start = self.rng.uniform(0, 1e5)
+        self.events: list[Event] = []
+        self.closed: tuple[int, str] | None = None
+        self.session: Session | None = None
+        self._up = Wire(match, path, random.Random(seed + 1), self._at_server)
+        self._down = Wire(match, path, random.Random(seed + 2), self._at_client)
+        self._acted = -1
+
+    @property
+    def local(self) -> float:
+        """The time on the client's own clock."""
+        return self.clock_start + self.match.now * (1 + self.drift)
+
+    def connect(self) -> None:
+        """Opens the connection."""
+        self.session = self.match.game.open(self, self.match.now)
+        self.core.open(self.local)
+        self._update()
+
+    def disconnect(self) -> None:
+        """Pulls the plug."""
+        assert self.session is not None
+        self.match.game.lost(self.session, self.match.now)
+        self.core.lost(1006, "gone", self.local)
+
+    # As the server's link:
+
+    def send(self, message: bytes) -> None:
+        self._down.send(message)
+
+    def outstanding(self) -> int:
+        return self._down.outstanding()
+
+    def close(self, code: int, reason: str) -> None:
+        self.closed = (code, reason)
+        assert self.session is not None
+        self.match.game.lost(self.session, self.match.now)
+
+    def _at_server(self, message: bytes) -> None:
+        assert self.session is not None
+        self.match.game.receive(self.session, message, self.match.now)
+
+    def _at_client(self, message: bytes) -> None:
+        waiting = self.core.state == "joining"
+        self.core.receive(message, self.local)
+        self._flush()
+        if waiting:
+            self._update()
+
+    def _update(self) -> None:
+        core = self.core
+        if core.prediction is not None and core.prediction.predicted.tick != self._acted:
+            self._acted = core.prediction.predicted.tick
+            core.set_input(self.policy(core, self.rng))
+        core.update(self.local)
+        self._flush()
+        if core.state != "closed":
+            due = core.next_update(self.local)
+            if due < float("inf"):
+                when = self.match.now + max(due - self.local, 1e-4) / (1 + self.drift)
+                self.match.at(when, self._update, key=self)
+
+    def _flush(self) -> None:
+        for message in self.core.outgoing():
+            self._up.send(message)
+        self.events += self.core.events()
+        if self.core.close_request and self.closed is None:
+            self.close(*self.core.close_request)
+
+
+class Match:
+    """A server, its players and the time.
+
+    Args:
+        scene: the rules.
+        seed: everything random comes from it.
+    """
+
+    def __init__(self, scene: Scene, seed: int, *, limits: Limits | None = None) -> None:
+        self.game = Game(scene, limits=limits)
+        self.seed = seed
+        self.now = 0.0
+        self.players: list[Player] = []
+        self._queue: list[tuple[float, int, Callable[[], None], object]] = []
+        self._latest: dict[object, int] = {}
+        self._number = count()
+        self._started = 0
+        self._tick_s = 1.0 / scene.tick_rate
+        self.on_tick: list[Callable[[], None]] = []
+        self.at(0.0, self._tick)
+
+    def join(self, policy: Policy, path: Path | None = None, core: Core | None = None) -> Player:
+        """A further player."""
+        seed = self.seed * 1_000_003 + len(self.players) * 7919
+        player = Player(self, core or Core(f"player {len(self.players)}"), path or Path(), policy, seed)
+        self.players.append(player)
+        self.at(self.now, player.connect)
+        return player
+
+    def at(self, when: float, act: Callable[[], None], key: object = None) -> None:
+        """Files something for a time; a later entry with the same key replaces an earlier one."""
+        number = next(self._number)
+        if key is not None:
+            self._latest[key] = number
+        heapq.heappush(self._queue, (when, number, act, key))
+
+    def run(self, seconds: float) -> None:
+        """Lets time pass."""
+        until = self.now + seconds
+        for _ in self._entries(until):
+            pass
+        self.now = until
+
+    def run_until(self, condition: Callable[[], bool], seconds: float) -> None:
+        """Lets time pass until a condition holds; fails if it does not within so many simulated seconds."""
+        for _ in self._entries(self.now + seconds):
+            if condition():
+                return
+        raise AssertionError(f"seed {self.seed}: not within {seconds} simulated seconds")
+
+    def _entries(self, until: float) -> Iterator[None]:
+        while self._queue and self._queue[0][0] <= until:
+            when, number, act, key = heapq.heappop(self._queue)
+            if key is not None and self._latest.get(key) != number:
+                continue
+            self.now = max(self.now, when)
+            act()
+            yield
+
+    def _tick(self) -> None:
+        self.game.tick(self.now, self.now)
+        for act in self.on_tick:
+            act()
+        self._started += 1
+        self.at(self._started * self._tick_s, self._tick)
+
+
+def wander(core: Core, rng: random.Random) -> Input:
+    """Walks about, jumps and stops, changing its mind about once a second."""
+    assert core.prediction is not None
+    held = core.wish
+    if rng.random() < 0.04:
+        angle = rng.choice(
+            [(127, 0), (-127, 0), (0, 127), (0, -127), (90, 90), (-90, 90), (90, -90), (-90, -90), (0, 0)]
+        )
+        return Input(*angle, int(rng.random() < 0.5))
+    return held
