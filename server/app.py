@@ -1,0 +1,214 @@
+"""The composition root: settings to a running process, and its end."""
+
+import asyncio
+import contextlib
+import dataclasses
+import gc
+import logging
+import os
+import signal
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+from server.game import Game
+from server.gateway import CLOSE_S, Gateway
+from server.settings import Settings, SettingsError, parse
+from server.ticker import Ticker, best_alarm
+from shared.checks import SceneError
+from shared.messages import VERSION, Hello, Inputs, encode
+from shared.scene import Scene, load_scene
+
+WARM_UP_TICKS = 8
+RESTART_WAIT_S = 2.0
+"""After so long clients are asked to come back when the server goes down."""
+STOP_S = CLOSE_S + 0.25
+"""The end waits no longer than this for peers to finish closing."""
+
+logger = logging.getLogger("server")
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Runs until a signal; returns the exit code."""
+    for number in _signals():
+        signal.signal(number, _leave)  # until the event loop takes over
+    try:
+        settings = parse(sys.argv[1:] if arguments is None else arguments)
+        if isinstance(settings, str):
+            print(settings, end="")
+            return 0
+        return run(settings)
+    except (SettingsError, SceneError) as error:
+        print("error:", *str(error).split(), file=sys.stderr)
+        return 2
+
+
+def run(settings: Settings) -> int:
+    """Serves one world; returns the exit code.
+
+    Raises:
+        SceneError: the scene cannot be used.
+        SettingsError: nor can the address.
+    """
+    logging.basicConfig(
+        stream=sys.stderr, level=settings.log_level.upper(), format="%(asctime)s %(levelname)s %(name)s: %(message)s"
+    )
+    scene = load_scene(settings.scene)
+    if settings.tick_rate is not None:
+        scene = dataclasses.replace(scene, tick_rate=settings.tick_rate)
+    warm_up(scene)
+    game = Game(scene)
+    with asyncio.Runner(loop_factory=_loop_factory()) as runner:
+        return runner.run(Server(settings, game).serve())
+
+
+class Server:
+    """The parts and their lives: start, run, stop."""
+
+    def __init__(self, settings: Settings, game: Game) -> None:
+        self.settings = settings
+        self.game = game
+        self.gateway = Gateway(game, self.stats if settings.stats else None)
+        self.ticker: Ticker | None = None
+        self.started = time.monotonic()
+        self._stop: asyncio.Future[tuple[str, int]] | None = None
+
+    async def serve(self) -> int:
+        """Listens, ticks until told to stop, says goodbye."""
+        loop = asyncio.get_running_loop()
+        loop.set_exception_handler(self._loop_failed)
+        self._stop = loop.create_future()
+        with _on_signals(loop, lambda name: self._end(name, 0)):
+            host, port = await self._listen()
+            rate = self.game.scene.tick_rate
+            self.ticker = Ticker(rate, self.game.tick, self._broken, lambda ring: best_alarm(loop, ring))
+            freeze()
+            kind = type(loop).__module__.partition(".")[0]
+            logger.info("started: scene %s, %d ticks/s, %s", self.game.scene.name, rate, kind)
+            shown = f"[{host}]" if ":" in host else host
+            print(f"listening on ws://{shown}:{port}", flush=True)
+            reason, code = await self._stop
+        logger.info("stopping: %s, %d connection(s)", reason, len(self.gateway.connections))
+        self.ticker.stop()
+        self.gateway.stop_listening()
+        self.game.shut_down("the server is going down", RESTART_WAIT_S)
+        with contextlib.suppress(TimeoutError):
+            await asyncio.wait_for(self.gateway.drained(), STOP_S)
+        logger.info("stopped after %.0f s", time.monotonic() - self.started)
+        return code
+
+    def stats(self) -> dict[str, Any]:
+        """What `/stats` shows."""
+        figures = {} if self.ticker is None else self.ticker.stats()
+        return {
+            **self.game.stats(),
+            **figures,
+            "connections": len(self.gateway.connections),
+            "internal_errors": self.gateway.internal_errors + figures.get("ticks_failed", 0),
+            "uptime_s": round(time.monotonic() - self.started, 3),
+            "cpu_s": round(time.process_time(), 3),
+            "rss_mb": round(rss_mb(), 1),
+            "pid": os.getpid(),
+        }
+
+    async def _listen(self) -> tuple[str, int]:
+        host, port = self.settings.host, self.settings.port
+        try:
+            return await self.gateway.listen(host, port)
+        except (OSError, UnicodeError) as error:  # UnicodeError: a host that is no host name at all
+            reason = getattr(error, "strerror", None) or str(error)
+            raise SettingsError(f"host = {host!r}, port = {port}: cannot listen ({reason})") from error
+
+    def _end(self, reason: str, code: int) -> None:
+        if self._stop is not None and not self._stop.done():
+            self._stop.set_result((reason, code))
+
+    def _broken(self) -> None:
+        self._end("too many ticks in a row have failed", 1)
+
+    def _loop_failed(self, loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
+        """An exception that reached the event loop, or trouble of its own, such as no file descriptor left."""
+        error = context.get("exception")
+        self.gateway.internal_errors += 1
+        logger.error("%s", context["message"], exc_info=None if isinstance(error, OSError) else error)
+
+
+def warm_up(scene: Scene) -> None:
+    """Compiles, and takes every way a message goes once, in a game of its own: so the first real tick is not late."""
+
+    class NoLink:
+        def send(self, message: bytes) -> None: ...
+
+        def outstanding(self) -> int:
+            return 0
+
+        def close(self, code: int, reason: str) -> None: ...
+
+    game = Game(scene)
+    session = game.open(NoLink(), 0.0)
+    game.receive(session, encode(Hello(VERSION, {}, "warm-up")), 0.0)
+    for tick in range(1, WARM_UP_TICKS + 1):
+        now = tick / scene.tick_rate
+        game.receive(session, encode(Inputs(tick + 1, tick - 1, bytes((127, 0, 1)))), now)
+        game.tick(now, now)
+    game.lost(session, 1.0)
+    game.tick(1.0, 1.0)
+
+
+def freeze() -> None:
+    """Takes everything that exists by now out of the garbage collector's rounds: it stays until the end anyway."""
+    gc.collect()
+    gc.freeze()
+
+
+def rss_mb() -> float:
+    """Memory of this process that is in RAM, in MB; where the system does not say, the most it ever was, or 0."""
+    try:
+        return int(Path("/proc/self/statm").read_bytes().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
+    except OSError:  # not Linux
+        pass
+    try:
+        import resource
+    except ImportError:  # Windows
+        return 0.0
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak / 1e6 if sys.platform == "darwin" else peak / 1e3
+
+
+def _loop_factory() -> Callable[[], asyncio.AbstractEventLoop]:
+    try:
+        import uvloop
+    except ImportError:
+        return asyncio.new_event_loop
+    return uvloop.new_event_loop
+
+
+def _signals() -> list[signal.Signals]:
+    """What ends a server: SIGINT and SIGTERM, and on Windows Ctrl-Break."""
+    names = ("SIGINT", "SIGTERM", "SIGBREAK")
+    return [getattr(signal, name) for name in names if hasattr(signal, name)]
+
+
+def _leave(number: int, frame: FrameType | None) -> None:
+    """Before there are clients, nobody has to be told."""
+    raise SystemExit(0)
+
+
+@contextlib.contextmanager
+def _on_signals(loop: asyncio.AbstractEventLoop, stop: Callable[[str], None]) -> Iterator[None]:
+    """Calls `stop(name)` for the first signal; from then on signals do what they do by default: end at once."""
+
+    def first(number: signal.Signals) -> None:
+        for each in _signals():
+            signal.signal(each, signal.SIG_DFL)
+        stop(number.name)
+
+    for number in _signals():
+        try:
+            loop.add_signal_handler(number, first, number)
+        except NotImplementedError:  # Windows
+            signal.signal(number, lambda n, _: loop.call_soon_threadsafe(first, signal.Signals(n)))
+    yield

@@ -1,0 +1,331 @@
+"""WebSockets to calls of the game and back; the only file of the server that knows websockets.
+
+websockets parses (its Sans-I/O `ServerProtocol`), asyncio moves bytes, and there is no task and no await per
+connection: what arrives is handed to the game in the call that brings it, what the game sends is written in the call
+that sends it. Nothing here waits for a client. asyncio's flow control (`pause_writing`) has no effect: the game looks
+at `outstanding()` before it sends, and what only a flood of pings could queue ends in an abort.
+
+The life of a connection: handshake (or an HTTP page) -> `game.open` -> `game.receive` ... -> `game.lost`, exactly
+once, as soon as the peer has closed, broken the protocol or gone. A stage that has a peer to wait for has a limit.
+"""
+
+import asyncio
+import json
+import logging
+import socket
+import sys
+import time
+from collections.abc import Callable, Mapping
+from http import HTTPStatus
+from typing import Any, Protocol, cast
+
+from websockets.exceptions import InvalidMessage
+from websockets.frames import CloseCode, Frame, Opcode
+from websockets.http11 import Request, Response
+from websockets.protocol import CONNECTING, OPEN
+from websockets.server import ServerProtocol
+
+from shared.messages import CLIENT_MESSAGE_MAX
+
+if sys.platform == "linux":
+    import fcntl
+    from termios import TIOCOUTQ as SIOCOUTQ
+
+HANDSHAKE_S = 5.0
+"""A connection that has not sent its whole request by then is aborted."""
+CLOSE_S = 2.0
+"""A peer that does not finish closing by then is aborted."""
+BACKLOG_BYTES_MAX = 1 << 20
+"""A peer that lets its answers to pings pile up to this is aborted."""
+REASON_BYTES_MAX = 123
+"""A close frame has room for no more."""
+ACCEPT_BACKLOG = 1024
+
+logger = logging.getLogger(__name__)
+_quiet = logging.getLogger(f"{__name__}.websockets")
+_quiet.setLevel(logging.WARNING)  # two lines per connection otherwise
+
+
+class Events(Protocol):
+    """What the gateway tells the game."""
+
+    def open(self, link: "Connection", now: float) -> Any:
+        """A WebSocket is open; what is returned (not None) stands for it from here on."""
+
+    def receive(self, session: Any, data: bytes, now: float) -> None:
+        """One binary message."""
+
+    def lost(self, session: Any, now: float) -> None:
+        """The WebSocket is no more; once per session."""
+
+
+class Gateway:
+    """Listens, and keeps the set of connections.
+
+    Args:
+        game: told of every event.
+        stats: what `/stats` answers, as JSON; None: there is no such page.
+    """
+
+    def __init__(self, game: Events, stats: Callable[[], Mapping[str, Any]] | None = None) -> None:
+        self.game = game
+        self.connections: set[Connection] = set()
+        self.internal_errors = 0
+        self._stats = stats
+        self._server: asyncio.Server | None = None
+        self._empty: asyncio.Event = asyncio.Event()
+        self._closing = False
+
+    async def listen(self, host: str, port: int) -> tuple[str, int]:
+        """Starts to accept; returns the address (port 0 picks one).
+
+        Raises:
+            OSError: the address cannot be used.
+        """
+        loop = asyncio.get_running_loop()
+        self._server = await loop.create_server(lambda: Connection(self, loop), host, port, backlog=ACCEPT_BACKLOG)
+        sockets = self._server.sockets
+        address = sockets[0].getsockname()
+        # A name with several addresses has a port of its own on each if the system picked them.
+        return (host if port or len(sockets) == 1 else address[0]), address[1]
+
+    def stop_listening(self) -> None:
+        """No new connection, and an end to those that have not become WebSockets."""
+        self._closing = True
+        if self._server is not None:
+            self._server.close()
+        for connection in list(self.connections):
+            if not connection.opened:
+                connection.abort()
+
+    async def drained(self) -> None:
+        """Returns when no connection is left."""
+        while self.connections:
+            self._empty.clear()
+            await self._empty.wait()
+
+    def made(self, connection: "Connection") -> None:
+        self.connections.add(connection)
+        if self._closing:
+            connection.abort()
+
+    def gone(self, connection: "Connection") -> None:
+        self.connections.discard(connection)
+        if not self.connections:
+            self._empty.set()
+
+    def failed(self, what: str) -> None:
+        """Called where an exception of our own is handled: it is logged and counted."""
+        self.internal_errors += 1
+        logger.exception("internal error in %s", what)
+
+    def page(self, request: Request, protocol: ServerProtocol) -> Response:
+        """The answer to a request that does not ask for a WebSocket."""
+        path = request.path.partition("?")[0]
+        if request.method != "GET":
+            return protocol.reject(HTTPStatus.METHOD_NOT_ALLOWED, "GET is all there is\n")
+        if path == "/healthz":
+            return protocol.reject(HTTPStatus.OK, "ok")
+        if path == "/stats" and self._stats is not None:
+            try:
+                text = json.dumps(self._stats())
+            except Exception:
+                self.failed("stats")
+                return protocol.reject(HTTPStatus.INTERNAL_SERVER_ERROR, "internal error\n")
+            response = protocol.reject(HTTPStatus.OK, text + "\n")
+            del response.headers["Content-Type"]
+            response.headers["Content-Type"] = "application/json"
+            return response
+        if path != "/":
+            return protocol.reject(HTTPStatus.NOT_FOUND, f"{path}: no such page\n")
+        response = protocol.reject(HTTPStatus.UPGRADE_REQUIRED, "this is a game server: connect by WebSocket\n")
+        response.headers["Upgrade"] = "websocket"
+        return response
+
+
+class Connection(asyncio.Protocol):
+    """One accepted socket; to the game it is a `server.session.Link`."""
+
+    def __init__(self, gateway: Gateway, loop: asyncio.AbstractEventLoop) -> None:
+        self.opened = False
+        self._gateway = gateway
+        self._loop = loop
+        self._protocol = ServerProtocol(max_size=CLIENT_MESSAGE_MAX, logger=_quiet)
+        self._transport: asyncio.Transport | None = None
+        self._fd = -1
+        self._unacknowledged = bytearray(4)  # a C int that the kernel fills in
+        self._timer: asyncio.TimerHandle | None = None
+        self._timer_is_last = False
+        self._session: Any = None
+        self._deaf = False  # set when this side closes: what still comes is not the game's business
+        self._fragments = bytearray()
+
+    # -- the link, as the game sees it ---------------------------------------------------------------------
+
+    def send(self, message: bytes) -> None:
+        """Queues one binary message; nothing happens if the WebSocket is not open any more."""
+        if self._transport is not None and self._protocol.state is OPEN:
+            self._transport.write(Frame(Opcode.BINARY, message).serialize(mask=False))
+
+    def outstanding(self) -> int:
+        """Bytes that the peer's kernel has not acknowledged (not on Linux: that ours has not taken)."""
+        if self._transport is None:
+            return 0
+        waiting = self._transport.get_write_buffer_size()
+        if sys.platform == "linux":
+            fcntl.ioctl(self._fd, SIOCOUTQ, self._unacknowledged)
+            waiting += int.from_bytes(self._unacknowledged, sys.byteorder)
+        return waiting
+
+    def close(self, code: int, reason: str) -> None:
+        """Closes once what was sent has gone out, with an abort if the peer does not finish within `CLOSE_S`."""
+        self._deaf = True
+        if self._protocol.state is OPEN:
+            self._protocol.send_close(code, reason.encode()[:REASON_BYTES_MAX].decode(errors="ignore"))
+            self._flush()
+
+    # -- what asyncio calls --------------------------------------------------------------------------------
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        self._transport = cast("asyncio.Transport", transport)
+        self._gateway.made(self)
+        self._abort_in(HANDSHAKE_S)
+        sock = transport.get_extra_info("socket")
+        self._fd = sock.fileno()
+        try:
+            sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        except OSError:  # some systems refuse it for a connection that the peer has reset
+            self.abort()
+
+    def data_received(self, data: bytes) -> None:
+        protocol = self._protocol
+        if protocol.state is CONNECTING and not protocol.eof_sent:
+            data = self._shake_hands(data)
+            if not data:
+                return
+        protocol.receive_data(data)
+        for event in protocol.events_received():
+            self._take(cast("Frame", event))
+        self._flush()
+        if protocol.state is not OPEN:
+            self._lose()
+
+    def eof_received(self) -> None:
+        self._protocol.receive_eof()
+        self._flush()
+        self._last_limit()  # asyncio closes the socket once everything is written, which may be never
+        self._lose()
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        if self._timer is not None:
+            self._timer.cancel()
+        self._transport = None
+        self._gateway.gone(self)
+        self._lose()
+
+    # -- inside --------------------------------------------------------------------------------------------
+
+    def abort(self) -> None:
+        if self._transport is not None:
+            self._transport.abort()
+
+    def _shake_hands(self, data: bytes) -> bytes:
+        """Handles the request, and returns what came after it (clients that do not wait for the answer may speak).
+
+        Line by line, for websockets would parse what follows the request before the request is answered.
+        """
+        protocol, start = self._protocol, 0
+        while start < len(data):
+            end = data.find(b"\n", start) + 1 or len(data)
+            protocol.receive_data(data[start:end])
+            start = end
+            events = protocol.events_received()
+            if events:
+                self._answer(cast("Request", events[0]))
+                break
+            if isinstance(protocol.handshake_exc, InvalidMessage):  # of itself websockets only hangs up
+                response = protocol.reject(HTTPStatus.BAD_REQUEST, "this is not an HTTP request\n")
+                protocol.writes.insert(0, response.serialize())
+            if protocol.eof_sent:
+                break
+        self._flush()
+        if protocol.state is not OPEN:
+            return b""
+        self._open()
+        return data[start:]
+
+    def _answer(self, request: Request) -> None:
+        protocol = self._protocol
+        wanted = any("websocket" in value.lower() for value in request.headers.get_all("Upgrade"))
+        protocol.send_response(protocol.accept(request) if wanted else self._gateway.page(request, protocol))
+
+    def _open(self) -> None:
+        if self._timer is not None:
+            self._timer.cancel()
+        self.opened = True
+        try:
+            self._session = self._gateway.game.open(self, time.monotonic())
+        except Exception:
+            self._gateway.failed("open")
+            self.close(CloseCode.INTERNAL_ERROR, "internal error")
+
+    def _take(self, frame: Frame) -> None:
+        """One frame that websockets found in order; it has answered pings and the peer's closing by then."""
+        if self._deaf:
+            return
+        if frame.opcode is Opcode.BINARY and frame.fin:
+            self._deliver(bytes(frame.data))
+        elif frame.opcode is Opcode.TEXT:
+            self.close(CloseCode.UNSUPPORTED_DATA, "text message: binary ones only")
+        elif frame.opcode is Opcode.BINARY or frame.opcode is Opcode.CONT:
+            self._fragments += frame.data
+            if frame.fin:
+                message = bytes(self._fragments)
+                self._fragments.clear()
+                self._deliver(message)
+
+    def _deliver(self, message: bytes) -> None:
+        try:
+            self._gateway.game.receive(self._session, message, time.monotonic())
+        except Exception:
+            self._gateway.failed("receive")
+            self.close(CloseCode.INTERNAL_ERROR, "internal error")
+
+    def _flush(self) -> None:
+        """Writes what websockets wants written."""
+        transport = self._transport
+        writes = self._protocol.data_to_send()
+        if transport is None or not writes:
+            return
+        for data in writes:
+            if data:
+                transport.write(data)
+            elif transport.can_write_eof():
+                transport.write_eof()
+            else:
+                transport.close()
+        if self._protocol.close_expected():
+            self._last_limit()
+        if transport.get_write_buffer_size() > BACKLOG_BYTES_MAX:
+            transport.abort()
+
+    def _lose(self) -> None:
+        """Tells the game, once, that the session is over."""
+        session, self._session = self._session, None
+        if session is None:
+            return
+        try:
+            self._gateway.game.lost(session, time.monotonic())
+        except Exception:
+            self._gateway.failed("lost")
+
+    def _last_limit(self) -> None:
+        """The end has begun: from now on the peer has `CLOSE_S`, whatever else it does."""
+        if not self._timer_is_last:
+            self._timer_is_last = True
+            self._abort_in(CLOSE_S)
+
+    def _abort_in(self, seconds: float) -> None:
+        if self._timer is not None:
+            self._timer.cancel()
+        self._timer = self._loop.call_later(seconds, self.abort)

@@ -1,0 +1,57 @@
+"""Durations, counted in buckets: bounded memory, whatever is recorded and for however long."""
+
+from dataclasses import dataclass, field
+
+FINE = 32
+"""Below so many microseconds each one has a bucket of its own; above, each doubling has half as many (6 % wide)."""
+BUCKETS = FINE + 26 * FINE // 2
+"""Up to 2^31 us, more than half an hour; what is longer goes into the last one."""
+
+
+def _bucket(us: int) -> int:
+    if us < FINE:
+        return max(us, 0)
+    shift = us.bit_length() - FINE.bit_length() + 1
+    return min(shift * (FINE // 2) + (us >> shift), BUCKETS - 1)
+
+
+def _upper_us(bucket: int) -> int:
+    """The lowest duration that no longer goes into a bucket."""
+    if bucket < FINE:
+        return bucket + 1
+    shift = bucket // (FINE // 2) - 1
+    return (bucket - shift * (FINE // 2) + 1) << shift
+
+
+@dataclass
+class Histogram:
+    """Counts durations given in seconds, and answers in milliseconds, at most 6 % too high."""
+
+    count: int = 0
+    max_s: float = 0.0
+    buckets: list[int] = field(default_factory=lambda: [0] * BUCKETS)
+
+    def record(self, seconds: float) -> None:
+        self.count += 1
+        self.buckets[_bucket(int(seconds * 1e6))] += 1
+        if seconds > self.max_s:
+            self.max_s = seconds
+
+    def quantile_ms(self, q: float) -> float:
+        """An upper bound of the `q` quantile; 0 if nothing was recorded."""
+        left = max(1.0, q * self.count)
+        for bucket, n in enumerate(self.buckets):
+            left -= n
+            if n and left <= 0:
+                return min(_upper_us(bucket) / 1e3, self.max_s * 1e3)
+        return self.max_s * 1e3
+
+    def summary(self) -> dict[str, float]:
+        """p50, p99 and max, in milliseconds."""
+        values = {"p50": self.quantile_ms(0.5), "p99": self.quantile_ms(0.99), "max": self.max_s * 1e3}
+        return {name: round(value, 3) for name, value in values.items()}
+
+    def reset(self) -> None:
+        """Forgets everything recorded."""
+        self.count, self.max_s = 0, 0.0
+        self.buckets = [0] * BUCKETS
