@@ -1,0 +1,145 @@
+"""Players without a player: policies, which look at a world once per tick and wish.
+
+A policy knows nothing of networks, so the same one plays over the wire (in a client's predicted world) and inside a
+server. Each is seeded by the random source it is given.
+"""
+
+from collections.abc import Callable
+from typing import Protocol
+
+from client_sdk.core import Core
+from shared.inputs import NEUTRAL, Input, make_input
+from shared.layout import ID, TEMPLATE, VX, X
+from shared.units import BLOCK
+from shared.world import World
+
+
+class Random(Protocol):
+    """What a policy needs of a `random.Random`."""
+
+    def random(self) -> float:
+        """A number from 0 up to 1."""
+        ...
+
+
+class Policy(Protocol):
+    """Decides what one player wishes."""
+
+    def __call__(self, world: World, me: int) -> Input:
+        """The wish for the tick that comes, given the world before it; `me` is an entity in it."""
+        ...
+
+
+class Bot:
+    """A policy at the wheel of a client: `AsyncClient.connect(..., before_update=Bot(Wander(Random(1))))`."""
+
+    def __init__(self, policy: Policy) -> None:
+        self._policy = policy
+        self._tick = -1
+
+    def __call__(self, core: Core) -> None:
+        """Sets the input for the tick that comes, once per tick."""
+        if core.prediction is None:
+            return
+        world = core.prediction.predicted
+        if world.tick != self._tick and core.entity in world:
+            self._tick = world.tick
+            core.set_input(self._policy(world, core.entity))
+
+
+class Stand:
+    """Does nothing."""
+
+    def __init__(self, random: Random) -> None:
+        pass
+
+    def __call__(self, world: World, me: int) -> Input:
+        return NEUTRAL
+
+
+class Wander:
+    """Strolls: a heading for half a second to two, sometimes a pause, now and then a jump."""
+
+    def __init__(self, random: Random) -> None:
+        self._random = random
+        self._until = 0
+        self._wish = NEUTRAL
+
+    def __call__(self, world: World, me: int) -> Input:
+        if world.tick >= self._until:
+            self._until = world.tick + _ticks(world, 0.5 + 1.5 * self._random.random())
+            pause, jump = self._random.random() < 0.2, self._random.random() < 0.2
+            self._wish = NEUTRAL if pause else _heading(self._random, jump=jump)
+        return self._wish
+
+
+class RunAndJump:
+    """Runs at full speed, jumps whenever it can, and turns where it gets no further."""
+
+    def __init__(self, random: Random) -> None:
+        self._random = random
+        self._until = 0
+        self._wish = NEUTRAL
+
+    def __call__(self, world: World, me: int) -> Input:
+        vx, vy = world.state(me)[VX : VX + 2]
+        stuck = vx == 0 == vy and self._wish is not NEUTRAL
+        if world.tick >= self._until or (stuck and self._random.random() < 0.2):
+            self._until = world.tick + _ticks(world, 2.0 + 4.0 * self._random.random())
+            self._wish = _heading(self._random, jump=True)
+        return self._wish
+
+
+class Follow:
+    """Runs after another player up to arm's length, jumps where it gets no further, and picks a new one at times."""
+
+    def __init__(self, random: Random) -> None:
+        self._random = random
+        self._until = 0
+        self._target = 0
+
+    def __call__(self, world: World, me: int) -> Input:
+        if world.tick >= self._until or self._target not in world:
+            self._until = world.tick + _ticks(world, 3.0 + 4.0 * self._random.random())
+            self._target = self._pick(world, me)
+        if not self._target:
+            return NEUTRAL
+        x, y, _ = world.position(me)
+        to_x, to_y, _ = world.position(self._target)
+        way = max(abs(to_x - x), abs(to_y - y))
+        if way < 1.0:
+            return NEUTRAL
+        vx, vy = world.state(me)[VX : VX + 2]
+        return make_input((to_x - x) / way, (to_y - y) / way, jump=vx == 0 or vy == 0)
+
+    def _pick(self, world: World, me: int) -> int:
+        """One of the four nearest of its own kind; 0 if there is nobody."""
+        states = world.states()
+        mine = states[states[:, ID] == me][0]
+        alike = states[(states[:, ID] != me) & (states[:, TEMPLATE] == mine[TEMPLATE])]
+        if not len(alike):
+            return 0
+        way = (alike[:, X : X + 2] - mine[X : X + 2]) / BLOCK
+        nearest = alike[(way * way).sum(axis=1).argsort(kind="stable")[:4], ID].tolist()
+        return int(nearest[int(self._random.random() * len(nearest))])
+
+
+POLICIES: dict[str, Callable[[Random], Policy]] = {
+    "stand": Stand,
+    "wander": Wander,
+    "run-and-jump": RunAndJump,
+    "follow": Follow,
+}
+
+
+def _heading(random: Random, *, jump: bool) -> Input:
+    """Any direction, at full speed."""
+    while True:
+        x, y = 2 * random.random() - 1, 2 * random.random() - 1
+        length = (x * x + y * y) ** 0.5
+        if 0.1 < length <= 1:
+            return make_input(x / length, y / length, jump=jump)
+
+
+def _ticks(world: World, seconds: float) -> int:
+    return max(1, round(seconds * world.scene.tick_rate))

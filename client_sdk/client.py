@@ -1,0 +1,127 @@
+"""What a game developer holds: one object in the game's own loop, without a thread and without an event loop.
+
+with Client.connect("ws://localhost:8765", name="Ann") as client:
+    while client.playing or client.joining:
+        for event in client.poll():
+            print(event)
+        client.set_input(1, 0, jump=pressed("space"))
+        client.update()
+        draw(client.view())
+"""
+
+import time
+from types import TracebackType
+from typing import Protocol
+
+from client_sdk.core import Core, View
+from client_sdk.events import Event, Stats
+from client_sdk.transports.connection import Connection
+from client_sdk.transports.polling import PollingTransport
+from shared.inputs import make_input
+from shared.scene import Scene
+
+
+class Transport(Protocol):
+    """What carries a client's messages. None of these block, but for `close`."""
+
+    def poll(self, now: float) -> None:
+        """Hands what has arrived to the core, and sends."""
+
+    def send(self, now: float) -> None:
+        """Sends what the core wants sent."""
+
+    def close(self, timeout: float) -> None:
+        """Sends, and ends within so many seconds."""
+
+
+class Client:
+    """A player on a server.
+
+    Call `poll`, `set_input`, `update` and `view` once per frame, at any frame rate. Times are float seconds of
+    `time.monotonic()`, unless every call is given another clock's; left out, it is now.
+
+    Args:
+        core: the client's state; read it for whatever is not offered here.
+        transport: what carries its messages.
+    """
+
+    def __init__(self, core: Core, transport: Transport) -> None:
+        self.core = core
+        self._transport = transport
+
+    @classmethod
+    def connect(cls, url: str, *, name: str = "", scene: Scene | None = None, timeout: float = 5.0) -> "Client":
+        """Connects to a server, and returns once it has answered; joining goes on in `poll` and `update`.
+
+        Args:
+            url: where the server is, like ws://localhost:8765.
+            name: shown to others, up to 32 characters.
+            scene: the scene this program was built for; another one on the server ends in `Left`. None: take its.
+            timeout: the longest that this may block, in seconds.
+
+        Raises:
+            ConnectError: there is no connection; the text says why and what to do.
+        """
+        core = Core(name, scene)
+        return cls(core, PollingTransport(Connection(url, core), timeout))
+
+    @property
+    def joining(self) -> bool:
+        """Whether the world is still being fetched: there is nothing to draw yet."""
+        return self.core.state == "joining"
+
+    @property
+    def playing(self) -> bool:
+        """Whether inputs count and there is a world to draw."""
+        return self.core.state == "playing"
+
+    @property
+    def closed(self) -> bool:
+        """Whether it is over; `Left` says why."""
+        return self.core.state == "closed"
+
+    @property
+    def entity(self) -> int:
+        """The own entity; 0 before the server has given one."""
+        return self.core.entity
+
+    @property
+    def stats(self) -> Stats:
+        """Counters since the start."""
+        return self.core.stats
+
+    def poll(self, now: float | None = None) -> list[Event]:
+        """What has happened since the last call, in order: `Joined`, `Corrected`, `Left`, ... Never blocks."""
+        self._transport.poll(time.monotonic() if now is None else now)
+        return self.core.events()
+
+    def set_input(self, x: float, y: float, *, jump: bool = False) -> None:
+        """What the player wishes from now on: a direction (east, north) of length 0 to 1, and whether to jump.
+
+        Raises:
+            ValueError: the direction is not finite.
+        """
+        self.core.set_input(make_input(x, y, jump=jump))
+
+    def update(self, now: float | None = None) -> None:
+        """Predicts up to now and sends the inputs of the ticks that have come."""
+        now = time.monotonic() if now is None else now
+        self.core.update(now)
+        self._transport.send(now)
+
+    def view(self, now: float | None = None) -> View:
+        """What to draw now; positions in blocks."""
+        return self.core.view(time.monotonic() if now is None else now)
+
+    def close(self, timeout: float = 1.0) -> None:
+        """Says goodbye, and waits for the server to do so for at most `timeout` seconds. Again: does nothing."""
+        self.core.close()
+        self._transport.close(timeout)
+
+    def __enter__(self) -> "Client":
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self.close()

@@ -1,0 +1,224 @@
+"""The same client under asyncio: no task per connection, one timer, and one call per chunk of bytes.
+
+    client = await AsyncClient.connect("ws://localhost:8765", name="Ann")
+    async for event in client:
+        ...
+
+Time is `time.monotonic()`: an event loop's own may be as coarse as a millisecond.
+"""
+
+import asyncio
+import ssl
+import time
+from collections import deque
+from collections.abc import Callable
+from types import TracebackType
+
+from client_sdk.core import EVENTS_MAX, Core, View
+from client_sdk.events import Event, Stats
+from client_sdk.transports.connection import CLOSE_S, UNSENT_MAX, ConnectError, Connection, stalled, unreachable
+from shared.inputs import Input
+from shared.scene import Scene
+
+WAIT_S_MIN = 0.001
+"""Timers are that coarse: an update is never asked for earlier."""
+WAIT_S_MAX = 3600.0
+
+
+class AsyncClient:
+    """A player on a server, which lives in an event loop: it predicts and sends by itself.
+
+    Use `connect`. `async for event in client` gives what happens and ends after `Left`; whoever does not ask
+    misses the oldest events.
+
+    Args:
+        before_update: called with the core before each tick is predicted, so that it can set the input.
+    """
+
+    def __init__(self, connection: Connection, before_update: Callable[[Core], None] | None = None) -> None:
+        self.core = connection.core
+        self._connection = connection
+        self._before_update = before_update
+        self._loop = asyncio.get_running_loop()
+        self._transport: asyncio.Transport | None = None
+        self._timer: asyncio.TimerHandle | None = None
+        self._state = self.core.state
+        self._events: deque[Event] = deque(maxlen=EVENTS_MAX)
+        self._waiting: asyncio.Future[None] | None = None
+        self._answered: asyncio.Future[None] = self._loop.create_future()
+        self._gone: asyncio.Future[None] = self._loop.create_future()
+
+    @classmethod
+    async def connect(
+        cls,
+        url: str,
+        *,
+        name: str = "",
+        scene: Scene | None = None,
+        timeout: float = 5.0,
+        before_update: Callable[[Core], None] | None = None,
+    ) -> "AsyncClient":
+        """As `Client.connect`; does not block.
+
+        Raises:
+            ConnectError: there is no connection; the text says why and what to do.
+        """
+        client = cls(Connection(url, Core(name, scene)), before_update)
+        connection = client._connection
+        uri = connection.uri
+        try:
+            async with asyncio.timeout(timeout):
+                await client._loop.create_connection(
+                    lambda: _Stream(client), uri.host, uri.port, ssl=True if uri.secure else None
+                )
+                await client._answered
+        except ConnectError:
+            raise
+        except ssl.SSLError as error:
+            raise ConnectError(f"{url}: no secure connection ({error.reason or error})") from error
+        except OSError as error:  # a TimeoutError is one
+            raise unreachable(connection, error) from error
+        finally:
+            if not connection.opened:
+                client._drop()
+        return client
+
+    @property
+    def entity(self) -> int:
+        """The own entity; 0 before the server has given one."""
+        return self.core.entity
+
+    @property
+    def stats(self) -> Stats:
+        """Counters since the start."""
+        return self.core.stats
+
+    def set_input(self, wish: Input) -> None:
+        """What the player wishes from now on (see `shared.inputs.make_input`)."""
+        self.core.set_input(wish)
+
+    def view(self) -> View:
+        """What to draw now; positions in blocks."""
+        return self.core.view(time.monotonic())
+
+    async def close(self, timeout: float = 1.0) -> None:
+        """Says goodbye, and waits for the server to do so for at most `timeout` seconds. Again: does nothing."""
+        self.core.close()
+        self._pump(time.monotonic())
+        if self._transport is not None:
+            await asyncio.wait((self._gone,), timeout=timeout)
+        self._drop()
+
+    def __aiter__(self) -> "AsyncClient":
+        return self
+
+    async def __anext__(self) -> Event:
+        while not self._events:
+            if self.core.state == "closed":
+                raise StopAsyncIteration
+            self._waiting = self._loop.create_future()
+            await self._waiting
+        return self._events.popleft()
+
+    async def __aenter__(self) -> "AsyncClient":
+        return self
+
+    async def __aexit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        await self.close()
+
+    # -- what the stream and the timer call ------------------------------------------------------------------
+
+    def _made(self, transport: asyncio.Transport) -> None:
+        self._transport = transport
+        transport.set_write_buffer_limits(UNSENT_MAX)
+        self._pump(time.monotonic())
+
+    def _received(self, data: bytes) -> None:
+        now = time.monotonic()
+        self._connection.receive(data, now)
+        self._pump(now)
+
+    def _ended(self, error: Exception | None) -> None:
+        now = time.monotonic()
+        if error is None:
+            self._connection.receive_eof(now)
+        else:
+            self._connection.broke(f"the connection broke off ({error})", now)
+        self._transport = None
+        self._pump(now)
+        self._gone.set_result(None)
+
+    def _stalled(self) -> None:
+        now = time.monotonic()
+        stalled(self._connection, now)
+        self._drop()
+        self._pump(now)
+
+    def _update(self) -> None:
+        now = time.monotonic()
+        core = self.core
+        if self._before_update is not None and core.state == "playing":
+            self._before_update(core)
+        core.update(now)
+        self._pump(now)
+        if self._transport is not None:
+            wait = min(max(core.next_update(now) - now, WAIT_S_MIN), WAIT_S_MAX)
+            self._timer = self._loop.call_later(wait, self._update)
+
+    def _pump(self, now: float) -> None:
+        """Writes what there is to write, hands events on, and acts on a change of state."""
+        connection, core = self._connection, self.core
+        data = connection.data_to_send(now)
+        if self._transport is not None and data:
+            self._transport.write(data)
+        events = core.events()
+        if events:
+            self._events.extend(events)
+            if self._waiting is not None and not self._waiting.done():
+                self._waiting.set_result(None)
+        if not self._answered.done():
+            if connection.refused is not None:
+                self._answered.set_exception(connection.refused)
+            elif connection.opened:
+                self._answered.set_result(None)
+                self._set_timer(0.0, self._update)
+        if core.state != self._state:
+            self._state = core.state
+            if core.state == "closed":
+                self._set_timer(CLOSE_S, self._drop)
+        if connection.done(now):
+            self._drop()
+
+    def _set_timer(self, seconds: float, call: Callable[[], None]) -> None:
+        if self._timer is not None:
+            self._timer.cancel()
+        self._timer = self._loop.call_later(seconds, call)
+
+    def _drop(self) -> None:
+        if self._timer is not None:
+            self._timer.cancel()
+        if self._transport is not None:
+            self._transport.abort()
+            self._transport = None
+
+
+class _Stream(asyncio.Protocol):
+    """asyncio's side of a client."""
+
+    def __init__(self, client: AsyncClient) -> None:
+        self._client = client
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        assert isinstance(transport, asyncio.Transport)
+        self._client._made(transport)
+
+    def data_received(self, data: bytes) -> None:
+        self._client._received(data)
+
+    def connection_lost(self, error: Exception | None) -> None:
+        self._client._ended(error)
+
+    def pause_writing(self) -> None:
+        self._client._stalled()

@@ -1,0 +1,137 @@
+"""One non-blocking socket, looked at when the game says so: no thread, no event loop."""
+
+import contextlib
+import select
+import socket
+import ssl
+import time
+
+from client_sdk.transports.connection import UNSENT_MAX, ConnectError, Connection, stalled, unreachable
+
+READ_BYTES = 64 * 1024
+READS_MAX = 32
+"""Reads per poll, 2 MiB: a game that was away for long does not hang in one poll."""
+NOT_NOW = (BlockingIOError, InterruptedError, ssl.SSLWantReadError, ssl.SSLWantWriteError)
+
+
+class PollingTransport:
+    """A connection over one non-blocking TCP socket (TLS for wss://).
+
+    Args:
+        timeout: seconds that the handshake may take altogether; until then this blocks.
+
+    Raises:
+        ConnectError: there is no connection; the text says why.
+    """
+
+    def __init__(self, connection: Connection, timeout: float) -> None:
+        self._connection = connection
+        self._buffer = memoryview(bytearray(READ_BYTES))
+        self._unsent = bytearray()
+        deadline = time.monotonic() + timeout
+        self._socket: socket.socket | None = _connected(connection, timeout)
+        try:
+            self._socket.setblocking(False)
+            self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            self._handshake(deadline)
+        except BaseException:
+            self._drop()
+            raise
+
+    def poll(self, now: float) -> None:
+        """Takes in what has arrived, and writes what there is to write; never blocks."""
+        if self._socket is None:
+            return
+        self._read(self._socket, now)
+        self.send(now)
+
+    def send(self, now: float) -> None:
+        """Writes what there is to write, as far as it goes; never blocks."""
+        sock = self._socket
+        if sock is None:
+            return
+        data: bytes | bytearray = self._connection.data_to_send(now)
+        if self._unsent:
+            self._unsent += data
+            data = self._unsent
+        if data:
+            self._write(sock, data, now)
+        if self._connection.done(now):
+            self._drop()
+
+    def close(self, timeout: float) -> None:
+        """Writes what there is to write and waits at most so many seconds for the server to close as well."""
+        deadline = time.monotonic() + timeout
+        try:
+            while self._socket is not None and self._wait(deadline):
+                self.poll(time.monotonic())
+        finally:
+            self._drop()
+
+    def _handshake(self, deadline: float) -> None:
+        connection = self._connection
+        while True:
+            self.poll(time.monotonic())
+            if connection.opened:
+                return
+            if connection.refused is not None:
+                raise connection.refused
+            if not self._wait(deadline):
+                raise unreachable(connection, TimeoutError())
+
+    def _wait(self, deadline: float) -> bool:
+        """Waits until there is something to read or write; False once it is too late."""
+        sock, left = self._socket, deadline - time.monotonic()
+        if sock is None or left <= 0:
+            return False
+        select.select([sock], [sock] if self._unsent else [], [], min(left, 0.1))
+        return True
+
+    def _read(self, sock: socket.socket, now: float) -> None:
+        buffer, receive = self._buffer, self._connection.receive
+        for _ in range(READS_MAX):
+            try:
+                n = sock.recv_into(buffer)
+            except NOT_NOW:
+                return
+            except OSError as error:
+                self._connection.broke(f"the connection broke off ({error.strerror or error})", now)
+                return
+            if n == 0:
+                self._connection.receive_eof(now)
+                return
+            receive(buffer[:n], now)
+
+    def _write(self, sock: socket.socket, data: bytes | bytearray, now: float) -> None:
+        try:
+            sent = sock.send(data)
+        except NOT_NOW:
+            sent = 0
+        except OSError as error:
+            self._connection.broke(f"the connection broke off ({error.strerror or error})", now)
+            return
+        self._unsent = bytearray(memoryview(data)[sent:])
+        if len(self._unsent) > UNSENT_MAX:
+            stalled(self._connection, now)
+
+    def _drop(self) -> None:
+        if self._socket is not None:
+            self._socket.close()
+            self._socket = None
+        self._unsent.clear()
+
+
+def _connected(connection: Connection, timeout: float) -> socket.socket:
+    """A stream to the server: TCP, in TLS if the address says so."""
+    uri = connection.uri
+    with contextlib.ExitStack() as undo:
+        try:
+            sock = undo.enter_context(socket.create_connection((uri.host, uri.port), timeout))
+            if uri.secure:
+                sock = ssl.create_default_context().wrap_socket(sock, server_hostname=uri.host)
+        except ssl.SSLError as error:
+            raise ConnectError(f"{connection.url}: no secure connection ({error.reason or error})") from error
+        except OSError as error:
+            raise unreachable(connection, error) from error
+        undo.pop_all()
+    return sock
