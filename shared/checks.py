@@ -19,9 +19,13 @@ def finite(value: object, field: str) -> float:
     """
     if isinstance(value, bool) or not isinstance(value, int | float):
         raise SceneError(f"{field} = {value!r}: must be a number")
-    if not math.isfinite(value):
+    try:
+        number = float(value)
+    except OverflowError:
+        number = math.inf
+    if not math.isfinite(number):
         raise SceneError(f"{field} = {value!r}: must be finite")
-    return float(value)
+    return number
 
 
 def text(value: object, at: str) -> None:

@@ -21,7 +21,7 @@ comparisons only.
 
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from shared.inputs import JUMP
+from shared.inputs import JUMP, MOVE_MAX
 from shared.layout import (
     AWAKE,
     BUTTONS,
@@ -519,8 +519,11 @@ def step(w: Arrays, inputs: Any, n_inputs: int, tick: int) -> None:
     for i in range(n_inputs):
         row = inputs[i, 0]
         for k in range(3):
-            if e[row, MOVE_X + k] != inputs[i, 1 + k]:
-                e[row, MOVE_X + k] = inputs[i, 1 + k]
+            wish = inputs[i, 1 + k]
+            if k < 2:
+                wish = min(max(wish, -MOVE_MAX), MOVE_MAX)
+            if e[row, MOVE_X + k] != wish:
+                e[row, MOVE_X + k] = wish
                 mark(w, row, tick)
         wake(w, row, -1)
 

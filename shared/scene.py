@@ -113,8 +113,8 @@ class Scene:
         to_velocity(self.gravity / self.tick_rate, "gravity")
         if self.gravity > 0 and rounded(self.gravity * SPEED / self.tick_rate) == 0:
             raise SceneError(f"gravity = {self.gravity!r}: vanishes in one tick; 0 switches it off")
-        if self.gravity > 0 and self.terminal_speed == 0:
-            raise SceneError("terminal_speed = 0: nothing could fall; set gravity = 0 instead")
+        if self.gravity > 0 and to_velocity(self.terminal_speed, "terminal_speed") == 0:
+            raise SceneError(f"terminal_speed = {self.terminal_speed!r}: nothing could fall; set gravity = 0 instead")
         if self.integrator not in INTEGRATORS:
             raise SceneError(f"integrator = {self.integrator!r}: must be one of {', '.join(INTEGRATORS)}")
         boolean(self.entity_collision, "entity_collision")

@@ -42,7 +42,7 @@ class World:
 
     def __init__(self, scene: Scene, *, compiled: bool | None = None) -> None:
         self.scene = scene
-        self.tick = 0
+        self._tick = 0
         self.blocks = blocks.Blocks()
         self.compiled = kernels.available() if compiled is None else compiled
         self._kernel: Any = kernels.compiled() if self.compiled else kernels.PLAIN
@@ -62,6 +62,11 @@ class World:
         self._bind()
 
     # -- reading -------------------------------------------------------------------------------------------
+
+    @property
+    def tick(self) -> int:
+        """How many ticks have passed; see `rebase`."""
+        return self._tick
 
     def __len__(self) -> int:
         return len(self._row_of)
@@ -149,7 +154,7 @@ class World:
 
     def state_hash(self, entities: Iterable[int] | None = None) -> bytes:
         """16 bytes over the tick, all blocks and all entities (or just some, and then no blocks)."""
-        digest = hashlib.blake2b(struct.pack("<q", self.tick), digest_size=16)
+        digest = hashlib.blake2b(struct.pack("<q", self._tick), digest_size=16)
         if entities is None:
             entities = self._row_of
             for index in sorted(self.blocks):
@@ -254,7 +259,7 @@ class World:
         if self._next_id > ID_MAX:
             raise SceneError("ids: used up")
         entity = self._next_id
-        self.put([(entity, kind, FALLING if speed[2] > 0 else 0, *at, *speed, 0, 0, 0)])
+        self.put([(entity, kind, self._thrown(speed[2]), *at, *speed, 0, 0, 0)])
         return entity
 
     def place(self, entity: int, position: tuple[float, float, float], *, push: bool = False) -> None:
@@ -268,8 +273,7 @@ class World:
         """Throws an entity, in blocks/s; upwards raises its gravity flag. Raises as `spawn` does, and `KeyError`."""
         state = list(self.state(entity))
         state[VX : VX + 3] = _velocity(velocity)
-        if state[VX + 2] > 0:
-            state[FLAGS] = FALLING
+        state[FLAGS] |= self._thrown(state[VX + 2])
         self.put([tuple(state)])
 
     def set_template(self, entity: int, template: str) -> None:
@@ -298,7 +302,7 @@ class World:
         """Writes whole states ([n, 12], as `state` gives them), new or known: what a snapshot says, verbatim."""
         new = np.array(states if isinstance(states, np.ndarray) else list(states), np.int64).reshape(-1, STATES)
         rows = np.array([self._row(entity) for entity in new[:, ID].tolist()], np.int64)
-        self._kernel.store(self._arrays, self._lent(rows), self._lent(new), len(rows), self.tick + 1)
+        self._kernel.store(self._arrays, self._lent(rows), self._lent(new), len(rows), self._tick + 1)
 
     def write_blocks(self, segment: Cell, offsets: Iterable[int], kinds: Iterable[int]) -> None:
         """Changes blocks of a loaded segment (by index z << 10 | y << 5 | x): what a snapshot says, verbatim."""
@@ -314,7 +318,8 @@ class World:
 
     def rebase(self, tick: int) -> None:
         """Declares what has been written to be the world at the end of `tick`, without a step."""
-        self.tick = tick
+        self._tick = tick
+        self._entities[: self._rows, layout.CHANGED] = -1  # it may be a tick that has been before
         self._lengths[layout.N_CHANGED] = self._lengths[layout.N_FELL] = 0
         if self._limbo:
             for name, length in (("_awake", layout.N_AWAKE), ("_woken", layout.N_WOKEN)):
@@ -338,8 +343,8 @@ class World:
             if n > len(self._inputs):
                 self._inputs = np.zeros((2 * n, 4), np.int64)
             self._inputs[:n] = [(self._row_of[entity], *wish) for entity, wish in inputs.items()]
-        self.tick += 1
-        self._kernel.step(self._arrays, self._lent(self._inputs), n, self.tick)
+        self._tick += 1
+        self._kernel.step(self._arrays, self._lent(self._inputs), n, self._tick)
         if self._limbo:
             self._free += self._limbo
             self._limbo.clear()
@@ -356,7 +361,7 @@ class World:
         self.blocks.heads[cells[cells >= 0]] = -1
         if len(self._entities) != len(other._entities):
             self._allocate(len(other._entities))
-        self.tick, self._next_id, self._rows = other.tick, other._next_id, other._rows
+        self._tick, self._next_id, self._rows = other._tick, other._next_id, other._rows
         self._row_of, self._free, self._limbo = dict(other._row_of), list(other._free), list(other._limbo)
         n = self._rows
         self._entities[:n] = other._entities[:n]
@@ -411,6 +416,10 @@ class World:
             self._row_of[entity] = row
             self._next_id = max(self._next_id, entity + 1)
         return row
+
+    def _thrown(self, speed: int) -> int:
+        """The flags of what flies up: it is not held by what it stands on."""
+        return FALLING if speed > 0 and self._parameters[layout.GRAVITY] else 0
 
     def _template(self, name: str) -> int:
         kind = self.scene.index_of.get(name)

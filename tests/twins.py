@@ -20,7 +20,7 @@ from tests.oracle import Body, Kind, Oracle, nearest
 
 RATES = (20, 30, 32, 60, 64, 128)
 SPEEDS = (0.0, 0.5, 3.0, 8.0, 17.3, 96.0, 1024.0)
-FAR = (0, 0, 10**6, -(10**6), 10**7, -(10**7), RANGE_BLOCKS - 64, 64 - RANGE_BLOCKS)
+FAR = (0, 0, 10**6, -(10**6), 10**7, -(10**7), RANGE_BLOCKS - 4096, 4096 - RANGE_BLOCKS)
 GRID = Fraction(1, BLOCK)
 
 
@@ -149,7 +149,7 @@ class Twins:
             kind,
             [nearest(Fraction(part), GRID) for part in position],
             [nearest(Fraction(part), Fraction(1, SPEED)) for part in velocity],
-            falling=velocity[2] * SPEED >= 0.5,
+            falling=self.scene.gravity > 0 and velocity[2] * SPEED >= 0.5,
         )
         taken = self.oracle.taken(body)
         try:
@@ -210,7 +210,7 @@ class Twins:
         self.world.set_velocity(entity, (x, y, z))
         body = self.oracle.bodies[entity]
         body.velocity = [nearest(Fraction(part), Fraction(1, SPEED)) for part in (x, y, z)]
-        body.falling = body.falling or body.velocity[2] > 0
+        body.falling = body.falling or (self.scene.gravity > 0 and body.velocity[2] > 0)
 
     def _edit(self) -> None:
         """Fills or clears a small box of blocks; refused as a whole where a solid entity is."""
