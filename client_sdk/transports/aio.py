@@ -13,6 +13,7 @@ import time
 from collections import deque
 from collections.abc import Callable
 from types import TracebackType
+from typing import cast
 
 from client_sdk.core import EVENTS_MAX, Core, View
 from client_sdk.events import Event, Stats
@@ -42,6 +43,7 @@ class AsyncClient:
         self._loop = asyncio.get_running_loop()
         self._transport: asyncio.Transport | None = None
         self._timer: asyncio.TimerHandle | None = None
+        self._due = 0.0
         self._state = self.core.state
         self._events: deque[Event] = deque(maxlen=EVENTS_MAX)
         self._waiting: asyncio.Future[None] | None = None
@@ -139,6 +141,8 @@ class AsyncClient:
         now = time.monotonic()
         self._connection.receive(data, now)
         self._pump(now)
+        if self.core.next_update(now) < self._due - WAIT_S_MIN:
+            self._schedule(now)
 
     def _ended(self, error: Exception | None) -> None:
         now = time.monotonic()
@@ -163,9 +167,13 @@ class AsyncClient:
             self._before_update(core)
         core.update(now)
         self._pump(now)
-        if self._transport is not None:
-            wait = min(max(core.next_update(now) - now, WAIT_S_MIN), WAIT_S_MAX)
-            self._timer = self._loop.call_later(wait, self._update)
+        self._schedule(now)
+
+    def _schedule(self, now: float) -> None:
+        """Sets the timer for the next update."""
+        if self._state != "closed":
+            self._due = now + min(max(self.core.next_update(now) - now, WAIT_S_MIN), WAIT_S_MAX)
+            self._set_timer(self._due - now, self._update)
 
     def _pump(self, now: float) -> None:
         """Writes what there is to write, hands events on, and acts on a change of state."""
@@ -183,7 +191,7 @@ class AsyncClient:
                 self._answered.set_exception(connection.refused)
             elif connection.opened:
                 self._answered.set_result(None)
-                self._set_timer(0.0, self._update)
+                self._schedule(now)
         if core.state != self._state:
             self._state = core.state
             if core.state == "closed":
@@ -211,8 +219,7 @@ class _Stream(asyncio.Protocol):
         self._client = client
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        assert isinstance(transport, asyncio.Transport)
-        self._client._made(transport)
+        self._client._made(cast("asyncio.Transport", transport))  # uvloop's are no subclass of it
 
     def data_received(self, data: bytes) -> None:
         self._client._received(data)
