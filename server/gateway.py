@@ -204,9 +204,9 @@ class Connection(asyncio.Protocol):
             if not data:
                 return
         protocol.receive_data(data)
+        self._flush()
         for event in protocol.events_received():
             self._take(cast("Frame", event))
-        self._flush()
         if protocol.state is not OPEN:
             self._lose()
 

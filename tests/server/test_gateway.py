@@ -1,0 +1,495 @@
+"""The gateway over real loopback sockets, with a game that only takes notes, and peers that know no manners."""
+
+import asyncio
+import json
+import logging
+import random
+import socket
+import struct
+import sys
+from collections.abc import AsyncIterator, Callable, Mapping
+from typing import Any
+
+import pytest
+import pytest_asyncio
+from websockets.frames import Frame, Opcode
+
+from server import gateway as module
+from server.gateway import Connection, Gateway
+from shared.messages import CLIENT_MESSAGE_MAX
+
+UPGRADE = (
+    b"GET / HTTP/1.1\r\nHost: x\r\nConnection: Upgrade\r\nUpgrade: websocket\r\n"
+    b"Sec-WebSocket-Version: 13\r\nSec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\n"
+    b"Sec-WebSocket-Extensions: permessage-deflate\r\n\r\n"
+)
+TIME_OUT_S = 5.0
+
+
+class Notes:
+    """A game that writes down what it is told, and raises when a message says so."""
+
+    def __init__(self) -> None:
+        self.opened: list[Connection] = []
+        self.received: list[tuple[int, bytes]] = []
+        self.lost_sessions: list[int] = []
+        self.refuses = False
+
+    def open(self, link: Connection, now: float) -> int:
+        self.opened.append(link)
+        if self.refuses:
+            link.send(b"bye")
+            link.close(4001, "full")
+        return len(self.opened)
+
+    def receive(self, session: int, data: bytes, now: float) -> None:
+        assert type(data) is bytes
+        self.received.append((session, data))
+        link = self.opened[session - 1]
+        if data == b"raise":
+            raise ZeroDivisionError
+        if data == b"echo":
+            link.send(data)
+        if data == b"leave":
+            link.close(4002, "ü" * 100)
+
+    def lost(self, session: int, now: float) -> None:
+        self.lost_sessions.append(session)
+
+    @property
+    def messages(self) -> list[bytes]:
+        return [data for _, data in self.received]
+
+
+class Peer:
+    """A raw socket that can read frames."""
+
+    def __init__(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        self.reader, self.writer = reader, writer
+
+    def write(self, *parts: bytes) -> None:
+        self.writer.write(b"".join(parts))
+
+    async def line(self) -> bytes:
+        return await asyncio.wait_for(self.reader.readuntil(b"\r\n\r\n"), TIME_OUT_S)
+
+    async def frame(self) -> tuple[int, bytes]:
+        async with asyncio.timeout(TIME_OUT_S):
+            first, length = await self.reader.readexactly(2)
+            assert length < 128, "a server does not mask"
+            if length == 126:
+                (length,) = struct.unpack("!H", await self.reader.readexactly(2))
+            return first, await self.reader.readexactly(length)
+
+    async def end(self) -> bytes:
+        """Everything up to the end of the stream, by FIN or by RST."""
+        chunks = []
+        async with asyncio.timeout(TIME_OUT_S):
+            try:
+                while chunk := await self.reader.read(1 << 16):
+                    chunks.append(chunk)
+            except ConnectionError:
+                pass
+        return b"".join(chunks)
+
+    async def closed_with(self, code: int) -> str:
+        """The reason in the close frame with this code, after which the stream ends; whatever comes before it."""
+        while True:
+            first, data = await self.frame()
+            if first == 0x88:
+                break
+        assert struct.unpack("!H", data[:2]) == (code,)
+        assert await self.end() == b""
+        return data[2:].decode()
+
+    def reset(self) -> None:
+        """Goes without a goodbye."""
+        self.writer.transport.abort()
+
+
+class Bench:
+    def __init__(self) -> None:
+        self.notes = Notes()
+        self.gateway = Gateway(self.notes, self.stats)
+        self.address = ("", 0)
+        self.figures: Callable[[], Mapping[str, Any]] = lambda: {"tick": 7}
+        self.peers: list[Peer] = []
+
+    def stats(self) -> Mapping[str, Any]:
+        return self.figures()
+
+    async def connect(self, *first: bytes, **options: Any) -> Peer:
+        peer = Peer(*await asyncio.open_connection(*self.address, **options))
+        self.peers.append(peer)
+        peer.write(*first)
+        return peer
+
+    async def client(self, **options: Any) -> Peer:
+        peer = await self.connect(UPGRADE, **options)
+        assert (await peer.line()).startswith(b"HTTP/1.1 101 ")
+        return peer
+
+    async def until(self, condition: Callable[[], bool]) -> None:
+        async with asyncio.timeout(TIME_OUT_S):
+            while not condition():  # noqa: ASYNC110 - any condition, not one event
+                await asyncio.sleep(0.001)
+
+    async def all_gone(self) -> None:
+        """Every connection has ended, and the game has been told of each exactly once."""
+        async with asyncio.timeout(TIME_OUT_S):
+            await self.gateway.drained()
+        assert sorted(self.notes.lost_sessions) == list(range(1, len(self.notes.opened) + 1))
+
+
+@pytest_asyncio.fixture
+async def bench() -> AsyncIterator[Bench]:
+    bench = Bench()
+    bench.address = await bench.gateway.listen("127.0.0.1", 0)
+    yield bench
+    bench.gateway.stop_listening()
+    for peer in bench.peers:
+        peer.reset()
+    await bench.all_gone()
+
+
+def masked(opcode: Opcode, data: bytes, *, fin: bool = True) -> bytes:
+    return Frame(opcode, data, fin).serialize(mask=True)
+
+
+def binary(data: bytes) -> bytes:
+    return masked(Opcode.BINARY, data)
+
+
+async def test_messages_both_ways_in_order(bench: Bench) -> None:
+    peer = await bench.client()
+    sent = [bytes([n]) * n for n in range(200)] + [bytes(CLIENT_MESSAGE_MAX)]
+    peer.write(*map(binary, sent), binary(b"echo"))
+    assert await peer.frame() == (0x82, b"echo")
+    assert bench.notes.messages == [*sent, b"echo"]
+
+
+async def test_the_socket_has_no_delay_and_there_is_no_compression(bench: Bench) -> None:
+    peer = await bench.connect(UPGRADE)
+    assert b"Sec-WebSocket-Extensions" not in await peer.line()
+    (connection,) = bench.gateway.connections
+    assert connection._transport is not None
+    sock = connection._transport.get_extra_info("socket")
+    assert sock.getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY)
+
+
+async def test_every_chopping_of_the_stream_gives_the_same_messages(bench: Bench) -> None:
+    stream = UPGRADE + b"".join(binary(bytes([n]) * n * 30) for n in range(10))
+    expected = [bytes([n]) * n * 30 for n in range(10)]
+    rng = random.Random(1)
+    for turn in range(20):
+        peer = await bench.connect()
+        at = 0
+        while at < len(stream):
+            step = rng.choice((1, 2, 3, 50, 1000)) if turn else len(stream)
+            peer.write(stream[at : at + step])
+            at += step
+            await peer.writer.drain()
+            await asyncio.sleep(0)
+        await bench.until(lambda: len(bench.notes.received) == len(expected))
+        assert bench.notes.messages == expected
+        bench.notes.received.clear()
+
+
+async def test_a_client_may_speak_before_the_answer_to_its_handshake(bench: Bench) -> None:
+    peer = await bench.connect(UPGRADE, masked(Opcode.PING, b"p"), binary(b"echo"))
+    assert (await peer.line()).startswith(b"HTTP/1.1 101 ")
+    assert await peer.frame() == (0x8A, b"p")
+    assert await peer.frame() == (0x82, b"echo")
+
+
+async def test_fragments_make_one_message_with_pings_between_them(bench: Bench) -> None:
+    peer = await bench.client()
+    peer.write(
+        masked(Opcode.BINARY, b"ec", fin=False),
+        masked(Opcode.PING, b"p"),
+        masked(Opcode.CONT, b"", fin=False),
+        masked(Opcode.CONT, b"ho"),
+        masked(Opcode.BINARY, b"", fin=False),
+        masked(Opcode.CONT, b""),
+    )
+    assert await peer.frame() == (0x8A, b"p")
+    assert await peer.frame() == (0x82, b"echo")
+    await bench.until(lambda: bench.notes.messages == [b"echo", b""])
+
+
+@pytest.mark.parametrize(
+    ("stream", "code"),
+    [
+        (masked(Opcode.TEXT, b"hello"), 1003),
+        (masked(Opcode.TEXT, b"hel", fin=False) + masked(Opcode.CONT, b"lo"), 1003),
+        (binary(bytes(CLIENT_MESSAGE_MAX + 1)), 1009),
+        (masked(Opcode.BINARY, bytes(5000), fin=False) + masked(Opcode.CONT, bytes(5000)), 1009),
+        (b"\x82\xff\xff\xff\xff\xff\xff\xff\xff\xff", 1009),
+        (b"\x82\x05hello", 1002),
+        (b"\x82\x00", 1002),
+        (b"\x83\x80\0\0\0\0", 1002),
+        (b"\xc2\x80\0\0\0\0", 1002),
+        (b"\x09\x80\0\0\0\0", 1002),
+        (b"\x89\xfe\x00\x7e\0\0\0\0" + bytes(126), 1002),
+        (masked(Opcode.CONT, b"x"), 1002),
+        (masked(Opcode.BINARY, b"x", fin=False) + binary(b"y"), 1002),
+        (masked(Opcode.CLOSE, b"\x03"), 1002),
+        (masked(Opcode.CLOSE, b"\x03\xe8\xff"), 1007),
+        (masked(Opcode.CLOSE, b"\x00\x01"), 1002),
+    ],
+)
+async def test_a_broken_protocol_is_answered_with_its_code(
+    bench: Bench, caplog: pytest.LogCaptureFixture, stream: bytes, code: int
+) -> None:
+    peer = await bench.client()
+    peer.write(binary(b"before"), stream, binary(b"after"))
+    closing = asyncio.ensure_future(peer.closed_with(code))
+    if code == 1003:  # an ordinary closing handshake: it is the peer's turn
+        await bench.until(lambda: len(bench.notes.lost_sessions) == 1)
+        peer.write(masked(Opcode.CLOSE, struct.pack("!H", code)))
+    await closing
+    peer.writer.close()
+    await bench.all_gone()
+    assert bench.notes.messages == [b"before"]
+    assert bench.gateway.internal_errors == 0
+    assert [record for record in caplog.records if record.levelno >= logging.WARNING] == []
+
+
+async def test_the_peer_closes_after_a_last_message(bench: Bench) -> None:
+    peer = await bench.client()
+    peer.write(binary(b"last"), masked(Opcode.CLOSE, struct.pack("!H", 1000) + b"enough"))
+    assert await peer.closed_with(1000) == "enough"
+    assert bench.notes.messages == [b"last"]
+    assert bench.notes.lost_sessions == [1], "before the peer has hung up"
+    peer.writer.close()
+    await bench.all_gone()
+
+
+async def test_the_game_closes_after_what_it_has_sent(bench: Bench) -> None:
+    peer = await bench.client()
+    peer.write(binary(b"echo"), binary(b"leave"), binary(b"ignored"))
+    assert await peer.frame() == (0x82, b"echo")
+    first, data = await peer.frame()
+    assert (first, data) == (0x88, struct.pack("!H", 4002) + "ü".encode() * 61), "cut to what a close frame holds"
+    assert bench.notes.messages == [b"echo", b"leave"]
+    link = bench.notes.opened[0]
+    link.send(b"too late")
+    link.close(4003, "again")
+    peer.write(masked(Opcode.CLOSE, data[:2]))
+    assert await peer.end() == b""
+    peer.writer.close()
+    await bench.all_gone()
+    link.send(b"far too late")
+    link.close(4003, "again")
+    assert link.outstanding() == 0
+
+
+async def test_the_game_refuses_at_once(bench: Bench) -> None:
+    bench.notes.refuses = True
+    peer = await bench.client()
+    assert await peer.frame() == (0x82, b"bye")
+    peer.write(binary(b"ignored"), masked(Opcode.CLOSE, b""))
+    assert await peer.closed_with(4001) == "full"
+    peer.writer.close()
+    await bench.all_gone()
+    assert bench.notes.messages == []
+
+
+async def test_an_error_of_the_game_closes_that_connection_and_is_counted(
+    bench: Bench, caplog: pytest.LogCaptureFixture
+) -> None:
+    bad, good = await bench.client(), await bench.client()
+    bad.write(binary(b"raise"), binary(b"raise"))
+    assert await bad.frame() == (0x88, struct.pack("!H", 1011) + b"internal error")
+    good.write(binary(b"echo"))
+    assert await good.frame() == (0x82, b"echo")
+    assert bench.gateway.internal_errors == 1
+    assert [record.exc_info is not None for record in caplog.records if record.levelno == logging.ERROR] == [True]
+
+
+@pytest.mark.parametrize(
+    "rubbish",
+    [
+        b"\r\n\r\n",
+        b"\x00" * 100 + b"\n",
+        b"GET / HTTP/1.1\nHost: x\n\n",
+        b"GET / HTTP/2.0\r\n\r\n",
+        b"GET / HTTP/1.1\r\nno colon\r\n\r\n",
+        b"POST / HTTP/1.1\r\nContent-Length: 5\r\n\r\nhello",
+        b"GET /" + b"a" * 10_000 + b" HTTP/1.1\r\n\r\n",
+        b"GET / HTTP/1.1\r\n" + b"a: b\r\n" * 1000 + b"\r\n",
+        UPGRADE.replace(b"AAAA==", b"AAAA"),
+        UPGRADE.replace(b"13", b"8"),
+        UPGRADE.replace(b"Connection: Upgrade", b"Connection: close"),
+        UPGRADE.replace(b"GET", b"PUT"),
+    ],
+)
+async def test_what_is_no_handshake_is_answered_in_one_line(
+    bench: Bench, caplog: pytest.LogCaptureFixture, rubbish: bytes
+) -> None:
+    peer = await bench.connect(rubbish)
+    head, _, body = (await peer.end()).partition(b"\r\n\r\n")
+    assert head.startswith(b"HTTP/1.1 4")
+    assert 0 < len(body.splitlines()) <= 3
+    peer.writer.close()
+    await bench.all_gone()
+    assert bench.notes.opened == []
+    assert [record for record in caplog.records if record.levelno >= logging.WARNING] == []
+
+
+async def test_random_bytes_in_every_stage_and_the_server_goes_on(
+    bench: Bench, caplog: pytest.LogCaptureFixture
+) -> None:
+    rng = random.Random(7)
+    for turn in range(100):
+        peer = await bench.connect(UPGRADE if turn % 2 else b"")
+        peer.write(rng.randbytes(rng.choice((1, 10, 300, 20_000))))
+        if turn % 3:
+            peer.writer.write_eof()
+            await peer.end()
+            peer.writer.close()
+        else:
+            peer.reset()
+    await bench.all_gone()
+    good = await bench.client()
+    good.write(binary(b"echo"))
+    assert await good.frame() == (0x82, b"echo")
+    assert bench.gateway.internal_errors == 0
+    assert [record for record in caplog.records if record.levelno >= logging.WARNING] == []
+
+
+@pytest.mark.parametrize("sent", [b"", b"GET / HT", UPGRADE, UPGRADE + b"\x82", UPGRADE + binary(bytes(300))[:99]])
+@pytest.mark.parametrize("way", ["half-close", "reset"])
+async def test_the_peer_goes_in_the_middle(bench: Bench, sent: bytes, way: str) -> None:
+    peer = await bench.connect(sent)
+    if sent.startswith(UPGRADE):
+        await peer.line()
+    else:
+        await bench.until(lambda: len(bench.gateway.connections) == 1)
+    if way == "reset":
+        peer.reset()
+    else:
+        peer.writer.write_eof()
+        await peer.end()
+        peer.writer.close()
+    await bench.all_gone()
+    assert bench.notes.received == []
+
+
+async def test_a_handshake_must_be_finished_in_time(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "HANDSHAKE_S", 0.05)
+    slow, good = await bench.connect(UPGRADE[:-2]), await bench.client()
+    assert await slow.end() == b""
+    good.write(binary(b"echo"))
+    assert await good.frame() == (0x82, b"echo")
+
+
+async def test_a_peer_that_does_not_finish_closing_is_aborted(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "CLOSE_S", 0.05)
+    peer = await bench.client()
+    bench.notes.opened[0].close(1000, "")
+    peer.write(*[masked(Opcode.PING, b"")] * 3)  # signs of life gain it nothing
+    await bench.all_gone()
+
+
+async def test_a_peer_that_neither_reads_nor_hangs_up_is_aborted(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "CLOSE_S", 0.05)
+    peer = await bench.client(limit=1024)
+    link = bench.notes.opened[0]
+    for _ in range(200):
+        link.send(bytes(65_000))
+    peer.writer.write_eof()  # half-open: our side still has 13 MB to write
+    await bench.all_gone()
+
+
+async def test_outstanding_counts_what_the_peer_has_not_taken(bench: Bench) -> None:
+    peer = await bench.client(limit=1024)
+    link = bench.notes.opened[0]
+    await bench.until(lambda: link.outstanding() == 0)
+    for _ in range(200):
+        link.send(bytes(65_000))
+    sent = 200 * 65_004
+    assert link._transport is not None
+    if sys.platform == "linux":
+        # All that the peer's kernel has not taken; its receive buffer holds some 6 MB at most.
+        assert link.outstanding() > link._transport.get_write_buffer_size() > 0
+    assert sent - (8 << 20) < link.outstanding() <= sent
+    total = 0
+    while total < sent:
+        total += len(await asyncio.wait_for(peer.reader.read(1 << 20), TIME_OUT_S))
+    await bench.until(lambda: link.outstanding() == 0)
+
+
+async def test_outstanding_is_harmless_after_a_reset(bench: Bench) -> None:
+    peer = await bench.client()
+    link = bench.notes.opened[0]
+    peer.reset()
+    for _ in range(10):
+        link.send(bytes(1000))
+        assert link.outstanding() >= 0
+    await bench.all_gone()
+    assert link.outstanding() == 0
+
+
+async def test_pings_whose_answers_are_not_read_do_not_pile_up(bench: Bench) -> None:
+    peer = await bench.client(limit=1024)
+    (connection,) = bench.gateway.connections
+    pings = masked(Opcode.PING, bytes(125)) * 1000
+    async with asyncio.timeout(30):
+        while connection in bench.gateway.connections:
+            if peer.writer.transport.get_write_buffer_size() < len(pings):
+                peer.write(pings)
+            await asyncio.sleep(0)
+    await bench.all_gone()
+
+
+async def get(bench: Bench, target: str, method: str = "GET") -> tuple[int, str, str]:
+    """Status, content type and body."""
+    peer = await bench.connect(f"{method} {target} HTTP/1.1\r\nHost: x\r\n\r\n".encode())
+    head, _, body = (await peer.end()).decode().partition("\r\n\r\n")
+    headers = dict(line.split(": ", 1) for line in head.splitlines()[1:])
+    assert int(headers["Content-Length"]) == len(body)
+    return int(head.split()[1]), headers["Content-Type"], body
+
+
+async def test_pages(bench: Bench) -> None:
+    assert await get(bench, "/healthz") == (200, "text/plain; charset=utf-8", "ok")
+    status, kind, body = await get(bench, "/stats?x=1")
+    assert (status, kind, json.loads(body)) == (200, "application/json", {"tick": 7})
+    for target, method, expected in (("/", "GET", 426), ("/x", "GET", 404), ("/healthz", "DELETE", 405)):
+        status, _, body = await get(bench, target, method)
+        assert (status, len(body.splitlines())) == (expected, 1)
+    assert bench.notes.opened == []
+
+
+async def test_stats_that_fail_are_our_mistake(bench: Bench) -> None:
+    bench.figures = lambda: {"x": object()}
+    assert (await get(bench, "/stats"))[0] == 500
+    assert bench.gateway.internal_errors == 1
+
+
+async def test_no_stats_no_page() -> None:
+    bench = Bench()
+    bench.gateway = Gateway(bench.notes)
+    bench.address = await bench.gateway.listen("127.0.0.1", 0)
+    assert (await get(bench, "/stats"))[0] == 404
+    bench.gateway.stop_listening()
+    for peer in bench.peers:
+        peer.writer.close()
+    await bench.all_gone()
+
+
+async def test_stop_listening_ends_what_is_no_websocket_and_leaves_the_rest(bench: Bench) -> None:
+    good, idle = await bench.client(), await bench.connect(b"GET")
+    await bench.until(lambda: len(bench.gateway.connections) == 2)
+    bench.gateway.stop_listening()
+    assert await idle.end() == b""
+    good.write(binary(b"echo"))
+    assert await good.frame() == (0x82, b"echo")
+    with pytest.raises(OSError, match=r"."):
+        await bench.connect()
+
+
+async def test_a_busy_port_is_an_os_error(bench: Bench) -> None:
+    with pytest.raises(OSError, match=r"in use"):
+        await Gateway(bench.notes).listen(*bench.address)

@@ -1,0 +1,132 @@
+"""Which source wins, and what a mistake says."""
+
+from pathlib import Path
+
+import pytest
+
+from server.settings import KINDS, Settings, SettingsError, load, parse
+
+
+def config(tmp_path: Path, text: str) -> str:
+    path = tmp_path / "server.toml"
+    path.write_text(text, "utf-8")
+    return str(path)
+
+
+def settings(arguments: list[str], environment: dict[str, str] | None = None) -> Settings:
+    found = parse(arguments, environment or {})
+    assert isinstance(found, Settings)
+    return found
+
+
+def test_defaults() -> None:
+    assert settings([]) == Settings("127.0.0.1", 8765, "hills", None, True, "info")
+    assert settings([]).origins == {}
+
+
+def test_each_source_wins_over_the_one_before(tmp_path: Path) -> None:
+    path = config(tmp_path, 'host = "a"\nport = 1\nscene = "flat"\ntick_rate = 10')
+    environment = {"SOVEREIGN_PORT": "2", "SOVEREIGN_SCENE": "arena", "UNRELATED": "x"}
+    found = settings(["--config", path, "--scene", "topdown"], environment)
+    assert (found.host, found.port, found.scene, found.tick_rate) == ("a", 2, "topdown", 10)
+    assert found.origins == {
+        "host": f"file {path}",
+        "port": "SOVEREIGN_PORT",
+        "scene": "--scene",
+        "tick_rate": f"file {path}",
+    }
+
+
+def test_the_environment_can_name_the_file_and_the_flag_wins(tmp_path: Path) -> None:
+    path = config(tmp_path, "port = 7")
+    assert settings([], {"SOVEREIGN_CONFIG": path}).port == 7
+    with pytest.raises(SettingsError, match="nowhere"):
+        parse(["--config", "nowhere.toml"], {"SOVEREIGN_CONFIG": path})
+
+
+@pytest.mark.parametrize(
+    ("arguments", "environment", "message"),
+    [
+        (["--port", "x"], {}, "port = 'x' (from --port): must be a whole number from 0 to 65535"),
+        (["--port", "65536"], {}, "port = 65536 (from --port): must be a whole number from 0 to 65535"),
+        (["--port=-1"], {}, "port = -1 (from --port): must be a whole number from 0 to 65535"),
+        (["--port", "8e3"], {}, "port = '8e3' (from --port): must be a whole number from 0 to 65535"),
+        (["--port", "٣"], {}, "port = '٣' (from --port): must be a whole number from 0 to 65535"),
+        (["--tick-rate", "0"], {}, "tick_rate = 0 (from --tick-rate): must be a whole number from 1 to 240"),
+        (["--host", ""], {}, "host = '' (from --host): must be a text without spaces around it"),
+        ([], {"SOVEREIGN_PORT": ""}, "port = '' (from SOVEREIGN_PORT): must be a whole number from 0 to 65535"),
+        ([], {"SOVEREIGN_STATS": "maybe"}, "stats = 'maybe' (from SOVEREIGN_STATS): must be true or false"),
+        (
+            ["--log-level", "loud"],
+            {},
+            "log_level = 'loud' (from --log-level): must be one of debug, info, warning, error",
+        ),
+        (["--prot", "1"], {}, "unrecognized arguments: --prot 1; --help lists all flags"),
+        (["--tick", "1"], {}, "unrecognized arguments: --tick 1; --help lists all flags"),
+        (["--port"], {}, "argument --port: expected one argument; --help lists all flags"),
+    ],
+)
+def test_a_mistake_names_the_setting_its_origin_and_the_value(
+    arguments: list[str], environment: dict[str, str], message: str
+) -> None:
+    with pytest.raises(SettingsError) as error:
+        parse(arguments, environment)
+    assert str(error.value) == message
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ('port = "8765"', "port = '8765' (from file {path}): must be a whole number from 0 to 65535"),
+        ("port = true", "port = True (from file {path}): must be a whole number from 0 to 65535"),
+        ("stats = 1", "stats = 1 (from file {path}): must be true or false"),
+        ("host = 1", "host = 1 (from file {path}): must be a text without spaces around it"),
+        ("log_level = []", "log_level = [] (from file {path}): must be one of debug, info, warning, error"),
+        ("origins = {}", "origins (from file {path}): no such setting (there are host, port, "),
+        ("port = ", "config = '{path}': not valid TOML ("),
+        ("port = 1\nport = 2", "config = '{path}': not valid TOML ("),
+    ],
+)
+def test_a_mistake_in_the_file_names_the_file(tmp_path: Path, text: str, message: str) -> None:
+    path = config(tmp_path, text)
+    with pytest.raises(SettingsError) as error:
+        load({}, {}, path)
+    assert str(error.value).startswith(message.format(path=path))
+
+
+def test_a_file_that_is_not_text_or_not_there(tmp_path: Path) -> None:
+    path = tmp_path / "binary.toml"
+    path.write_bytes(b"\xff\xfe")
+    with pytest.raises(SettingsError, match="not valid TOML"):
+        load({}, {}, str(path))
+    with pytest.raises(SettingsError, match="cannot be read"):
+        load({}, {}, str(tmp_path))
+
+
+@pytest.mark.parametrize(("word", "value"), [("TRUE", True), ("1", True), ("no", False), ("false", False)])
+def test_truth_from_the_environment(word: str, value: bool) -> None:
+    assert settings([], {"SOVEREIGN_STATS": word}).stats is value
+
+
+def test_a_flag_of_truth_needs_no_value() -> None:
+    assert settings(["--stats", "--port", "1"], {"SOVEREIGN_STATS": "no"}).stats is True
+    assert settings(["--stats", "false"]).stats is False
+
+
+def test_the_printed_configuration_reads_back(tmp_path: Path) -> None:
+    arguments = ["--scene", 'C:\\new "x"\t.toml', "--tick-rate", "60", "--stats", "no"]
+    text = parse([*arguments, "--print-config"], {})
+    assert isinstance(text, str)
+    assert "tick_rate = 60  # --tick-rate" in text
+    assert settings(["--config", config(tmp_path, text)]) == settings(arguments)
+
+
+def test_help_and_scenes(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as end:
+        parse(["--help"], {})
+    assert end.value.code == 0
+    text = capsys.readouterr().out
+    assert all("--" + name.replace("_", "-") in text for name in KINDS)
+    listed = parse(["--list-scenes"], {"SOVEREIGN_PORT": "broken"})
+    assert isinstance(listed, str)
+    assert {line.split()[0] for line in listed.splitlines()} >= {"flat", "hills", "arena", "topdown"}
