@@ -12,6 +12,7 @@ outliers of) them would have been on time; `Timeline` goes there: at most 10 % f
 at once and down slowly, and with a jump only where the way is longer than 10 ticks.
 """
 
+import heapq
 import math
 from collections import deque
 from typing import Protocol
@@ -90,6 +91,7 @@ class QuantileLead:
 
     def __init__(self, window: int = 320, outliers: int = 3, gap: float = 2.0, safety: float = 0.5) -> None:
         self._paths: deque[float] = deque(maxlen=window)
+        self._target: float | None = None
         self._outliers = outliers
         self._gap = gap
         self._safety = safety
@@ -97,18 +99,22 @@ class QuantileLead:
     def observe(self, tick: int, margin: float, phase: float, now: float) -> None:
         """See `LeadController`."""
         self._paths.append(margin - phase)
+        self._target = None
 
     def target(self, now: float) -> float | None:
         """See `LeadController`."""
-        if len(self._paths) < 16:
-            return None
-        worst = sorted(self._paths)[: self._outliers + 1]
+        if self._target is None and len(self._paths) >= 16:
+            self._target = self._safety - self._level()
+        return self._target
+
+    def _level(self) -> float:
+        worst = heapq.nsmallest(self._outliers + 1, self._paths)
         level = worst[-1]
         for path in reversed(worst):
             if level - path > self._gap:
                 break
             level = path
-        return self._safety - level
+        return level
 
 
 class Timeline:

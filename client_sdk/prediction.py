@@ -23,7 +23,7 @@ from shared.layout import COLUMNS, ID, Int64s, X
 from shared.messages import ProtocolError, Snapshot
 from shared.ring import Ring
 from shared.scene import Scene
-from shared.snapshot import SegmentPart, decode_part
+from shared.snapshot import SegmentPart, decode_parts
 from shared.units import BLOCK, BLOCK_SHIFT, SEGMENT_SHIFT
 from shared.world import STATES, World
 
@@ -72,8 +72,8 @@ class Prediction:
             ProtocolError: a part of it is malformed.
         """
         world = self.confirmed
-        parts = [decode_part(part, self._templates) for part in snapshot.segments]
-        here = {entity for part in parts for entity in part.states[:, ID].tolist()}
+        parts, states = decode_parts(snapshot.segments, self._templates)
+        here = set(states[:, ID].tolist())
         if snapshot.drops:
             self._drop(np.frombuffer(snapshot.drops, "<i4").reshape(-1, 3), here)
         homes = self._homes() if any(part.gone or part.since == KEYFRAME for part in parts) else {}
@@ -85,7 +85,7 @@ class Prediction:
                 world.write_blocks(part.segment, part.edits["block"].tolist(), part.edits["kind"].tolist())
                 self._terrain_changed = True
         if here:
-            world.put(np.concatenate([part.states for part in parts]))
+            world.put(states)
         world.rebase(snapshot.tick)
 
     def _gone(self, part: SegmentPart, homes: dict[int, Cell]) -> list[int]:

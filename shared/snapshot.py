@@ -9,13 +9,14 @@ gone      n * u32: entities that have left the segment or the world
 edits     n * [u16 block, u8 kind]: blocks that changed, by index z << 10 | y << 5 | x
 """
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import msgpack
 import numpy as np
 
 from shared.checks import Cell
-from shared.layout import BUTTONS, CELL, FALLING, FLAGS, ID, TEMPLATE, VX, Int64s, X
+from shared.layout import BUTTONS, CELL, FALLING, TEMPLATE, Int64s, X
 from shared.messages import ENTITY_MAX, ProtocolError
 from shared.units import BLOCK, SEGMENT
 
@@ -33,13 +34,19 @@ assert len(FIELDS) == CELL == BUTTONS + 1
 PART_MAX = 200 * 1024
 """No field of a segment's part is longer, in bytes."""
 
+STATE_LOW = np.array([1, 0, 0, 0, 0, 0, -(1 << 30), -(1 << 30), -(1 << 30), -127, -127, 0], np.int64)
+STATE_HIGH = np.array(
+    [ENTITY_MAX, 255, FALLING, SIDE - 1, SIDE - 1, SIDE - 1, 1 << 30, 1 << 30, 1 << 30, 127, 127, 255], np.int64
+)
+"""The bounds of a state on the wire: nothing a peer sends may take the kernel out of its tables."""
+
 
 class SegmentPart(NamedTuple):
-    """A decoded part: `states` [n, 12] as `World.put` takes them, `gone` ids, `edits` (`EDIT` records)."""
+    """A decoded part: how many of the `states` are its `entities`, `gone` ids, `edits` (`EDIT` records)."""
 
     segment: Cell
     since: int
-    states: Int64s
+    entities: int
     gone: list[int]
     edits: np.ndarray[Any, np.dtype[Any]]
 
@@ -63,47 +70,43 @@ def encode_part(segment: Cell, since: int, rows: Int64s, gone: list[int], edits:
     return msgpack.packb(part)  # type: ignore[no-any-return]
 
 
-def decode_part(part: Any, templates: int) -> SegmentPart:
-    """Checks and unpacks one element of `Snapshot.segments`, in a scene of so many templates.
+def decode_parts(segments: Sequence[Any], templates: int) -> tuple[list[SegmentPart], Int64s]:
+    """Checks and unpacks `Snapshot.segments`, in a scene of so many templates.
+
+    Returns:
+        The parts, and the states ([n, 12], as `World.put` takes them) of all their entities, part after part.
 
     Raises:
-        ProtocolError: anything in it is not as drawn above.
+        ProtocolError: anything is not as drawn above.
     """
+    parts = [_decode_part(segment) for segment in segments]
+    packed = np.frombuffer(b"".join([segment[4] for segment in segments]), ROW)
+    states = np.empty((len(packed), CELL), np.int64)
+    if len(packed):
+        for column, name in enumerate(FIELDS):
+            states[:, column] = packed[name]
+        low, high = states.min(axis=0), states.max(axis=0)
+        if (low < STATE_LOW).any() or (high > STATE_HIGH).any() or high[TEMPLATE] >= templates:
+            raise ProtocolError("segment.rows: a value is out of range")
+        origins = np.array([part.segment for part in parts], np.int64) * SIDE
+        states[:, X : X + 3] += np.repeat(origins, [part.entities for part in parts], axis=0)
+    return parts, states
+
+
+def _decode_part(part: Any) -> SegmentPart:
     if type(part) is not list or len(part) != 7:
         raise ProtocolError("segment: not seven fields")
-    for name, value in zip(("x", "y", "z", "since"), part, strict=False):
-        if type(value) is not int or not -(1 << 31) <= value < 1 << 53:
+    x, y, z, since, rows, gone, edits = part
+    for name, value in (("x", x), ("y", y), ("z", z)):
+        if type(value) is not int or not -(1 << 23) <= value < 1 << 23:
             raise ProtocolError(f"segment.{name} = {str(value)[:40]}: not allowed")
-    for name, value, size in zip(("rows", "gone", "edits"), part[4:], (ROW.itemsize, 4, EDIT.itemsize), strict=True):
+    if type(since) is not int or not -1 <= since < 1 << 53:
+        raise ProtocolError(f"segment.since = {str(since)[:40]}: not allowed")
+    for name, value, size in (("rows", rows, ROW.itemsize), ("gone", gone, 4), ("edits", edits, EDIT.itemsize)):
         if type(value) is not bytes or len(value) > PART_MAX or len(value) % size:
             raise ProtocolError(f"segment.{name}: not allowed")
-    segment = (part[0], part[1], part[2])
-    if not all(-(1 << 23) <= place < 1 << 23 for place in segment):
-        raise ProtocolError(f"segment {segment}: out of range")
-    packed = np.frombuffer(part[4], ROW)
-    states = np.empty((len(packed), CELL), np.int64)
-    for column, name in enumerate(FIELDS):
-        states[:, column] = packed[name]
-    if len(states) and not _sound(states, templates):
-        raise ProtocolError("segment.rows: a value is out of range")
-    for axis in range(3):
-        states[:, X + axis] += segment[axis] * SIDE
-    gone = np.frombuffer(part[5], "<u4").tolist()
-    edits = np.frombuffer(part[6], EDIT)
-    if len(edits) and int(edits["block"].max()) >= SEGMENT**3:
+    edited = np.frombuffer(edits, EDIT)
+    if edits and int(edited["block"].max()) >= SEGMENT**3:
         raise ProtocolError("segment.edits: a block is out of range")
-    return SegmentPart(segment, part[3], states, gone, edits)
-
-
-def _sound(states: Int64s, templates: int) -> bool:
-    places = states[:, X : X + 3]
-    ids = states[:, ID]
-    return bool(
-        ids.min() > 0
-        and ids.max() <= ENTITY_MAX
-        and states[:, TEMPLATE].max() < templates
-        and states[:, FLAGS].max() <= FALLING
-        and places.min() >= 0
-        and places.max() < SIDE
-        and np.abs(states[:, VX : VX + 3]).max() <= 1 << 30
-    )
+    left = np.frombuffer(gone, "<u4").tolist() if gone else []
+    return SegmentPart((x, y, z), since, len(rows) // ROW.itemsize, left, edited)

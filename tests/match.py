@@ -113,7 +113,7 @@ class Player:
 
     def _update(self) -> None:
         core = self.core
-        if core.prediction is not None and core.prediction.predicted.tick != self._acted:
+        if core.state == "playing" and core.prediction and core.prediction.predicted.tick != self._acted:
             self._acted = core.prediction.predicted.tick
             core.set_input(self.policy(core, self.rng))
         core.update(self.local)

@@ -1,0 +1,116 @@
+"""A lone player is never corrected: whatever the network does, both sides compute the same."""
+
+import random
+
+import pytest
+
+from client_sdk.core import Core
+from client_sdk.events import Corrected
+from shared.inputs import JUMP, Input
+from shared.scene import load_scene
+from shared.units import BLOCK
+from tests.match import Match, Path, Player
+
+TICKS = 20_000
+
+
+class Tour:
+    """Walks, jumps and presses into walls all over the place; remembers what it has done."""
+
+    def __init__(self) -> None:
+        self.cells: set[tuple[int, int]] = set()
+        self.pressed = self.jumped = 0
+        self._wish = Input()
+
+    def __call__(self, core: Core, rng: random.Random) -> Input:
+        assert core.prediction is not None
+        state = core.prediction.predicted.state(core.entity)
+        x, y, vx, vy, vz = state[3], state[4], state[6], state[7], state[8]
+        self.cells.add((x // BLOCK, y // BLOCK))
+        blocked = (self._wish.move_x != 0 and vx == 0) or (self._wish.move_y != 0 and vy == 0)
+        self.pressed += blocked
+        self.jumped += vz > 0
+        if x > 51 * BLOCK and y > 51 * BLOCK:  # the pit into the void is near: whom it swallows, the server puts back
+            self._wish = Input(-90, -90)
+        elif rng.random() < (0.1 if blocked else 0.02):
+            self._wish = Input(rng.randint(-127, 127), rng.randint(-127, 127), rng.choice((0, JUMP)))
+        return self._wish
+
+
+def play(scene: str, path: Path, ticks: int, seed: int = 1) -> tuple[Match, Player, Tour]:
+    match, tour = Match(load_scene(scene), seed), Tour()
+    player = match.join(tour, path)
+    match.run_until(lambda: player.core.state == "playing", 20)
+    match.run(ticks / match.game.scene.tick_rate)
+    return match, player, tour
+
+
+@pytest.mark.parametrize("latency_ms", [0, 50, 150, 300])
+def test_no_correction_in_20000_ticks_under_latency_and_jitter(latency_ms: int) -> None:
+    path = Path(delay_s=latency_ms / 2000, jitter_s=0.040)
+    _, player, tour = play("arena", path, TICKS)
+    stats = player.core.stats
+    assert stats.corrections == 0
+    assert stats.resyncs == 0
+    assert stats.inputs_sent >= TICKS - 20
+    assert stats.snapshots >= TICKS - 20
+    assert len(tour.cells) > 500
+    assert tour.pressed > 2000
+    assert tour.jumped > 2000
+    assert player.closed is None
+
+
+def test_the_confirmed_world_is_the_servers_world() -> None:
+    match, player, _ = play("arena", Path(), 500)
+    assert player.core.prediction is not None
+    confirmed = player.core.prediction.confirmed
+    hashes = {}
+    match.on_tick.append(lambda: hashes.update({match.game.world.tick: match.game.world.state_hash()}))
+    match.run(5)
+    assert confirmed.tick in hashes
+    assert confirmed.state_hash() == hashes[confirmed.tick]
+
+
+def test_one_seed_is_one_run() -> None:
+    hashes = [play("arena", Path(0.05, 0.04), 500, seed)[0].game.world.state_hash() for seed in (1, 1, 2)]
+    assert hashes[0] == hashes[1]
+    assert hashes[0] != hashes[2]
+
+
+def test_rolling_back_and_replaying_all_the_time_changes_nothing() -> None:
+    match = Match(load_scene("arena"), 4)
+    player = match.join(Tour(), Path(0.15, 0.04))
+    match.run_until(lambda: player.core.state == "playing", 20)
+    prediction = player.core.prediction
+    assert prediction is not None
+    rehearsed = []
+
+    def rehearse() -> None:
+        before = prediction.predicted.state_hash()
+        rehearsed.append(prediction.predicted.tick - prediction.confirmed.tick)
+        prediction.rehearse()
+        assert prediction.predicted.state_hash() == before
+
+    match.on_tick.append(rehearse)
+    match.run(30)
+    assert player.core.stats.corrections == 0
+    assert min(rehearsed) >= 8
+
+
+def test_a_wall_that_only_the_server_has_corrects_the_client_to_the_bit() -> None:
+    match = Match(load_scene("flat"), 1)
+    player = match.join(lambda core, rng: Input(127, 0), Path(0.05, 0.01))
+    match.run_until(lambda: player.core.state == "playing", 20)
+    prediction = player.core.prediction
+    assert prediction is not None
+    x = int(prediction.predicted.position(player.core.entity)[0]) + 6
+    match.game.world.fill((x, 0, 8), (x + 1, 128, 12), 4)  # not noted: no client is told
+    match.run(10)
+    stats = player.core.stats
+    events = [event for event in player.events if isinstance(event, Corrected)]
+    assert stats.corrections == len(events) > 100
+    assert max(stats.correction_blocks) > 0
+    assert {"x"} <= set(events[0].fields) <= {"x", "vx"}
+    mine = prediction.confirmed.state(player.core.entity)
+    assert mine[3] + round(0.3 * BLOCK) == x * BLOCK
+    assert match.game.world.state(player.core.entity) == mine
