@@ -7,9 +7,9 @@ that stood in no queue, and their median is the estimate.
 An input for tick t is sent when the client's own *timeline* reaches t, and the server tells by how many ticks it
 was early: its margin. Margin minus the timeline's phase at that moment does not depend on where the timeline was,
 only on the path; so the client's own corrections cancel out of the measurement, exactly and at once, and the loop
-cannot oscillate however long the round trip is. `Lead` keeps these and asks for the least phase at which (all but
-outliers of) them would have been on time; `Timeline` goes there: at most 10 % faster or slower than real time, up
-at once and down slowly, and with a jump only where the way is longer than 10 ticks.
+cannot oscillate however long the round trip is. `QuantileLead` keeps these and asks for the least phase at which
+(all but outliers of) them would have been on time; the timeline goes there: up at once, at most 10 % faster than
+real time, down slowly, and with a jump only where the way is longer than 10 ticks.
 """
 
 import heapq
@@ -70,14 +70,22 @@ class ServerClock:
 
 
 class LeadController(Protocol):
-    """Decides the phase of the timeline from the margins of inputs."""
+    """Steers the phase of the timeline: how far ahead of the server to live."""
+
+    def start(self, clock: ServerClock, now: float) -> float:
+        """The phase to begin with, before any input has been sent."""
+        ...
 
     def observe(self, tick: int, margin: float, phase: float, now: float) -> None:
-        """The input for `tick` came `margin` ticks early, sent while the timeline had `phase`."""
+        """The input for `tick`, sent while the timeline had `phase`, came `margin` ticks before its deadline."""
 
-    def target(self, now: float) -> float | None:
-        """The phase to steer to; None: not known yet."""
+    def steer(self, phase: float, elapsed: float, clock: ServerClock, now: float) -> float:
+        """The new phase, `elapsed` ticks after the last call. Called once per update."""
         ...
+
+
+FASTER, SLOWER, JUMP = 0.10, 0.01, 10.0
+"""The timeline runs at most so much faster or slower than real time; it jumps where the way is this many ticks."""
 
 
 class QuantileLead:
@@ -96,16 +104,25 @@ class QuantileLead:
         self._gap = gap
         self._safety = safety
 
+    def start(self, clock: ServerClock, now: float) -> float:
+        """Half the round trip, all the jitter there was, and two ticks."""
+        return clock.phase + (clock.rtt_s / 2 + clock.spread_s) * clock.rate + 2.0
+
     def observe(self, tick: int, margin: float, phase: float, now: float) -> None:
         """See `LeadController`."""
         self._paths.append(margin - phase)
         self._target = None
 
-    def target(self, now: float) -> float | None:
+    def steer(self, phase: float, elapsed: float, clock: ServerClock, now: float) -> float:
         """See `LeadController`."""
         if self._target is None and len(self._paths) >= 16:
             self._target = self._safety - self._level()
-        return self._target
+        if self._target is None:
+            return phase
+        way = self._target - phase
+        if abs(way) > JUMP:
+            return self._target
+        return phase + max(-SLOWER * elapsed, min(way, FASTER * elapsed))
 
     def _level(self) -> float:
         worst = heapq.nsmallest(self._outliers + 1, self._paths)
@@ -120,8 +137,6 @@ class QuantileLead:
 class Timeline:
     """The client's own tick: continuous, a little ahead of the server."""
 
-    FASTER, SLOWER, JUMP = 0.10, 0.01, 10.0
-
     def __init__(self, rate: float, phase: float, now: float) -> None:
         self.rate = rate
         self.phase = phase
@@ -135,13 +150,10 @@ class Timeline:
         """The local time at which a tick is reached, as things stand."""
         return (tick - self.phase) / self.rate
 
-    def steer(self, target: float, now: float) -> bool:
-        """Moves towards a phase; whether it had to jump."""
-        ticks = max(now - self._steered, 0.0) * self.rate
+    def steer(self, lead: LeadController, clock: ServerClock, now: float) -> bool:
+        """Goes where the controller wants; whether that was a jump."""
+        before = self.phase
+        elapsed = max(now - self._steered, 0.0) * self.rate
         self._steered = now
-        way = target - self.phase
-        if abs(way) > self.JUMP:
-            self.phase = target
-            return True
-        self.phase += max(-self.SLOWER * ticks, min(way, self.FASTER * ticks))
-        return False
+        self.phase = lead.steer(before, elapsed, clock, now)
+        return abs(self.phase - before) > JUMP

@@ -158,8 +158,7 @@ class Core:
         assert self.timeline is not None
         assert self.prediction is not None
         assert self._interpolation is not None
-        target = self._lead.target(now)
-        if target is not None and self.timeline.steer(target, now):
+        if self.timeline.steer(self._lead, self.clock, now):
             self._restart(now)
         self._interpolation.advance(self.clock.tick(now), now)
         self._predict(math.floor(self.timeline.tick(now)), now)
@@ -296,9 +295,7 @@ class Core:
         if self.entity not in prediction.confirmed or not self._grounded():
             return
         clock = self.clock
-        # Until the server has told how early inputs come: half the round trip, all its jitter, and two ticks.
-        ahead = (clock.rtt_s / 2 + clock.spread_s) * clock.rate + 2.0
-        self.timeline = Timeline(clock.rate, clock.phase + ahead, now)
+        self.timeline = Timeline(clock.rate, self._lead.start(clock, now), now)
         self._restart(now)
         self.state = "playing"
         self._events.append(Joined(self.entity, self.scene, prediction.predicted.tick))
