@@ -1,0 +1,308 @@
+"""The real process: what it prints, how it ends, and that rubbish from a peer leaves no trace in its log."""
+
+import asyncio
+import json
+import os
+import queue
+import random
+import re
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+import urllib.request
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+from websockets.exceptions import ConnectionClosed
+from websockets.sync.client import ClientConnection, connect
+
+from shared.messages import VERSION, Bye, Hello, Inputs, Message, Welcome, decode_from_server, encode
+
+pytestmark = pytest.mark.e2e
+
+ROOT = Path(__file__).resolve().parents[2]
+START_S = 90.0
+"""Compiling the kernel for the first time takes its time."""
+END_S = 10.0
+UPGRADE = (
+    b"GET / HTTP/1.1\r\nHost: x\r\nConnection: Upgrade\r\nUpgrade: websocket\r\n"
+    b"Sec-WebSocket-Version: 13\r\nSec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\n\r\n"
+)
+
+
+class ServerProcess:
+    """`python -m server` with its two streams read by threads."""
+
+    def __init__(self, *arguments: str, **environment: str) -> None:
+        clean = {name: value for name, value in os.environ.items() if not name.startswith("SOVEREIGN_")}
+        self.process = subprocess.Popen(
+            [sys.executable, "-m", "server", *arguments],
+            cwd=ROOT,
+            env=clean | environment,
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        self.out: queue.Queue[str | None] = queue.Queue()
+        self.errors: list[str] = []
+        self._readers = [
+            threading.Thread(target=self._read_out, daemon=True),
+            threading.Thread(target=self._read_errors, daemon=True),
+        ]
+        for reader in self._readers:
+            reader.start()
+
+    def _read_out(self) -> None:
+        assert self.process.stdout is not None
+        for line in self.process.stdout:
+            self.out.put(line)
+        self.out.put(None)
+
+    def _read_errors(self) -> None:
+        assert self.process.stderr is not None
+        self.errors.extend(self.process.stderr)
+
+    def address(self) -> tuple[str, int]:
+        """Waits for the line that says it is ready."""
+        line = self.out.get(timeout=START_S)
+        found = re.fullmatch(r"listening on ws://(\[[^]]+\]|[^:]+):(\d+)\n", line or "")
+        assert found, (line, self.errors)
+        return found[1].strip("[]"), int(found[2])
+
+    def end(self, number: int | None = None) -> int:
+        """Its exit code, after a signal if one is given; both streams have been read to their ends."""
+        if number is not None:
+            self.process.send_signal(number)
+        code = self.process.wait(END_S if number is not None else START_S)
+        for reader in self._readers:
+            reader.join(END_S)
+        return code
+
+    def rest(self) -> list[str]:
+        """The lines on stdout that nobody has read yet."""
+        lines = []
+        while (line := self.out.get(timeout=END_S)) is not None:
+            lines.append(line)
+        return lines
+
+    def close(self) -> None:
+        if self.process.poll() is None:
+            self.process.kill()
+        self.end()
+        for stream in (self.process.stdout, self.process.stderr):
+            assert stream is not None
+            stream.close()
+
+
+@contextmanager
+def running(*arguments: str, **environment: str) -> Iterator[ServerProcess]:
+    server = ServerProcess(*arguments, **environment)
+    try:
+        yield server
+    finally:
+        server.close()
+
+
+def until(condition: Callable[[], bool], seconds: float = END_S) -> None:
+    deadline = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+
+
+def page(address: tuple[str, int], path: str) -> str:
+    with urllib.request.urlopen(f"http://{address[0]}:{address[1]}{path}", timeout=END_S) as answer:
+        return str(answer.read().decode())
+
+
+def stats(address: tuple[str, int]) -> dict[str, Any]:
+    found: dict[str, Any] = json.loads(page(address, "/stats"))
+    return found
+
+
+@contextmanager
+def joined(address: tuple[str, int]) -> Iterator[tuple[ClientConnection, Welcome]]:
+    with connect(f"ws://{address[0]}:{address[1]}", compression=None) as link:
+        link.send(encode(Hello(VERSION, {}, "test")))
+        welcome = decode_from_server(link.recv(END_S, decode=False))
+        assert isinstance(welcome, Welcome), welcome
+        yield link, welcome
+
+
+def last_words(link: ClientConnection) -> Message:
+    """The last message before the server closes; it must close with a code."""
+    last = None
+    try:
+        while True:
+            last = decode_from_server(link.recv(END_S, decode=False))
+    except ConnectionClosed:
+        assert link.close_code != 1006, "without a close frame"
+    assert last is not None
+    return last
+
+
+def test_serves_and_tells_its_clients_when_it_ends() -> None:
+    with running("--port", "0", "--scene", "flat", "--tick-rate", "64") as server:
+        address = server.address()
+        assert page(address, "/healthz") == "ok"
+        with joined(address) as (link, welcome):
+            link.send(encode(Inputs(welcome.tick + 3, welcome.tick, bytes((127, 0, 0)) * 3)))
+            until(lambda: stats(address)["tick"] > welcome.tick + 20)
+            figures = stats(address)
+            assert (figures["clients"], figures["tick_rate"], figures["internal_errors"]) == (1, 64, 0)
+            assert figures["ticks"] >= 20
+            assert figures["rss_mb"] > 10
+            assert figures["cpu_s"] > 0
+            assert set(figures["tick_lateness_ms"]) == set(figures["tick_work_ms"]) == {"p50", "p99", "max"}
+            asked = time.monotonic()
+            server.process.send_signal(signal.SIGTERM)
+            bye = last_words(link)
+        assert isinstance(bye, Bye)
+        assert bye.wait > 0
+        assert server.end() == 0
+        assert time.monotonic() - asked < 4
+        assert server.rest() == []
+        assert [line.split()[2] for line in server.errors] == ["INFO"] * 3, server.errors
+
+
+@contextmanager
+def mute(address: tuple[str, int]) -> Iterator[socket.socket]:
+    """A WebSocket client that says nothing more, not even when the server closes."""
+    with socket.create_connection(address) as link:
+        link.sendall(UPGRADE)
+        assert link.recv(12) == b"HTTP/1.1 101"
+        yield link
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_a_client_that_does_not_answer_does_not_keep_it(number: signal.Signals) -> None:
+    with running("--port", "0", "--scene", "flat") as server:
+        address = server.address()
+        with mute(address), socket.create_connection(address):
+            until(lambda: stats(address)["connections"] >= 2)
+            asked = time.monotonic()
+            assert server.end(number) == 0
+            assert time.monotonic() - asked < 4
+
+
+@pytest.mark.skipif(os.name == "nt", reason="a signal ends a process there")
+def test_a_second_signal_ends_it_at_once() -> None:
+    with running("--port", "0", "--scene", "flat") as server, mute(server.address()):
+        server.process.send_signal(signal.SIGINT)
+        until(lambda: any("stopping" in line for line in server.errors))
+        asked = time.monotonic()
+        assert server.end(signal.SIGINT) == -signal.SIGINT
+        assert time.monotonic() - asked < 1
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="asks /proc")
+def test_a_signal_before_it_is_ready_ends_it_well() -> None:
+    with running("--port", "0") as server:
+        until(lambda: catches_sigterm(server), START_S)
+        assert server.end(signal.SIGTERM) == 0
+
+
+def catches_sigterm(server: ServerProcess) -> bool:
+    status = Path(f"/proc/{server.process.pid}/status").read_text()
+    found = re.search(r"^SigCgt:\s*([0-9a-f]+)", status, re.MULTILINE)
+    return found is not None and bool(int(found[1], 16) >> (signal.SIGTERM - 1) & 1)
+
+
+@pytest.mark.parametrize("host", ["::1", "localhost"])
+def test_other_hosts(host: str) -> None:
+    if host == "::1":
+        try:
+            with socket.socket(socket.AF_INET6) as probe:
+                probe.bind(("::1", 0))
+        except OSError:
+            pytest.skip("no IPv6")
+    with running("--port", "0", "--scene", "flat", "--host", host) as server:
+        address = server.address()
+        with socket.create_connection(address):
+            pass
+        assert server.end(signal.SIGTERM) == 0
+
+
+def broken(tmp_path: Path, text: str) -> str:
+    path = tmp_path / "broken.toml"
+    path.write_text(text)
+    return str(path)
+
+
+def fails(*arguments: str, **environment: str) -> str:
+    """The one line that a process prints before it ends with exit code 2."""
+    with running(*arguments, **environment) as server:
+        assert server.end() == 2
+        assert server.rest() == []
+        assert len(server.errors) == 1, server.errors
+        return server.errors[0]
+
+
+def test_bad_settings(tmp_path: Path) -> None:
+    assert fails("--port", "x") == "error: port = 'x' (from --port): must be a whole number from 0 to 65535\n"
+    assert "--prot" in fails("--prot", "1")
+    assert "tick_rate = 0 (from SOVEREIGN_TICK_RATE)" in fails(SOVEREIGN_TICK_RATE="0")
+    assert "no_such" in fails("--config", broken(tmp_path, "no_such = 1"))
+
+
+def test_bad_scenes(tmp_path: Path) -> None:
+    assert "'nowhere'" in fails("--scene", "nowhere")
+    assert "not valid TOML" in fails("--scene", broken(tmp_path, "x ="))
+    assert "gravity" in fails("--scene", broken(tmp_path, 'gravity = "much"'))
+    assert "gravity" in fails("--scene", broken(tmp_path, "gravity = 0.0001"), "--tick-rate", "240")
+
+
+def test_bad_addresses() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = str(taken.getsockname()[1])
+        line = fails("--scene", "flat", "--port", port)
+        assert "127.0.0.1" in line
+        assert port in line
+        assert "in use" in line
+    assert "no.such.host.invalid" in fails("--scene", "flat", "--host", "no.such.host.invalid")
+    assert "a..b" in fails("--scene", "flat", "--host", "a..b")
+
+
+async def storm(address: tuple[str, int]) -> None:
+    """Rubbish of every kind, in every stage."""
+    rng = random.Random(11)
+
+    async def one(turn: int) -> None:
+        reader, writer = await asyncio.open_connection(*address)
+        body = rng.randbytes(rng.choice((1, 5, 100, 9000)))
+        if turn % 3 == 1:
+            body = UPGRADE + body
+        elif turn % 3 == 2:  # well-formed frames of nonsense
+            body = UPGRADE + b"\x82\xfe" + len(body[:200]).to_bytes(2, "big") + b"\0\0\0\0" + body[:200]
+        writer.write(body)
+        try:
+            if turn % 2:
+                writer.write_eof()
+                await asyncio.wait_for(reader.read(), END_S)
+        except ConnectionError:
+            pass
+        finally:
+            writer.transport.abort()
+
+    await asyncio.gather(*(one(turn) for turn in range(200)))
+
+
+def test_rubbish_leaves_no_trace_and_the_ticks_go_on() -> None:
+    with running("--port", "0", "--scene", "flat") as server:
+        address = server.address()
+        with joined(address):
+            asyncio.run(storm(address))
+            until(lambda: stats(address)["connections"] == 2)  # the one that has joined, and the one that asks
+            before = stats(address)
+            until(lambda: stats(address)["tick"] > before["tick"] + 5)
+            assert stats(address)["internal_errors"] == 0
+            assert stats(address)["clients"] == 1
+        assert server.end(signal.SIGTERM) == 0
+        assert [line for line in server.errors if " INFO " not in line] == []
