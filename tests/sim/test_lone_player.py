@@ -55,8 +55,8 @@ def test_no_correction_in_20000_ticks_under_latency_and_jitter(latency_ms: int) 
     assert stats.inputs_sent >= TICKS - 20
     assert stats.snapshots >= TICKS - 20
     assert len(tour.cells) > 500
-    assert tour.pressed > 2000
-    assert tour.jumped > 2000
+    assert tour.pressed > 500
+    assert tour.jumped > 500
     assert player.closed is None
 
 
