@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from shared import blocks, kernels, layout, terrain
-from shared.checks import Cell, SceneError
+from shared.checks import Cell, SceneError, whole
 from shared.inputs import Input
 from shared.layout import ENTITY, FALLING, FLAGS, ID, NEXT, PREV, TEMPLATE, VX, Arrays, X
 from shared.scene import Scene
@@ -190,46 +190,47 @@ class World:
         self.blocks.unload(index)
         self._wake_segment(index)  # below the scene's floor, what is not loaded is void
 
-    def set_block(self, x: int, y: int, z: int, kind: int) -> bool:
-        """Places (kind 1 to 255) or removes (0) a block; whether anything changed.
+    def set_block(self, x: int, y: int, z: int, kind: int, *, push: bool = False) -> bool:
+        """Places (kind 1 to 255) or removes (0) a block; whether anything changed. Raises as `fill` does."""
+        return self.fill((x, y, z), (x + 1, y + 1, z + 1), kind, push=push) > 0
 
-        Raises:
-            OverlapError: a solid entity is there.
-            SceneError: not a kind, or no segment is loaded there.
-        """
-        return self.fill((x, y, z), (x + 1, y + 1, z + 1), kind) > 0
-
-    def fill(self, low: Cell, high: Cell, kind: int) -> int:
+    def fill(self, low: Cell, high: Cell, kind: int, *, push: bool = False) -> int:
         """Sets every block of the box between two corners (`high` excluded), or none; how many changed.
 
+        With `push`, solid entities in the way go to their nearest free places as in `place`, in ascending order of id.
+
         Raises:
-            OverlapError: a solid entity is in the way.
+            OverlapError: a solid entity is in the way (and, with `push`, cannot be pushed out of it).
             SceneError: not a kind, or no segment is loaded there.
         """
-        if not 0 <= kind <= blocks.KIND_MAX:
-            raise SceneError(f"kind = {kind!r}: must be 0 to {blocks.KIND_MAX}")
+        whole(kind, "kind", blocks.AIR, blocks.KIND_MAX)
         cells = [
             (x, y, z) for z in range(low[2], high[2]) for y in range(low[1], high[1]) for x in range(low[0], high[0])
         ]
         for cell in cells:
             if blocks.segment_of(*cell) not in self.blocks:
                 raise SceneError(f"block {cell}: its segment is not loaded")
+        in_the_way: list[int] = []
         if kind != blocks.AIR and cells:
-            corners = [part * BLOCK for part in (*low, *high)]
-            in_the_way = self._overlapping(-1, corners)
-            if in_the_way:
+            in_the_way = self._overlapping(-1, [part * BLOCK for part in (*low, *high)])
+            if in_the_way and not push:
                 raise OverlapError(f"blocks {low} to {high}: entity {in_the_way[0]} is there")
-        changed = 0
-        for x, y, z in cells:
-            before = self.blocks.get(x, y, z)
-            if before == kind:
-                continue
+        changed = [(cell, before) for cell in cells if (before := self.blocks.get(*cell) or blocks.AIR) != kind]
+        for (x, y, z), _ in changed:
             self.blocks.set(x, y, z, kind)
-            changed += 1
             if kind == blocks.AIR:
                 face = (x * BLOCK, y * BLOCK, (x + 1) * BLOCK, (y + 1) * BLOCK, (z + 1) * BLOCK)
                 self._kernel.wake_on(self._arrays, -1, *face)
-        return changed
+        states = [self.state(entity) for entity in in_the_way]
+        try:
+            for entity in in_the_way:
+                self.place(entity, self.position(entity), push=True)
+        except OverlapError:
+            for cell, before in changed:
+                self.blocks.set(*cell, before)
+            self.put(states)
+            raise
+        return len(changed)
 
     # -- entities ------------------------------------------------------------------------------------------
 
