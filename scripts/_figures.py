@@ -1,0 +1,187 @@
+"""What a load test has measured: from raw counts to figures, a table and a verdict in words. Nothing runs here."""
+
+from collections import Counter
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+from shared.messages import MALFORMED
+
+SNAPSHOTS_SHARE_MIN = 0.95
+LATE_SHARE_MAX = 0.01
+PACE_MIN = 0.98
+MEMORY_MB_MAX = 5.0
+MEMORY_SETTLED_S = 10
+
+Figures = dict[str, Any]
+
+
+class Judgement(NamedTuple):
+    """One sentence of the verdict."""
+
+    good: bool
+    text: str
+
+
+def quantiles(values: Sequence[float]) -> dict[str, float]:
+    """p50, p99 and max; zeros for no values."""
+    if not values:
+        return {"p50": 0.0, "p99": 0.0, "max": 0.0}
+    ordered = sorted(values)
+    last = len(ordered) - 1
+    return {name: round(ordered[round(q * last)], 4) for name, q in (("p50", 0.5), ("p99", 0.99), ("max", 1.0))}
+
+
+def figures(
+    clients: Sequence[Figures], seconds: float, before: Figures, after: Figures, bots_cpu_s: float, rss_mb: list[float]
+) -> Figures:
+    """The figures of the window.
+
+    Args:
+        clients: what each bot counted in the window (`_swarm.Player.figures`).
+        before, after: `/stats` at its ends; empty if the server does not tell.
+    """
+    n = len(clients)
+    ticks = after["ticks"] - before["ticks"] if before and after else None
+    expected = max((client["ticks"] for client in clients), default=0)
+    shares = sorted(min(1.0, client["snapshots"] / expected) if expected else 0.0 for client in clients)
+    causes: Counter[str] = Counter()
+    for client in clients:
+        causes.update(client["causes"])
+    gone = [client["left"] for client in clients if client["left"]]
+
+    def total(name: str) -> int:
+        return int(sum(client[name] for client in clients))
+
+    def per_client_tick_us(cpu_s: float) -> float | None:
+        return round(cpu_s * 1e6 / (n * ticks), 2) if ticks and n else None
+
+    return {
+        "clients": n,
+        "seconds": round(seconds, 3),
+        "tick_rate": after.get("tick_rate"),
+        "server_ticks": ticks,
+        "tick_lateness_ms": after.get("tick_lateness_ms"),
+        "snapshots_per_client_per_s": round(total("snapshots") / n / seconds, 3),
+        "snapshots_share": {"worst": round(shares[0], 4), "p50": round(shares[n // 2], 4)},
+        "clients_with_95_percent": sum(share >= SNAPSHOTS_SHARE_MIN for share in shares),
+        "inputs_sent": total("inputs_sent"),
+        "inputs_late": total("inputs_late"),
+        "inputs_late_share": round(total("inputs_late") / max(1, total("inputs_sent")), 6),
+        "corrections": total("corrections"),
+        "corrections_per_client_minute": round(total("corrections") / n / seconds * 60, 3),
+        "correction_blocks": quantiles([size for client in clients for size in client["correction_blocks"]]),
+        "corrections_by_cause": dict(causes),
+        "replayed_ticks_per_client_per_s": round(total("replayed_ticks") / n / seconds, 2),
+        "resyncs": total("resyncs"),
+        "lead_ticks": quantiles([client["lead_ticks"] for client in clients]),
+        "rtt_ms": quantiles([client["rtt_ms"] for client in clients]),
+        "bytes_per_client_per_s": {
+            "up": round(total("bytes_up") / n / seconds, 1),
+            "down": round(total("bytes_down") / n / seconds, 1),
+        },
+        "server_cpu_us_per_client_tick": per_client_tick_us(after["cpu_s"] - before["cpu_s"]) if ticks else None,
+        "server_cpu_share": round((after["cpu_s"] - before["cpu_s"]) / seconds, 4) if ticks else None,
+        "bots_cpu_us_per_client_tick": per_client_tick_us(bots_cpu_s),
+        "server_rss_mb": rss_mb,
+        "disconnects": len(gone),
+        "malformed": sum(left["code"] == MALFORMED for left in gone),
+        "reasons": dict(Counter(left["reason"] for left in gone)),
+    }
+
+
+def rows(f: Figures) -> list[tuple[str, str]]:
+    """The table: what, and how much."""
+    lateness, sizes, bytes_s = f["tick_lateness_ms"], f["correction_blocks"], f["bytes_per_client_per_s"]
+    memory = f["server_rss_mb"]
+    return [
+        ("clients", f"{f['clients']} for {f['seconds']:.1f} s at {f['tick_rate'] or '?'} ticks/s"),
+        ("server ticks", _or_unknown(f["server_ticks"], "")),
+        ("tick lateness, since its start", _three(lateness, "ms") if lateness else "not told"),
+        (
+            "snapshots per client",
+            f"{f['snapshots_per_client_per_s']:.1f} /s (worst {f['snapshots_share']['worst']:.1%})",
+        ),
+        ("inputs", f"{f['inputs_sent']} sent, {f['inputs_late_share']:.2%} late"),
+        ("lead", f"{_three(f['lead_ticks'], 'ticks')}"),
+        ("corrections", f"{f['corrections']} ({f['corrections_per_client_minute']:.1f} per client and minute)"),
+        ("their size", _three(sizes, "blocks") if f["corrections"] else "none"),
+        ("bytes per client", f"{bytes_s['up'] / 1e3:.2f} KB/s up, {bytes_s['down'] / 1e3:.2f} KB/s down"),
+        ("server CPU", _or_unknown(f["server_cpu_us_per_client_tick"], " us per client and tick")),
+        ("bots' CPU", _or_unknown(f["bots_cpu_us_per_client_tick"], " us per client and tick")),
+        ("server memory", f"{memory[0]:.0f} to {memory[-1]:.0f} MB" if memory else "not told"),
+        ("disconnects", str(f["disconnects"])),
+    ]
+
+
+def verdict(f: Figures) -> list[Judgement]:
+    """In words, what is good and what is not."""
+    n = f["clients"]
+    good_clients, worst = f["clients_with_95_percent"], f["snapshots_share"]["worst"]
+    judgements = [
+        Judgement(
+            good_clients == n,
+            f"{good_clients} of {n} clients got at least 95 % of their snapshots (worst {worst:.1%})",
+        ),
+        Judgement(
+            f["disconnects"] == 0,
+            "no client lost its connection"
+            if f["disconnects"] == 0
+            else f"{f['disconnects']} of {n} clients are gone: " + "; ".join(f["reasons"]),
+        ),
+    ]
+    if f["server_ticks"] is not None:
+        judgements.append(_pace(f))
+    late = f["inputs_late_share"]
+    judgements.append(
+        Judgement(
+            late <= LATE_SHARE_MAX, f"{late:.2%} of the inputs came too late (up to {LATE_SHARE_MAX:.0%} is good)"
+        )
+    )
+    judgements.append(_corrections(f))
+    memory = f["server_rss_mb"]
+    if len(memory) >= 2 * MEMORY_SETTLED_S:
+        grown = memory[-1] - memory[MEMORY_SETTLED_S]
+        judgements.append(
+            Judgement(
+                grown <= MEMORY_MB_MAX,
+                f"the server's memory grew by {max(grown, 0):.1f} MB after the first {MEMORY_SETTLED_S} s",
+            )
+        )
+    return judgements
+
+
+def failures(f: Figures) -> list[str]:
+    """Why the test has failed; empty if it has not."""
+    found = []
+    if f["disconnects"]:
+        found.append(f"{f['disconnects']} bot(s) died: " + "; ".join(f["reasons"]))
+    if f["malformed"]:
+        found.append(f"{f['malformed']} message(s) were malformed")
+    return found
+
+
+def _pace(f: Figures) -> Judgement:
+    wanted = f["tick_rate"] * f["seconds"]
+    pace, period_ms, p99 = f["server_ticks"] / wanted, 1e3 / f["tick_rate"], f["tick_lateness_ms"]["p99"]
+    text = f"the server made {pace:.1%} of its ticks; 99 % began within {p99:.1f} ms (a tick is {period_ms:.0f} ms)"
+    return Judgement(pace >= PACE_MIN and p99 < period_ms, text)
+
+
+def _corrections(f: Figures) -> Judgement:
+    if not f["corrections"]:
+        return Judgement(True, "no prediction had to be corrected")
+    by_late = f["corrections_by_cause"].get("late input", 0)
+    met = f["corrections"] - by_late
+    text = (
+        f"{f['corrections']} corrections of {f['inputs_sent']} predicted ticks, half of them under "
+        f"{max(f['correction_blocks']['p50'], 0.01):.2f} blocks: {met} where players met, {by_late} after late inputs"
+    )
+    return Judgement(by_late <= LATE_SHARE_MAX * f["inputs_sent"], text)
+
+
+def _three(values: dict[str, float], unit: str) -> str:
+    return f"{values['p50']:.2f} / {values['p99']:.2f} / {values['max']:.2f} {unit} (p50 / p99 / max)"
+
+
+def _or_unknown(value: float | None, unit: str) -> str:
+    return "not told" if value is None else f"{value:g}{unit}"

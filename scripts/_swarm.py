@@ -1,0 +1,169 @@
+"""One process full of bots, told what to do over its pipes; `loadtest.py` starts it.
+
+argument  {"url", "first", "clients", "seed", "policy", "joins_per_s"}, as JSON
+stdin     "measure": the window begins; "stop": it ends, say goodbye; the end of the pipe: give up
+stdout    one JSON object per line: {"playing", "ended"} while joining and playing, and last {"clients", "cpu_s"}
+"""
+
+import asyncio
+import gc
+import json
+import random
+import sys
+import threading
+import time
+from dataclasses import dataclass, field
+from typing import Any
+
+from client_sdk.bots import POLICIES, Bot
+from client_sdk.events import Left, Stats
+from client_sdk.transports.aio import AsyncClient
+from client_sdk.transports.connection import ConnectError
+
+REPORT_S = 0.2
+COUNTERS = (
+    *("snapshots", "inputs_sent", "inputs_late", "corrections", "repredictions", "replayed_ticks", "resyncs"),
+    *("bytes_up", "bytes_down"),
+)
+
+
+@dataclass
+class Player:
+    """A bot, from the attempt to connect to its end."""
+
+    name: str
+    client: AsyncClient | None = None
+    left: dict[str, Any] | None = None
+    """Why it is no longer there; None: it is, or nobody has tried yet."""
+    before: dict[str, float] = field(default_factory=dict)
+    causes_before: dict[str, int] = field(default_factory=dict)
+    tick_before: int = 0
+
+    @property
+    def playing(self) -> bool:
+        return self.client is not None and self.client.core.state == "playing"
+
+    async def play(self, url: str, bot: Bot) -> None:
+        """Connects, and lives until it is over."""
+        try:
+            self.client = await AsyncClient.connect(url, name=self.name, before_update=bot, timeout=20.0)
+        except ConnectError as error:
+            self.left = {"code": 0, "reason": str(error)}
+            return
+        async for event in self.client:
+            if isinstance(event, Left):
+                self.left = {"code": event.code, "reason": event.reason}
+
+    def mark(self) -> None:
+        """The window begins."""
+        if self.client is not None:
+            self.before = counters(self.client.stats)
+            self.causes_before = dict(self.client.stats.corrections_by_cause)
+            self.tick_before = self._tick()
+
+    def figures(self) -> dict[str, Any]:
+        """What has happened since `mark`."""
+        left = self.left or (None if self.playing else {"code": 0, "reason": "it never got to play"})
+        base: dict[str, Any] = {"name": self.name, "left": left, "ticks": 0} | dict.fromkeys(COUNTERS, 0)
+        if self.client is None or not self.before:
+            return base | {"correction_blocks": [], "causes": {}, "lead_ticks": 0.0, "rtt_ms": 0.0}
+        stats = self.client.stats
+        figures = {name: value - self.before[name] for name, value in counters(stats).items()}
+        causes = {
+            cause: n - self.causes_before.get(cause, 0)
+            for cause, n in stats.corrections_by_cause.items()
+            if n > self.causes_before.get(cause, 0)
+        }
+        sizes = stats.correction_blocks[-int(figures["corrections"]) :] if figures["corrections"] else []
+        return (
+            base
+            | figures
+            | {
+                "ticks": self._tick() - self.tick_before,
+                "correction_blocks": sizes,
+                "causes": causes,
+                "lead_ticks": stats.lead_ticks,
+                "rtt_ms": stats.rtt_s * 1e3,
+            }
+        )
+
+    def _tick(self) -> int:
+        """The newest tick that the server has told of."""
+        prediction = self.client.core.prediction if self.client is not None else None
+        return prediction.confirmed.tick if prediction is not None else 0
+
+
+def counters(stats: Stats) -> dict[str, float]:
+    return {name: getattr(stats, name) for name in COUNTERS}
+
+
+async def swarm(order: dict[str, Any]) -> int:
+    """Runs the bots until told to stop."""
+    commands = listen()
+    players = [Player(f"bot {order['first'] + i}") for i in range(order["clients"])]
+    make = POLICIES[order["policy"]]
+    lives: list[asyncio.Task[None]] = []
+    joining = asyncio.create_task(join(order, players, make, lives))
+    cpu_s = 0.0
+    while True:
+        say({"playing": sum(p.playing for p in players), "ended": [p.left for p in players if p.left]})
+        try:
+            command = await asyncio.wait_for(commands.get(), REPORT_S)
+        except TimeoutError:
+            continue
+        if command == "measure":
+            gc.collect()
+            gc.freeze()
+            cpu_s = time.process_time()
+            for player in players:
+                player.mark()
+        elif command == "stop":
+            say({"clients": [player.figures() for player in players], "cpu_s": time.process_time() - cpu_s})
+        if command != "measure":
+            break
+    joining.cancel()
+    await asyncio.gather(*(p.client.close() for p in players if p.client is not None))
+    for life in lives:
+        life.cancel()
+    await asyncio.gather(*lives, return_exceptions=True)
+    return 0
+
+
+async def join(order: dict[str, Any], players: list[Player], make: Any, lives: list[asyncio.Task[None]]) -> None:
+    """Starts the bots one by one, at a bounded pace."""
+    begun = time.monotonic()
+    for i, player in enumerate(players):
+        bot = Bot(make(random.Random(f"{order['seed']} {player.name}")))
+        lives.append(asyncio.create_task(player.play(order["url"], bot)))
+        await asyncio.sleep(max(0.0, begun + (i + 1) / order["joins_per_s"] - time.monotonic()))
+
+
+def listen() -> asyncio.Queue[str]:
+    """The lines of stdin, then "" at its end. A thread reads them, for pipes are no sockets everywhere."""
+    commands: asyncio.Queue[str] = asyncio.Queue()
+    loop = asyncio.get_running_loop()
+
+    def read() -> None:
+        for line in sys.stdin:
+            loop.call_soon_threadsafe(commands.put_nowait, line.strip())
+        loop.call_soon_threadsafe(commands.put_nowait, "")
+
+    threading.Thread(target=read, daemon=True).start()
+    return commands
+
+
+def say(what: dict[str, Any]) -> None:
+    print(json.dumps(what), flush=True)
+
+
+def run(order: dict[str, Any]) -> int:
+    """The process's whole life."""
+    try:
+        import uvloop
+    except ImportError:
+        return asyncio.run(swarm(order))
+    return int(uvloop.run(swarm(order)))
+
+
+if __name__ == "__main__":
+    sys.exit(run(json.loads(sys.argv[1])))
