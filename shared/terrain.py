@@ -7,9 +7,10 @@ import numpy as np
 import numpy.typing as npt
 
 from shared.blocks import Kinds
-from shared.checks import Cell, SceneError
+from shared.checks import Cell, SceneError, whole
 from shared.units import SEGMENT
 
+PARAMETER_MAX = 1 << 31
 STONE, SOIL, GRASS, WALL = 1, 2, 3, 4
 
 Ints = npt.NDArray[np.int64]
@@ -26,6 +27,8 @@ def generate(terrain: Mapping[str, Any], segment: Cell) -> Kinds:
     if name not in GENERATORS:
         raise SceneError(f"terrain.generator = {name!r}: no such generator (there are {', '.join(GENERATORS)})")
     parameters = {key: value for key, value in terrain.items() if key != "generator"}
+    for key in parameters.keys() - {"fill"}:
+        whole(parameters[key], f"terrain.{key}", 1 if key == "scale" else -PARAMETER_MAX, PARAMETER_MAX)
     try:
         return np.ascontiguousarray(GENERATORS[name](segment, **parameters)).reshape(-1)
     except (TypeError, ValueError) as error:
