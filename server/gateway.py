@@ -1,9 +1,10 @@
 """WebSockets to calls of the game and back; the only file of the server that knows websockets.
 
-websockets parses (its Sans-I/O `ServerProtocol`), asyncio moves bytes, and there is no task and no await per
-connection: what arrives is handed to the game in the call that brings it, what the game sends is written in the call
-that sends it. Nothing here waits for a client. asyncio's flow control (`pause_writing`) has no effect: the game looks
-at `outstanding()` before it sends, and what only a flood of pings could queue ends in an abort.
+websockets parses (its Sans-I/O `ServerProtocol`; only plain messages are cut out here), asyncio moves bytes, and there
+is no task and no await per connection: what arrives is handed to the game in the call that brings it, what the game
+sends is written in the call that sends it. Nothing here waits for a client. asyncio's flow control (`pause_writing`)
+has no effect: the game looks at `outstanding()` before it sends, and what only a flood of pings could queue ends in
+an abort.
 
 The life of a connection: handshake (or an HTTP page) -> `game.open` -> `game.receive` ... -> `game.lost`, exactly
 once, as soon as the peer has closed, broken the protocol or gone. A stage that has a peer to wait for has a limit.
@@ -27,6 +28,10 @@ from websockets.server import ServerProtocol
 
 from shared.messages import CLIENT_MESSAGE_MAX
 
+try:
+    from websockets.speedups import apply_mask
+except ImportError:  # the same, plain
+    from websockets.utils import apply_mask
 if sys.platform == "linux":
     import fcntl
     from termios import TIOCOUTQ as SIOCOUTQ
@@ -37,6 +42,10 @@ CLOSE_S = 2.0
 """A peer that does not finish closing by then is aborted."""
 BACKLOG_BYTES_MAX = 1 << 20
 """A peer that lets its answers to pings pile up to this is aborted."""
+OPCODES = frozenset(Opcode)
+FINAL_BINARY = 0x82
+MASKED = 0x80
+"""First byte of the only frame that clients have a reason to send; bit of the second that it must have."""
 REASON_BYTES_MAX = 123
 """A close frame has room for no more."""
 ACCEPT_BACKLOG = 1024
@@ -158,7 +167,10 @@ class Connection(asyncio.Protocol):
         self._timer_is_last = False
         self._session: Any = None
         self._deaf = False  # set when this side closes: what still comes is not the game's business
+        self._plain = True  # false from the first frame on that only websockets may judge
+        self._tail = b""  # of a plain stream: the beginning of a frame
         self._fragments = bytearray()
+        self._fragmented = False
 
     # -- the link, as the game sees it ---------------------------------------------------------------------
 
@@ -203,10 +215,10 @@ class Connection(asyncio.Protocol):
             data = self._shake_hands(data)
             if not data:
                 return
-        protocol.receive_data(data)
-        self._flush()
-        for event in protocol.events_received():
-            self._take(cast("Frame", event))
+        if self._plain:
+            self._cut(data)
+        else:
+            self._parse(data)
         if protocol.state is not OPEN:
             self._lose()
 
@@ -269,6 +281,45 @@ class Connection(asyncio.Protocol):
             self._gateway.failed("open")
             self.close(CloseCode.INTERNAL_ERROR, "internal error")
 
+    def _cut(self, data: bytes) -> None:
+        """Delivers whole plain messages at once (0.7 us instead of 3.4 by way of websockets) and has it parse the rest.
+
+        It gets pings, fragments and the like frame by frame, and everything from the first oddity on: then it decides.
+        """
+        if self._tail:
+            data, self._tail = self._tail + data, b""
+        at, size = 0, len(data)
+        while size - at >= 2:
+            first, second = data[at], data[at + 1]
+            length, mask = second & 127, at + 2
+            if length == 126 and size - at >= 4:
+                length, mask = data[at + 2] << 8 | data[at + 3], at + 4
+            odd = second < MASKED or second == MASKED | 127 or length > CLIENT_MESSAGE_MAX or self._deaf
+            if odd or (first != FINAL_BINARY and first & 15 not in OPCODES):
+                self._plain = False
+                self._parse(data[at:])
+                return
+            start, end = mask + 4, mask + 4 + length
+            if end > size:
+                break
+            if first == FINAL_BINARY and not self._fragmented:
+                self._deliver(apply_mask(data[start:end], data[mask:start]))
+            else:
+                self._parse(data[at:end])
+                if self._protocol.state is not OPEN:
+                    self._plain = False
+                    self._parse(data[end:])
+                    return
+            at = end
+        self._tail = data[at:]
+
+    def _parse(self, data: bytes) -> None:
+        """Has websockets parse: it answers pings and closes where it must, and the game gets the messages."""
+        self._protocol.receive_data(data)
+        self._flush()
+        for event in self._protocol.events_received():
+            self._take(cast("Frame", event))
+
     def _take(self, frame: Frame) -> None:
         """One frame that websockets found in order; it has answered pings and the peer's closing by then."""
         if self._deaf:
@@ -278,6 +329,7 @@ class Connection(asyncio.Protocol):
         elif frame.opcode is Opcode.TEXT:
             self.close(CloseCode.UNSUPPORTED_DATA, "text message: binary ones only")
         elif frame.opcode is Opcode.BINARY or frame.opcode is Opcode.CONT:
+            self._fragmented = not frame.fin
             self._fragments += frame.data
             if frame.fin:
                 message = bytes(self._fragments)

@@ -12,6 +12,8 @@ from typing import Any
 
 import pytest
 import pytest_asyncio
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from websockets.frames import Frame, Opcode
 
 from server import gateway as module
@@ -441,6 +443,69 @@ async def test_pings_whose_answers_are_not_read_do_not_pile_up(bench: Bench) -> 
                 peer.write(pings)
             await asyncio.sleep(0)
     await bench.all_gone()
+
+
+class Wire(asyncio.Transport):
+    """Where a connection writes when there is no socket."""
+
+    def __init__(self) -> None:
+        self.socket = socket.socket()
+        super().__init__({"socket": self.socket})
+        self.written = bytearray()
+
+    def write(self, data: bytes | bytearray | memoryview) -> None:
+        self.written += data
+
+    def can_write_eof(self) -> bool:
+        return True
+
+    def write_eof(self) -> None:
+        self.written += b"EOF"
+
+    def get_write_buffer_size(self) -> int:
+        return 0
+
+
+BODIES = st.one_of(
+    st.binary(max_size=6), st.sampled_from([b"leave", b"echo", b"raise"]), st.integers(120, 130).map(bytes)
+)
+DATA = st.builds(
+    lambda opcode, body, fin: masked(opcode, body, fin=fin),
+    st.sampled_from([Opcode.BINARY] * 6 + [Opcode.CONT, Opcode.TEXT]),
+    BODIES,
+    st.sampled_from([True, True, True, False]),
+)
+CONTROL = st.builds(masked, st.sampled_from([Opcode.PING, Opcode.PONG, Opcode.CLOSE]), st.binary(max_size=6))
+ODD = st.one_of(
+    st.binary(max_size=12),
+    st.integers(CLIENT_MESSAGE_MAX - 1, CLIENT_MESSAGE_MAX + 1).map(lambda n: binary(bytes(n))),
+    st.sampled_from([b"\x82\xff\0\0\0\0\0\0\0\x03keysabc", b"\x82\xfe\0\x03keysabc", b"\x82\x03abc"]),
+)
+
+
+def outcome(chunks: list[bytes], *, plain: bool) -> tuple[list[bytes], list[int], bytes]:
+    """What the game received and was told, and what was written, for a stream in these pieces."""
+    notes, wire, loop = Notes(), Wire(), asyncio.new_event_loop()
+    connection = Connection(Gateway(notes), loop)
+    connection.connection_made(wire)
+    connection.data_received(UPGRADE)
+    connection._plain = plain
+    wire.written.clear()
+    for chunk in chunks:
+        connection.data_received(chunk)
+    wire.socket.close()
+    loop.close()
+    return notes.messages, notes.lost_sessions, bytes(wire.written)
+
+
+@settings(max_examples=300, deadline=None)
+@given(st.lists(st.one_of(DATA, DATA, CONTROL, ODD), max_size=12), st.lists(st.integers(0, 2000), max_size=8))
+def test_cut_here_or_parsed_by_websockets_comes_to_the_same(frames: list[bytes], cuts: list[int]) -> None:
+    stream = b"".join(frames)[:20_000]
+    ends = sorted({min(cut, len(stream)) for cut in cuts} | {len(stream)})
+    chunks = [stream[a:b] for a, b in zip([0, *ends], ends, strict=False)]
+    # Byte by byte, websockets hands out each frame before it sees the next, as is the case here.
+    assert outcome(chunks, plain=True) == outcome([stream[i : i + 1] for i in range(len(stream))], plain=False)
 
 
 async def get(bench: Bench, target: str, method: str = "GET") -> tuple[int, str, str]:
