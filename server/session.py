@@ -1,5 +1,6 @@
 """One client as the server knows it: its inputs and their fates on one side, what it has been sent on the other."""
 
+import math
 from collections import deque
 from typing import Protocol
 
@@ -50,29 +51,35 @@ class InputQueue:
     def file(self, message: Inputs, tick: int, ahead: float) -> None:
         """Takes a message at tick `tick`; the next tick's deadline is `ahead` ticks away."""
         rows = memoryview(message.rows).cast("b")
-        for i in range(len(rows) // INPUT_ROW_BYTES):
+        count = len(rows) // INPUT_ROW_BYTES
+        known = min(max(self.newest + 1 - message.first, 0), count)  # duplicates, or an order that TCP cannot produce
+        usable = min(max(tick + AHEAD_MAX + 1 - message.first, known), count)
+        self.refused += known + count - usable
+        for i in range(known, usable):
             at = message.first + i
-            if at <= self.newest:  # a duplicate, or an order that TCP cannot produce
-                self.refused += 1
-                continue
+            self._reached(at)
             move_x, move_y, buttons = rows[3 * i : 3 * i + 3].tolist()
             wish = clamp(Input(move_x, move_y, buttons & 0xFF))
-            # Every tick between the newest and this one has a margin of its own, so that they can be counted off.
-            self.margins.extend([MARGIN_REFUSED] * min(at - self.newest - 1, FATES_MAX) if self.newest >= 0 else ())
-            self.newest = at
-            if self.first < 0:
-                self.first = at
-            if at > tick + AHEAD_MAX:
-                self.refused += 1
-                self.margins.append(MARGIN_REFUSED)
-                continue
-            margin = int((at - tick - 1 + ahead) * MARGIN_ONE)
-            self.margins.append(max(MARGIN_REFUSED + 1, min(margin, -MARGIN_REFUSED - 1)))
+            margin = math.floor((at - tick - 1 + ahead) * MARGIN_ONE)
             if at <= tick:
                 self.late += 1
                 self._held = wish
+                margin = min(margin, -1)
             else:
                 self._ring.put(at, wish)
+            self.margins.append(max(MARGIN_REFUSED + 1, min(margin, -MARGIN_REFUSED - 1)))
+        if usable < count:
+            self._reached(message.first + usable)
+            self.margins.extend([MARGIN_REFUSED] * (count - usable))
+            self.newest = message.first + count - 1
+
+    def _reached(self, at: int) -> None:
+        """`at` is the newest from here on: ticks left out get a margin each, so that they can be counted off."""
+        if self.newest >= 0:
+            self.margins.extend([MARGIN_REFUSED] * min(at - self.newest - 1, FATES_MAX))
+        else:
+            self.first = at
+        self.newest = at
 
     def take(self, tick: int) -> Input:
         """The input for a tick whose time has come."""
