@@ -14,11 +14,21 @@ from dataclasses import dataclass
 import numpy as np
 
 from client_sdk.clock import LeadController, QuantileLead, ServerClock, Timeline
-from client_sdk.events import Corrected, Event, Joined, Left, Resynchronised, SegmentLoaded, Stats
+from client_sdk.events import (
+    Answered,
+    Corrected,
+    Diverged,
+    Event,
+    Joined,
+    Left,
+    Resynchronised,
+    SegmentLoaded,
+    Stats,
+)
 from client_sdk.interpolation import Interpolation
-from client_sdk.prediction import Prediction, check_scene
+from client_sdk.prediction import NONDETERMINISM, Prediction, check_scene
 from client_sdk.smoothing import Smoothing
-from shared import messages
+from shared import edits, messages
 from shared.blocks import unpack
 from shared.checks import Cell, Vec
 from shared.inputs import NEUTRAL, Input, clamp
@@ -29,11 +39,13 @@ from shared.messages import (
     NEUTRALISED,
     REPEATED,
     Bye,
+    Command,
     Hello,
     Inputs,
     Ping,
     Pong,
     ProtocolError,
+    Resync,
     Snapshot,
     Terrain,
     Welcome,
@@ -44,6 +56,7 @@ from shared.ring import Ring
 from shared.scene import Scene
 from shared.units import BLOCK, BLOCK_SHIFT, SEGMENT_SHIFT, SPEED
 
+VERDICT = np.dtype([("number", "<u4"), ("verdict", "u1")])
 TICKS_PER_UPDATE_MAX = 16
 """A program that was away for longer does not catch up tick by tick: it begins anew."""
 UNCONFIRMED_MAX = 96
@@ -104,7 +117,9 @@ class Core:
         self._out: list[bytes] = []
         self._events: deque[Event] = deque(maxlen=EVENTS_MAX)
         self._phases: Ring[float] = Ring(256)
-        self._late: Ring[bool] = Ring(256)
+        self._pieces: tuple[Cell, bytearray] = ((0, 0, 0), bytearray())
+        self._number = 0
+        self._seen = 0.0
         self._newest = -1
         self._interpolation: Interpolation | None = None
         self._smoothing = Smoothing()
@@ -130,6 +145,21 @@ class Core:
     def lost(self, code: int, reason: str, now: float) -> None:
         """The connection is gone."""
         self._end(Left(code, reason))
+
+    def edit(self, x: int, y: int, z: int, kind: int) -> int:
+        """Places (kind 1 to 255) or removes (0) a block with the next tick; the number by which it is `Answered`.
+
+        Raises:
+            RuntimeError: the client has not joined.
+        """
+        if self.state != "playing":
+            raise RuntimeError("edit: the client has not joined")
+        assert self.prediction is not None
+        edit = edits.Edit(x, y, z, kind)
+        self._number += 1
+        tick = self.prediction.edit(self._number, edit)
+        self._send(Command(self._number, tick, self._seen, edits.NAME, edits.pack(edit)))
+        return self._number
 
     def close(self) -> None:
         """Says goodbye."""
@@ -161,6 +191,7 @@ class Core:
         if self.timeline.steer(self._lead, self.clock, now):
             self._restart(now)
         self._interpolation.advance(self.clock.tick(now), now)
+        self._seen = self.clock.tick(now) - self._interpolation.delay_ticks
         self._predict(math.floor(self.timeline.tick(now)), now)
 
     def next_update(self, now: float) -> float:
@@ -228,13 +259,21 @@ class Core:
         self.clock.rate = float(scene.tick_rate)
 
     def _terrain(self, terrain: Terrain) -> None:
+        """A piece of a segment; the edits that came before the last piece are made up for."""
         if self.prediction is None:
             raise ProtocolError("Terrain before Welcome")
-        try:
-            kinds = unpack(terrain.packed)
-        except ValueError as error:
-            raise ProtocolError(f"Terrain.packed: {error}") from error
         segment = (terrain.x, terrain.y, terrain.z)
+        if terrain.offset == 0:
+            self._pieces = (segment, bytearray())
+        if self._pieces[0] != segment or len(self._pieces[1]) != terrain.offset:
+            raise ProtocolError("Terrain: a piece is missing")
+        self._pieces[1].extend(terrain.chunk)
+        if len(self._pieces[1]) < terrain.total:
+            return
+        try:
+            kinds = unpack(bytes(self._pieces[1]))
+        except ValueError as error:
+            raise ProtocolError(f"Terrain.chunk: {error}") from error
         self.prediction.load_segment(segment, kinds)
         self._events.append(SegmentLoaded(segment))
 
@@ -247,37 +286,40 @@ class Core:
         self.stats.snapshots += 1
         if self.stats.snapshots > 1:
             self.stats.snapshots_skipped += snapshot.tick - prediction.confirmed.tick - 1
-        self._fates(snapshot, now)
-        prediction.apply(snapshot)
+        late = self._fates(snapshot, now)
+        for number, verdict in np.frombuffer(snapshot.verdicts, VERDICT).tolist():
+            prediction.settle(number, verdict == messages.DONE)
+            text = messages.VERDICT_TEXTS[min(verdict, len(messages.VERDICT_TEXTS) - 1)]
+            self._events.append(Answered(number, verdict == messages.DONE, text))
+        wrong = prediction.apply(snapshot)
         self._interpolation.push(snapshot.tick, prediction.confirmed.states())
-        done = prediction.reconcile(self._cause(snapshot.tick))
+        done = prediction.reconcile(late)
         self.stats.replayed_ticks += done.replayed
         self.stats.repredictions += done.repredicted
-        if done.replayed:
+        if done.replayed and not done.acted:
             self._smoothing.add(done.offset, now)
         if done.correction:
             self._corrected(done.correction)
+            if done.correction.cause == NONDETERMINISM:
+                wrong = f"own {', '.join(done.correction.fields)}"
+        if wrong:
+            self.stats.divergences += 1
+            self._events.append(Diverged(snapshot.tick, wrong))
+            self._send(Resync())
 
-    def _fates(self, snapshot: Snapshot, now: float) -> None:
-        """How the inputs up to `newest` fared: feeds the lead."""
+    def _fates(self, snapshot: Snapshot, now: float) -> bool:
+        """How the inputs up to `newest` fared: feeds the lead; whether any of the told ticks lacked its input."""
         margins = np.frombuffer(snapshot.margins, "<i2").tolist()
         for i, margin in enumerate(margins):
             tick = snapshot.newest - len(margins) + 1 + i
             phase = self._phases.get(tick)
-            late = margin < 0
-            self.stats.inputs_late += late
-            self._late.put(tick, late)
+            self.stats.inputs_refused += margin == MARGIN_REFUSED
+            self.stats.inputs_late += MARGIN_REFUSED < margin < 0
             if phase is not None and margin != MARGIN_REFUSED:
                 self._lead.observe(tick, margin / MARGIN_ONE, phase, now)
-        for i, fate in enumerate(snapshot.fates):
-            if fate in (REPEATED, NEUTRALISED):
-                self.stats.inputs_substituted += 1
-                self._late.put(snapshot.first + i, True)
-
-    def _cause(self, tick: int) -> str:
-        """Why the own entity may differ: an input was not used, or something that only the server knew."""
-        recent = range(tick - 8, tick + 1)
-        return "late input" if any(self._late.get(at) for at in recent) else "other"
+        missing = sum(fate in (REPEATED, NEUTRALISED) for fate in snapshot.fates)
+        self.stats.inputs_substituted += missing
+        return missing > 0
 
     def _corrected(self, correction: Corrected) -> None:
         stats = self.stats

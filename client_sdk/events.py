@@ -40,6 +40,26 @@ class Corrected:
 
 
 @dataclass(frozen=True)
+class Answered:
+    """The server's answer to a command: `verdict` is "done", or why not (and then what was predicted is undone)."""
+
+    number: int
+    done: bool
+    verdict: str
+
+
+@dataclass(frozen=True)
+class Diverged:
+    """The two sides computed different worlds from the same inputs, or a copy is damaged: an alarm.
+
+    It must never happen; the client has asked for everything anew.
+    """
+
+    tick: int
+    what: str
+
+
+@dataclass(frozen=True)
 class Resynchronised:
     """Prediction was given up for a while (a long silence, a suspended program) and has begun anew."""
 
@@ -54,7 +74,7 @@ class SegmentLoaded:
     segment: Cell
 
 
-Event = Joined | Left | Corrected | Resynchronised | SegmentLoaded
+Event = Joined | Left | Corrected | Answered | Diverged | Resynchronised | SegmentLoaded
 
 
 @dataclass
@@ -74,5 +94,7 @@ class Stats:
     repredictions: int = 0
     replayed_ticks: int = 0
     resyncs: int = 0
+    divergences: int = 0
+    inputs_refused: int = 0
     rtt_s: float = 0.0
     lead_ticks: float = 0.0

@@ -8,6 +8,9 @@ the snapshot for tick T comes, it is compared with what was predicted for T, `==
     equal     the prediction stands; nothing is done
     not       predicted = confirmed, and the inputs for T+1 .. now are replayed
 
+Edits are predicted as well: carried out at their tick by the rule that the server uses, and forgotten when it has
+given its verdict, so that a replay undoes what was refused.
+
 A difference in the own entity is a *correction* and is counted; one in others only is a *reprediction* (someone
 pressed a key). No tolerance: the physics is exact, so a lone player is never corrected, whatever the network does.
 """
@@ -17,19 +20,24 @@ from dataclasses import dataclass
 import numpy as np
 
 from client_sdk.events import Corrected
+from shared import edits
 from shared.checks import Cell
+from shared.edits import Edit
 from shared.inputs import NEUTRAL, Input
-from shared.layout import COLUMNS, ID, Int64s, X
+from shared.layout import COLUMNS, FALLING, FLAGS, ID, Int64s, X
 from shared.messages import ProtocolError, Snapshot
 from shared.ring import Ring
 from shared.scene import Scene
-from shared.snapshot import SegmentPart, decode_parts
+from shared.snapshot import ACTED, SegmentPart, checksum, decode_parts
 from shared.units import BLOCK, BLOCK_SHIFT, SEGMENT_SHIFT
-from shared.world import STATES, World
+from shared.world import World
 
 HISTORY = 256
 """Ticks for which predictions and inputs are kept."""
 KEYFRAME = -1
+
+NONDETERMINISM = "nondeterminism"
+"""The cause that must never occur: both sides knew the same and computed something else."""
 
 Place = tuple[float, float, float]
 
@@ -43,6 +51,11 @@ class Reconciled:
     replayed: int
     offset: Place
     """Where the own entity was shown, minus where it is now."""
+    acted: bool
+    """Whether the server's rules moved it: then the picture jumps, too."""
+
+
+NOTHING = Reconciled(None, False, 0, (0.0, 0.0, 0.0), False)
 
 
 class Prediction:
@@ -57,16 +70,27 @@ class Prediction:
         self._states: Ring[Int64s] = Ring(HISTORY)
         self._templates = len(scene.templates)
         self._terrain_changed = False
+        self._acted: set[int] = set()
+        self._edits: dict[int, tuple[int, Edit]] = {}  # by number, with its tick; until there is a verdict
+        self._compared = -1
+        self._early: dict[Cell, list[tuple[list[int], list[int]]]] = {}
 
     # -- the server's word ---------------------------------------------------------------------------------
 
     def load_segment(self, segment: Cell, kinds: np.ndarray[tuple[int, ...], np.dtype[np.uint8]]) -> None:
         """The blocks of a segment have come."""
         self.confirmed.load_segment(segment, kinds)
+        for offsets, changed in self._early.pop(segment, ()):
+            self.confirmed.write_blocks(segment, offsets, changed)
         self._terrain_changed = True
 
-    def apply(self, snapshot: Snapshot) -> None:
-        """Writes a snapshot into the confirmed world.
+    def settle(self, number: int, done: bool) -> None:
+        """The server has given its verdict on an edit."""
+        if self._edits.pop(number, None) is not None and not done:
+            self._terrain_changed = True  # undo it
+
+    def apply(self, snapshot: Snapshot) -> str:
+        """Writes a snapshot into the confirmed world; what is wrong with the result, or nothing.
 
         Raises:
             ProtocolError: a part of it is malformed.
@@ -74,6 +98,8 @@ class Prediction:
         world = self.confirmed
         parts, states = decode_parts(snapshot.segments, self._templates)
         here = set(states[:, ID].tolist())
+        self._acted.update(states[states[:, FLAGS] & ACTED != 0, ID].tolist())
+        states[:, FLAGS] &= FALLING
         if snapshot.drops:
             self._drop(np.frombuffer(snapshot.drops, "<i4").reshape(-1, 3), here)
         homes = self._homes() if any(part.gone or part.since == KEYFRAME for part in parts) else {}
@@ -81,12 +107,20 @@ class Prediction:
             for entity in self._gone(part, homes):
                 if entity in world and entity not in here:
                     world.remove(entity)
-            if len(part.edits) and part.segment in world.blocks:
-                world.write_blocks(part.segment, part.edits["block"].tolist(), part.edits["kind"].tolist())
-                self._terrain_changed = True
+            if len(part.edits):
+                changes = part.edits["block"].tolist(), part.edits["kind"].tolist()
+                if part.segment in world.blocks:
+                    world.write_blocks(part.segment, *changes)
+                    self._terrain_changed = True
+                else:  # its terrain is on the way, and was perhaps packed before this
+                    self._early.setdefault(part.segment, []).append(changes)
         if here:
             world.put(states)
         world.rebase(snapshot.tick)
+        for part in parts:
+            if part.check and part.segment in world.blocks and checksum(world, part.segment) != part.check:
+                return f"segment {part.segment} is not the server's"
+        return ""
 
     def _gone(self, part: SegmentPart, homes: dict[int, Cell]) -> list[int]:
         if part.since == KEYFRAME:
@@ -104,6 +138,7 @@ class Prediction:
             if home in gone and entity not in here:
                 self.confirmed.remove(entity)
         for segment in gone:
+            self._early.pop(segment, None)
             if segment in self.confirmed.blocks and not len(self.confirmed.in_segment(segment)):
                 self.confirmed.unload_segment(segment)
                 self._terrain_changed = True
@@ -121,23 +156,40 @@ class Prediction:
         self._inputs.put(self.predicted.tick + 1, wish)
         self._step()
 
-    def reconcile(self, cause: str) -> Reconciled:
+    def edit(self, number: int, edit: Edit) -> int:
+        """Files an edit for the next tick to be predicted; that tick."""
+        tick = self.predicted.tick + 1
+        self._edits[number] = (tick, edit)
+        return tick
+
+    def reconcile(self, late: bool) -> Reconciled:
         """Compares the newest confirmed tick with what was predicted for it, and replays if they differ.
 
-        `cause` is the explanation of a correction in which no other entity differs.
+        `late`: an input up to that tick, and after the one before, was late or missing at the server.
         """
-        tick = self.confirmed.tick
+        tick, gap = self.confirmed.tick, self.confirmed.tick - self._compared > 1
+        self._compared = tick
+        acted, self._acted = self.entity in self._acted, set()
         if not self.begun or tick > self.predicted.tick:
-            return Reconciled(None, False, 0, (0.0, 0.0, 0.0))
+            return NOTHING
         guess, truth = self._states.get(tick), self.confirmed.states()
         if guess is not None and not self._terrain_changed and np.array_equal(guess, truth):
-            return Reconciled(None, False, 0, (0.0, 0.0, 0.0))
-        correction = self._correction(guess, truth, cause)
-        shown, now = self._place(self.predicted), self.predicted.tick
+            return NOTHING
+        correction = None
+        if guess is not None and (mine := self._difference(guess, truth)):
+            causes = (
+                (late, "late input"),
+                (acted, "server act"),
+                (self._terrain_changed, "unknown edit"),
+                (gap or self._others_differ(guess, truth), "other entity"),
+            )
+            cause = next((cause for holds, cause in causes if holds), NONDETERMINISM)
+            correction = Corrected(tick, *mine, self.predicted.tick - tick, cause)
+        shown, now = self._place(), self.predicted.tick
         self._replay(now)
-        place = self._place(self.predicted)
+        place = self._place()
         offset = (shown[0] - place[0], shown[1] - place[1], shown[2] - place[2])
-        return Reconciled(correction, correction is None, now - tick, offset)
+        return Reconciled(correction, correction is None, now - tick, offset, acted)
 
     def state_before(self, entity: int) -> tuple[int, ...] | None:
         """The state of an entity one tick before the newest predicted one."""
@@ -158,26 +210,28 @@ class Prediction:
             self._step()
 
     def _step(self) -> None:
-        wish = self._inputs.get(self.predicted.tick + 1)
+        tick = self.predicted.tick + 1
+        for due, edit in self._edits.values():
+            # One that is due but has no verdict yet is carried out as soon as the replay begins.
+            if due == tick or (due < tick and tick == self.confirmed.tick + 1):
+                edits.apply(self.predicted, self.entity, edit)
         known = self.entity in self.predicted
-        self.predicted.step({self.entity: wish or NEUTRAL} if known else None)
-        self._states.put(self.predicted.tick, self.predicted.states())
+        self.predicted.step({self.entity: self._inputs.get(tick) or NEUTRAL} if known else None)
+        self._states.put(tick, self.predicted.states())
 
-    def _correction(self, guess: Int64s | None, truth: Int64s, cause: str) -> Corrected | None:
-        mine = truth[truth[:, ID] == self.entity]
-        if guess is None or not len(mine):
+    def _difference(self, guess: Int64s, truth: Int64s) -> tuple[tuple[str, ...], float] | None:
+        """In which fields, and by how many blocks, the own entity is not as predicted."""
+        was, mine = guess[guess[:, ID] == self.entity], truth[truth[:, ID] == self.entity]
+        if not len(mine) or not len(was) or np.array_equal(mine, was):
             return None
-        was = guess[guess[:, ID] == self.entity]
-        if np.array_equal(mine, was):
-            return None
-        if not len(was):
-            was = np.zeros((1, STATES), np.int64)
-        fields = tuple(COLUMNS[k] for k in np.flatnonzero(mine[0] != was[0]))
         way = (mine[0, X : X + 3] - was[0, X : X + 3]) / BLOCK
-        ticks = self.predicted.tick - self.confirmed.tick
-        return Corrected(self.confirmed.tick, fields, float(np.sqrt((way * way).sum())), ticks, cause)
+        return tuple(COLUMNS[k] for k in np.flatnonzero(mine[0] != was[0])), float(np.sqrt((way * way).sum()))
 
-    def _place(self, world: World) -> Place:
+    def _others_differ(self, guess: Int64s, truth: Int64s) -> bool:
+        return not np.array_equal(guess[guess[:, ID] != self.entity], truth[truth[:, ID] != self.entity])
+
+    def _place(self) -> Place:
+        world = self.predicted
         return world.position(self.entity) if self.entity in world else (0.0, 0.0, 0.0)
 
 

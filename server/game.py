@@ -17,13 +17,30 @@ from server import interest
 from server.limits import Limits
 from server.replication import KEYFRAME, ChangeLog
 from server.session import Link, Session
-from shared import messages
+from shared import edits, messages
 from shared.checks import Vec
 from shared.inputs import Input
-from shared.messages import Bye, Hello, Inputs, Ping, Pong, ProtocolError, Welcome, decode_from_client, encode
+from shared.messages import (
+    AHEAD_MAX,
+    Bye,
+    Command,
+    Hello,
+    Inputs,
+    Ping,
+    Pong,
+    ProtocolError,
+    Resync,
+    Terrain,
+    Welcome,
+    decode_from_client,
+    encode,
+)
 from shared.scene import Scene
 from shared.world import OverlapError, World
 
+VERDICT = np.dtype([("number", "<u4"), ("verdict", "u1")])
+RESYNC_S = 1.0
+"""A client may ask for everything anew so often."""
 SPAWN_RINGS = 24
 """Where a spawn is taken, others are tried in rings around it, two blocks apart."""
 
@@ -46,6 +63,7 @@ class Counters:
     snapshot_bytes: int = 0
     terrain_bytes: int = 0
     fell_out: int = 0
+    resyncs: int = 0
 
 
 class Game:
@@ -98,12 +116,19 @@ class Game:
             return
         if isinstance(message, Inputs) and session.entity:
             session.inputs.file(message, self.world.tick, self._ticks_left(now))
-            session.acked = max(session.acked, min(message.acked, session.tick))
+            self._acked(session, message.acked, now)
         elif isinstance(message, Ping):
             tick = self.world.tick + 1 - self._ticks_left(now)
-            session.link.send(encode(Pong(message.sent, tick)))
+            session.send(encode(Pong(message.sent, tick)))
         elif isinstance(message, Hello) and not session.entity and not session.joining:
             self._hello(session, message)
+        elif isinstance(message, Command) and session.entity:
+            self._file_command(session, message)
+        elif isinstance(message, Resync) and session.entity:
+            if now - session.resynced_at >= RESYNC_S:
+                session.resynced_at = now
+                self.counters.resyncs += 1
+                self._forget(session)
         elif isinstance(message, Bye):
             session.close(messages.GOING_AWAY, "goodbye")
         else:
@@ -120,7 +145,7 @@ class Game:
         """Tells every client, with the seconds after which to come back, and closes the connections."""
         for session in self.sessions:
             if not session.closed:
-                session.link.send(encode(Bye(messages.GOING_AWAY, reason, wait)))
+                session.send(encode(Bye(messages.GOING_AWAY, reason, wait)))
                 session.close(messages.GOING_AWAY, reason)
 
     # -- the tick acts -------------------------------------------------------------------------------------
@@ -131,6 +156,7 @@ class Game:
         self._leave()
         self._join()
         self._revive()
+        self._command()
         inputs = self._take_inputs()
         self.world.step(inputs)
         self.log.record()
@@ -163,13 +189,35 @@ class Game:
             session.entity = entity
             self.counters.joined += 1
             welcome = Welcome(messages.VERSION, self.world.tick, entity, self.scene.to_table())
-            session.link.send(encode(welcome))
+            session.send(encode(welcome))
 
     def _revive(self) -> None:
         for entity in self._respawn:
             if entity in self.world:
                 self._to_spawn(entity)
         self._respawn.clear()
+
+    def _command(self) -> None:
+        """What players do at the start of this tick, in the order in which they joined."""
+        tick = self.world.tick + 1
+        for session in self.sessions:
+            rate = self.limits.edits_per_s
+            session.edits_left = min(session.edits_left + rate / self.scene.tick_rate, 2 * rate)
+            while session.commands and session.commands[0].tick <= tick:
+                command = session.commands.popleft()
+                session.verdicts.append((command.number, self._carry_out(session, command)))
+
+    def _carry_out(self, session: Session, command: Command) -> int:
+        edit = edits.unpack(command.payload) if command.name == edits.NAME else None
+        if edit is None:
+            return messages.INVALID
+        if session.edits_left < 1:
+            return messages.TOO_MANY
+        session.edits_left -= 1
+        verdict = edits.apply(self.world, session.entity, edit)
+        if verdict == messages.DONE:
+            self.log.note_edit(*edit[:3])
+        return verdict
 
     def _take_inputs(self) -> dict[int, Input]:
         tick = self.world.tick + 1
@@ -186,14 +234,17 @@ class Game:
             if not session.entity or session.closed:
                 continue
             self._look_around(session)
-            on_the_way = session.link.outstanding()
-            if on_the_way > max(self.limits.gate_bytes, 2 * session.snapshot_bytes):
+            outstanding = session.link.outstanding()
+            window = session.pacing.window(outstanding, session.snapshot_bytes, 1 / self.scene.tick_rate, now)
+            if session.acked < 0:
+                window = max(window, self.limits.first_bytes)
+            if outstanding > window:
                 session.skipped += 1
                 self.counters.snapshots_skipped += 1
                 continue
             session.sent_at = now
-            self._send_snapshot(session)
-            self._send_terrain(session)
+            self._send_snapshot(session, now)
+            self._send_terrain(session, window - session.link.outstanding())
 
     def _look_around(self, session: Session) -> None:
         centre = self.log.segment(session.entity)
@@ -209,13 +260,20 @@ class Game:
         session.sees.update(added)
         session.fresh.update(added)
         session.terrain_due.extend(segment for segment in added if exists(segment))
+        if session.terrain_now and session.terrain_now[0] in dropped:
+            session.terrain_now = None
 
-    def _send_snapshot(self, session: Session) -> None:
+    def _forget(self, session: Session) -> None:
+        """Begins anew with what a client sees: keyframes and terrain."""
+        session.fresh.update(session.sees)
+        session.terrain_now = None
+        session.terrain_due = type(session.terrain_due)(sorted(s for s in session.sees if s in self.world.blocks))
+
+    def _send_snapshot(self, session: Session, now: float) -> None:
         tick, inputs = self.world.tick, session.inputs
         changed = self.log.changed_segments(session.tick) if session.tick >= 0 else set()
         if changed is None:  # too far behind to catch up: everything anew
-            session.fresh.update(session.sees)
-            session.terrain_due.extend(s for s in session.sees if s in self.world.blocks)
+            self._forget(session)
             changed = set()
         parts = [self.log.part(segment, KEYFRAME) for segment in session.fresh]
         parts += [
@@ -225,24 +283,35 @@ class Game:
         ]
         margins = np.array(inputs.margins, "<i2").tobytes()
         drops = np.array(session.drops, "<i4").tobytes()
-        header = (tick, inputs.newest, margins, tick - len(inputs.fates) + 1, bytes(inputs.fates), drops)
+        verdicts = np.array(session.verdicts[: messages.VERDICTS_MAX], VERDICT).tobytes()
+        first = tick - len(inputs.fates) + 1
+        header = (tick, inputs.newest, margins, first, bytes(inputs.fates), verdicts, drops)
         message = messages.join_snapshot(header, parts)
-        session.link.send(message)
+        session.send(message)
         session.tick = tick
         session.snapshot_bytes = len(message)
         session.fresh.clear()
         session.drops.clear()
+        del session.verdicts[: messages.VERDICTS_MAX]
+        session.sent_when.put(tick, now)
         inputs.told()
         self.counters.snapshots_sent += 1
         self.counters.snapshot_bytes += len(message)
 
-    def _send_terrain(self, session: Session) -> None:
-        budget = self.limits.terrain_bytes_per_tick
-        while session.terrain_due and budget > 0:
-            message = self.log.terrain(session.terrain_due.popleft())
-            session.link.send(message)
-            budget -= len(message)
-            self.counters.terrain_bytes += len(message)
+    def _send_terrain(self, session: Session, room: int) -> None:
+        """Terrain behind the snapshot, as far as it fits into what may be on the way."""
+        room = min(room, self.limits.terrain_bytes_per_tick)
+        while room > 0 and (session.terrain_now or session.terrain_due):
+            if session.terrain_now is None:
+                segment = session.terrain_due.popleft()
+                session.terrain_now = (segment, self.log.packed(segment), 0)
+            segment, packed, offset = session.terrain_now
+            chunk = packed[offset : offset + self.limits.terrain_chunk_bytes]
+            session.send(encode(Terrain(*segment, offset, len(packed), chunk)))
+            offset += len(chunk)
+            session.terrain_now = (segment, packed, offset) if offset < len(packed) else None
+            room -= len(chunk)
+            self.counters.terrain_bytes += len(chunk)
 
     def _check_clocks(self, now: float) -> None:
         for session in self.sessions:
@@ -261,6 +330,23 @@ class Game:
     def _ticks_left(self, now: float) -> float:
         """Ticks until the next tick's deadline."""
         return 1.0 - (now - self._deadline) * self.scene.tick_rate
+
+    def _acked(self, session: Session, tick: int, now: float) -> None:
+        """The client has applied the snapshot of a tick."""
+        if session.acked < tick <= session.tick:
+            session.acked = tick
+            when = session.sent_when.get(tick)
+            if when is not None:
+                session.pacing.answered(now - when, now)
+
+    def _file_command(self, session: Session, command: Command) -> None:
+        if command.number <= session.command:
+            return
+        session.command = command.number
+        if len(session.commands) >= self.limits.commands_waiting_max or command.tick > self.world.tick + AHEAD_MAX:
+            session.verdicts.append((command.number, messages.TOO_MANY))
+        else:
+            session.commands.append(command)
 
     def _hello(self, session: Session, hello: Hello) -> None:
         if hello.version != messages.VERSION:
@@ -286,7 +372,7 @@ class Game:
 
     def _end(self, session: Session, code: int, reason: str) -> None:
         reason = reason[: messages.REASON_MAX]
-        session.link.send(encode(Bye(code, reason, -1.0)))
+        session.send(encode(Bye(code, reason, -1.0)))
         session.close(code, reason)
 
     def _spawn(self) -> int | None:
@@ -302,6 +388,7 @@ class Game:
             try:
                 self.world.place(entity, place, push=True)
                 self.world.set_velocity(entity, (0.0, 0.0, 0.0))
+                self.log.note_act(entity)
             except OverlapError:
                 continue
             return

@@ -2,8 +2,6 @@
 
 from dataclasses import dataclass
 
-from shared.blocks import PACKED_MAX
-
 
 @dataclass(frozen=True)
 class Limits:
@@ -18,10 +16,16 @@ class Limits:
     """A client that could not be sent a snapshot for so long is closed."""
     messages_per_tick: float = 8.0
     """A client's messages beyond this rate (with a burst of 32 ticks' worth) close it."""
-    gate_bytes: int = 16 * 1024
-    """While more than this, and more than two snapshots, is on its way to a client, it is sent nothing new."""
+    first_bytes: int = 8 * 1024
+    """So much may be on its way to a client of which nothing is known yet."""
+    terrain_chunk_bytes: int = 1024
+    """Terrain goes behind snapshots in pieces of this size,"""
     terrain_bytes_per_tick: int = 12 * 1024
-    """Terrain goes behind snapshots in portions of about this size."""
+    """at most so many bytes a tick."""
+    commands_waiting_max: int = 64
+    """A client's commands that wait for their tick; more are answered with `TOO_MANY`."""
+    edits_per_s: float = 10.0
+    """A client's edits beyond this rate (with a burst of two seconds' worth) are answered with `TOO_MANY`."""
     see_radius: int = 1
     """A client sees the segments at most so many segments away from its own,"""
     keep_radius: int = 2
@@ -29,4 +33,4 @@ class Limits:
 
     def __post_init__(self) -> None:
         assert self.see_radius <= self.keep_radius
-        assert self.gate_bytes + PACKED_MAX < 1 << 20
+        assert self.terrain_chunk_bytes <= self.terrain_bytes_per_tick

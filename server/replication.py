@@ -11,14 +11,15 @@ from collections.abc import Iterable
 from shared.blocks import pack, segment_of
 from shared.checks import Cell
 from shared.layout import ID, Int64s, X
-from shared.messages import Terrain, encode
 from shared.ring import Ring
-from shared.snapshot import encode_part
+from shared.snapshot import checksum, encode_part
 from shared.units import BLOCK_SHIFT, SEGMENT, SEGMENT_SHIFT
 from shared.world import World
 
 HISTORY = 64
 """Ticks for which changes are kept."""
+CHECK_TICKS = 32
+"""How often a segment in which something changes is sent with its checksum."""
 KEYFRAME = -1
 """The `since` of a part that holds everything."""
 
@@ -30,6 +31,7 @@ class _Tick:
         self.changed: dict[Cell, list[int]] = defaultdict(list)  # ids by segment
         self.gone: dict[Cell, list[int]] = defaultdict(list)
         self.edited: dict[Cell, set[int]] = defaultdict(set)  # block offsets by segment
+        self.acted: set[int] = set()  # ids that the rules placed or threw
 
 
 class ChangeLog:
@@ -41,7 +43,7 @@ class ChangeLog:
         self._now = _Tick()
         self._home: dict[int, Cell] = {}
         self._parts: dict[tuple[Cell, int], bytes] = {}
-        self._terrain: dict[Cell, tuple[int, bytes]] = {}
+        self._packed: dict[Cell, tuple[int, bytes]] = {}
 
     def segment(self, entity: int) -> Cell:
         """Where an entity was at the end of the latest recorded tick."""
@@ -51,6 +53,10 @@ class ChangeLog:
         """A block has changed, ahead of the coming step."""
         inside = SEGMENT - 1
         self._now.edited[segment_of(x, y, z)].add((z & inside) << 10 | (y & inside) << 5 | (x & inside))
+
+    def note_act(self, entity: int) -> None:
+        """The rules have placed or thrown an entity, ahead of the coming step."""
+        self._now.acted.add(entity)
 
     def note_removal(self, entity: int) -> None:
         """An entity has been removed, ahead of the coming step."""
@@ -88,13 +94,13 @@ class ChangeLog:
             part = self._parts[key] = self._keyframe(segment) if since == KEYFRAME else self._changes(segment, since)
         return part
 
-    def terrain(self, segment: Cell) -> bytes:
-        """The message that carries a segment's blocks as they are."""
+    def packed(self, segment: Cell) -> bytes:
+        """A segment's blocks as they are, packed."""
         digest = self._world.blocks.digest(segment)
-        known = self._terrain.get(segment)
+        known = self._packed.get(segment)
         if known is None or known[0] != digest:
-            known = self._terrain[segment] = (digest, pack(self._world.blocks.segment(segment)))
-        return encode(Terrain(*segment, self._world.tick, known[1]))
+            known = self._packed[segment] = (digest, pack(self._world.blocks.segment(segment)))
+        return known[1]
 
     def _since(self, since: int) -> list[_Tick] | None:
         if self._world.tick - since > HISTORY:
@@ -104,9 +110,9 @@ class ChangeLog:
 
     def _keyframe(self, segment: Cell) -> bytes:
         if segment in self._world.blocks:
-            return encode_part(segment, KEYFRAME, self._world.in_segment(segment), [], [])
+            return encode_part(segment, KEYFRAME, self._world.in_segment(segment))
         strays = [entity for entity, home in self._home.items() if home == segment]
-        return encode_part(segment, KEYFRAME, self._world.rows(sorted(strays)), [], [])
+        return encode_part(segment, KEYFRAME, self._world.rows(sorted(strays)))
 
     def _changes(self, segment: Cell, since: int) -> bytes:
         ticks = self._since(since)
@@ -116,7 +122,11 @@ class ChangeLog:
         }
         gone = {entity for tick in ticks for entity in tick.gone.get(segment, ()) if self._home.get(entity) != segment}
         edited = {offset for tick in ticks for offset in tick.edited.get(segment, ())}
-        return encode_part(segment, since, self._rows(here), sorted(gone), self._kinds(segment, sorted(edited)))
+        acted = {entity for tick in ticks for entity in tick.acted if entity in here}
+        due = (self._world.tick + hash(segment)) % CHECK_TICKS == 0 and segment in self._world.blocks
+        check = checksum(self._world, segment) if due else 0
+        kinds = self._kinds(segment, sorted(edited))
+        return encode_part(segment, since, self._rows(here), sorted(gone), kinds, acted=acted, check=check)
 
     def _rows(self, entities: Iterable[int]) -> Int64s:
         return self._world.rows(sorted(entities))

@@ -4,6 +4,7 @@ import math
 from collections import deque
 from typing import Protocol
 
+from server.pacing import Pacing
 from shared.checks import Cell
 from shared.inputs import NEUTRAL, Input, clamp
 from shared.messages import (
@@ -17,6 +18,7 @@ from shared.messages import (
     REPEATED,
     REPEATS_MAX,
     USED,
+    Command,
     Inputs,
 )
 from shared.ring import Ring
@@ -124,8 +126,23 @@ class Session:
         self.fresh: set[Cell] = set()
         self.drops: list[Cell] = []
         self.terrain_due: deque[Cell] = deque()
+        self.terrain_now: tuple[Cell, bytes, int] | None = None
+        """The packed segment that is being sent, and how much of it has been."""
+        self.commands: deque[Command] = deque()
+        self.command = -1
+        """The highest number of a command so far."""
+        self.resynced_at = now
+        self.verdicts: list[tuple[int, int]] = []
+        self.edits_left = 0.0
+        self.pacing = Pacing()
+        self.sent_when: Ring[float] = Ring(FATES_MAX)
         self.centre: Cell | None = None
         self.skipped = 0
+
+    def send(self, message: bytes) -> None:
+        """Hands a message to the link."""
+        self.pacing.sent(len(message))
+        self.link.send(message)
 
     def close(self, code: int, reason: str) -> None:
         """Ends the connection; nothing is taken from it or sent to it any more."""

@@ -5,16 +5,20 @@ travels as packed little-endian records in a MessagePack `bin`.
 
     client -> server                                     server -> client
       1 Hello    version scene name                        17 Welcome   version tick entity scene
-      2 Inputs   first acked rows                          18 Snapshot  tick newest margins first fates drops segment*
-      3 Ping     sent                                      19 Terrain   x y z tick packed
-      4 Bye      code reason wait                          20 Pong      sent tick
-                                                            4 Bye       code reason wait
+      2 Inputs   first acked rows                          18 Snapshot  tick newest margins first fates verdicts
+      3 Ping     sent                                                   drops segment*
+      4 Bye      code reason wait                          19 Terrain   x y z offset total chunk
+      5 Command  number tick seen name payload             20 Pong      sent tick
+      6 Resync                                              4 Bye       code reason wait
 
     Inputs.rows    n * [i8 move_x, i8 move_y, u8 buttons], for the ticks first, first + 1, ...
     Snapshot       the state at the end of `tick`; how early the client's inputs came (margins, n * i16 in 1/256
-                   tick, for the ticks up to `newest`); what became of those from `first` on (fates, n * u8); which
-                   segments it no longer sees (drops, n * [i32 x, y, z]); then each segment in which anything
-                   changed (`shared.snapshot`).
+                   tick, for the ticks up to `newest`); what became of those from `first` on (fates, n * u8); and of
+                   its commands (verdicts, n * [u32 number, u8 verdict]); which segments it no longer sees (drops,
+                   n * [i32 x, y, z]); then each segment in which anything changed (`shared.snapshot`).
+    Terrain        a part of a packed segment (`shared.blocks.pack`), which is complete with byte `total`.
+    Command        something to do at the start of `tick`; `seen` is the tick at which the client drew the others.
+    Resync         the client has lost track: everything it sees, anew.
     Pong.tick      the server's time in ticks when it answered: 17.25 is a quarter of a tick after tick 17.
 
 `decode(any bytes)` gives a message whose every field has been checked, or raises `ProtocolError`.
@@ -41,7 +45,14 @@ SCENE_FIELDS_MAX = 32
 REASON_MAX = 500
 FATES_MAX = 256
 DROPS_MAX = 4096
+VERDICTS_MAX = 128
+COMMAND_MAX = (1 << 32) - 1
+PAYLOAD_MAX = 1024
 SEGMENTS_MAX = 1024
+LIST_MAX = 8 * 1024
+CLIENT_LIST_MAX = 8
+TABLE_MAX = 64
+"""No list and no table has more items, however long the message: what a head claims is set aside in memory."""
 TICK_MAX = (1 << 53) - 1
 ENTITY_MAX = (1 << 31) - 1
 
@@ -57,6 +68,10 @@ MARGIN_ONE = 256
 """A margin of one tick."""
 MARGIN_REFUSED = -(1 << 15)
 """Stands for the margin of an input that was refused."""
+
+DONE, OVERLAPS, OUT_OF_REACH, TOO_MANY, INVALID, FORBIDDEN = range(6)
+"""The verdict on a command."""
+VERDICT_TEXTS = ("done", "an entity is in the way", "out of reach", "too many", "not possible there", "not allowed")
 
 # Close codes.
 GOING_AWAY, PROTOCOL, TEXT, TOO_BIG, INTERNAL = 1001, 1002, 1003, 1009, 1011
@@ -89,6 +104,20 @@ class Ping(NamedTuple):
     sent: float
 
 
+class Command(NamedTuple):
+    """Something to do once, at the start of `tick` or as soon as possible after it. Numbers ascend."""
+
+    number: int
+    tick: int
+    seen: float
+    name: str
+    payload: bytes
+
+
+class Resync(NamedTuple):
+    """The client's copy is damaged: it needs everything anew."""
+
+
 class Bye(NamedTuple):
     """Goes before the connection closes. `wait`: come back in so many seconds; negative: do not."""
 
@@ -117,18 +146,20 @@ class Snapshot(NamedTuple):
     margins: bytes
     first: int
     fates: bytes
+    verdicts: bytes
     drops: bytes
     segments: tuple[list[Any], ...]
 
 
 class Terrain(NamedTuple):
-    """All blocks of one segment as they are at the end of `tick`."""
+    """Bytes `offset` and following of a packed segment of `total` bytes, in order."""
 
     x: int
     y: int
     z: int
-    tick: int
-    packed: bytes
+    offset: int
+    total: int
+    chunk: bytes
 
 
 class Pong(NamedTuple):
@@ -138,7 +169,7 @@ class Pong(NamedTuple):
     tick: float
 
 
-Message = Hello | Inputs | Ping | Bye | Welcome | Snapshot | Terrain | Pong
+Message = Hello | Inputs | Ping | Bye | Command | Resync | Welcome | Snapshot | Terrain | Pong
 Check = Callable[[Any], bool]
 
 
@@ -171,21 +202,38 @@ _segment = _whole(-(1 << 23), (1 << 23) - 1)
 
 KINDS: dict[int, tuple[type[Any], tuple[Check, ...]]] = {
     1: (Hello, (_whole(0, 1 << 31), _digests, _text(NAME_MAX))),
-    2: (Inputs, (_whole(0, TICK_MAX), _tick, _bytes(INPUT_ROWS_MAX * INPUT_ROW_BYTES, INPUT_ROW_BYTES))),
+    2: (
+        Inputs,
+        (
+            _whole(0, TICK_MAX - INPUT_ROWS_MAX),
+            _tick,
+            _bytes(INPUT_ROWS_MAX * INPUT_ROW_BYTES, INPUT_ROW_BYTES),
+        ),
+    ),
     3: (Ping, (_finite,)),
     4: (Bye, (_whole(0, 4999), _text(REASON_MAX), _finite)),
+    5: (Command, (_whole(0, COMMAND_MAX), _tick, _finite, _text(NAME_MAX), _bytes(PAYLOAD_MAX))),
+    6: (Resync, ()),
     17: (
         Welcome,
         (_whole(0, 1 << 31), _tick, _whole(1, ENTITY_MAX), lambda value: type(value) is dict),
     ),
     18: (
         Snapshot,
-        (_tick, _tick, _bytes(FATES_MAX * 2, 2), _tick, _bytes(FATES_MAX), _bytes(DROPS_MAX * 12, 12)),
+        (
+            _tick,
+            _tick,
+            _bytes(FATES_MAX * 2, 2),
+            _tick,
+            _bytes(FATES_MAX),
+            _bytes(VERDICTS_MAX * 5, 5),
+            _bytes(DROPS_MAX * 12, 12),
+        ),
     ),
-    19: (Terrain, (_segment, _segment, _segment, _tick, _bytes(PACKED_MAX))),
+    19: (Terrain, (_segment, _segment, _segment, _whole(0, PACKED_MAX), _whole(1, PACKED_MAX), _bytes(PACKED_MAX))),
     20: (Pong, (_finite, _finite)),
 }
-CLIENT_KINDS = frozenset({1, 2, 3, 4})
+CLIENT_KINDS = frozenset({1, 2, 3, 4, 5, 6})
 SERVER_KINDS = frozenset({4, 17, 18, 19, 20})
 _KIND_OF = {kind: number for number, (kind, _) in KINDS.items()}
 _SNAPSHOT = _KIND_OF[Snapshot]
@@ -198,14 +246,19 @@ def encode(message: Message) -> bytes:
     return msgpack.packb((kind, *fields))  # type: ignore[no-any-return]
 
 
-def join_snapshot(header: tuple[int, int, bytes, int, bytes, bytes], segments: list[bytes]) -> bytes:
-    """A snapshot from its first six fields and segments that are encoded already (shared by many clients)."""
+def join_snapshot(header: tuple[int, int, bytes, int, bytes, bytes, bytes], segments: list[bytes]) -> bytes:
+    """A snapshot from its first seven fields and segments that are encoded already (shared by many clients)."""
     n = 1 + len(header) + len(segments)
     return b"".join((b"\xdc" + n.to_bytes(2, "big"), *map(msgpack.packb, (_SNAPSHOT, *header)), *segments))
 
 
-def decode(data: bytes, kinds: frozenset[int], longest: int) -> Message:
-    """The message in `data`, which must be one of `kinds` and at most `longest` bytes.
+def shown(value: Any) -> str:
+    """A peer's value in the text of an error: short, and not opened if it is nested (it may be so a thousand deep)."""
+    return type(value).__name__ if isinstance(value, list | dict) else str(value)[:40]
+
+
+def decode(data: bytes, kinds: frozenset[int], longest: int, lists: int = LIST_MAX) -> Message:
+    """The message in `data`, one of `kinds`, at most `longest` bytes, no list of more than `lists` items.
 
     Raises:
         ProtocolError: for anything else, whatever the bytes are.
@@ -213,7 +266,7 @@ def decode(data: bytes, kinds: frozenset[int], longest: int) -> Message:
     if len(data) > longest:
         raise ProtocolError(f"message of {len(data)} bytes: longer than {longest}")
     try:
-        parts = msgpack.unpackb(data, use_list=True, strict_map_key=True)
+        parts = msgpack.unpackb(data, strict_map_key=True, max_array_len=lists, max_map_len=TABLE_MAX)
     except Exception as error:  # msgpack raises some ten kinds for bytes that are not MessagePack
         raise ProtocolError(f"not MessagePack ({type(error).__name__})") from error
     if type(parts) is not list or not parts or type(parts[0]) is not int or parts[0] not in kinds:
@@ -226,13 +279,13 @@ def decode(data: bytes, kinds: frozenset[int], longest: int) -> Message:
         raise ProtocolError(f"{kind.__name__}: {len(values)} fields instead of {len(checks)}")
     for name, value, check in zip(kind._fields, values, checks, strict=False):
         if not check(value):
-            raise ProtocolError(f"{kind.__name__}.{name} = {str(value)[:40]}: not allowed")
+            raise ProtocolError(f"{kind.__name__}.{name} = {shown(value)}: not allowed")
     return kind(*values)  # type: ignore[no-any-return]
 
 
 def decode_from_client(data: bytes) -> Message:
     """What a server may receive. Raises `ProtocolError`."""
-    return decode(data, CLIENT_KINDS, CLIENT_MESSAGE_MAX)
+    return decode(data, CLIENT_KINDS, CLIENT_MESSAGE_MAX, CLIENT_LIST_MAX)
 
 
 def decode_from_server(data: bytes) -> Message:

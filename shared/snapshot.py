@@ -9,7 +9,8 @@ gone      n * u32: entities that have left the segment or the world
 edits     n * [u16 block, u8 kind]: blocks that changed, by index z << 10 | y << 5 | x
 """
 
-from collections.abc import Sequence
+import zlib
+from collections.abc import Collection, Sequence
 from typing import Any, NamedTuple
 
 import msgpack
@@ -17,8 +18,9 @@ import numpy as np
 
 from shared.checks import Cell
 from shared.layout import BUTTONS, CELL, FALLING, TEMPLATE, Int64s, X
-from shared.messages import ENTITY_MAX, ProtocolError
+from shared.messages import ENTITY_MAX, ProtocolError, shown
 from shared.units import BLOCK, SEGMENT
+from shared.world import World
 
 ROW = np.dtype(
     [("id", "<u4"), ("template", "u1"), ("flags", "u1")]
@@ -31,12 +33,14 @@ SIDE = SEGMENT * BLOCK
 FIELDS = ("id", "template", "flags", "x", "y", "z", "vx", "vy", "vz", "move_x", "move_y", "buttons")
 assert len(FIELDS) == CELL == BUTTONS + 1
 
+ACTED = 4
+"""Flag on the wire: the server's rules placed or threw this entity."""
 PART_MAX = 200 * 1024
 """No field of a segment's part is longer, in bytes."""
 
 STATE_LOW = np.array([1, 0, 0, 0, 0, 0, -(1 << 30), -(1 << 30), -(1 << 30), -127, -127, 0], np.int64)
 STATE_HIGH = np.array(
-    [ENTITY_MAX, 255, FALLING, SIDE - 1, SIDE - 1, SIDE - 1, 1 << 30, 1 << 30, 1 << 30, 127, 127, 255], np.int64
+    [ENTITY_MAX, 255, FALLING | ACTED, SIDE - 1, SIDE - 1, SIDE - 1, 1 << 30, 1 << 30, 1 << 30, 127, 127, 255], np.int64
 )
 """The bounds of a state on the wire: nothing a peer sends may take the kernel out of its tables."""
 
@@ -49,32 +53,51 @@ class SegmentPart(NamedTuple):
     entities: int
     gone: list[int]
     edits: np.ndarray[Any, np.dtype[Any]]
+    check: int
 
 
-def encode_rows(rows: Int64s, segment: Cell) -> bytes:
-    """Entities of one segment ([n, >= 12] state columns) as packed rows."""
+def encode_rows(rows: Int64s, segment: Cell, acted: Collection[int] = ()) -> bytes:
+    """Entities of one segment ([n, >= 12] state columns) as packed rows, those in `acted` flagged."""
     packed = np.empty(len(rows), ROW)
     for column, name in enumerate(FIELDS):
         packed[name] = rows[:, column]
     packed["flags"] &= FALLING
+    if acted:
+        packed["flags"] |= np.where(np.isin(packed["id"], list(acted)), ACTED, 0).astype(np.uint8)
     for axis, name in enumerate("xyz"):
         packed[name] = rows[:, X + axis] - segment[axis] * SIDE
     return packed.tobytes()
 
 
-def encode_part(segment: Cell, since: int, rows: Int64s, gone: list[int], edits: list[tuple[int, int]]) -> bytes:
+def encode_part(
+    segment: Cell,
+    since: int,
+    rows: Int64s,
+    gone: Sequence[int] = (),
+    edits: Sequence[tuple[int, int]] = (),
+    *,
+    acted: Collection[int] = (),
+    check: int = 0,
+) -> bytes:
     """One segment's part, ready to be joined into any client's snapshot."""
     packed_gone = np.array(gone, "<u4").tobytes()
     packed_edits = np.array(edits, EDIT).tobytes() if edits else b""
-    part = (*segment, since, encode_rows(rows, segment), packed_gone, packed_edits)
+    part = (*segment, since, encode_rows(rows, segment, acted), packed_gone, packed_edits, check)
     return msgpack.packb(part)  # type: ignore[no-any-return]
+
+
+def checksum(world: World, segment: Cell) -> int:
+    """A number from 1 on for all of a loaded segment as it is: entities and blocks."""
+    rows = encode_rows(world.in_segment(segment), segment)
+    return zlib.crc32(world.blocks.digest(segment).to_bytes(8, "little") + rows) or 1
 
 
 def decode_parts(segments: Sequence[Any], templates: int) -> tuple[list[SegmentPart], Int64s]:
     """Checks and unpacks `Snapshot.segments`, in a scene of so many templates.
 
     Returns:
-        The parts, and the states ([n, 12], as `World.put` takes them) of all their entities, part after part.
+        The parts, and the states ([n, 12], as `World.put` takes them but for `ACTED`) of all their entities, part
+        after part.
 
     Raises:
         ProtocolError: anything is not as drawn above.
@@ -94,14 +117,16 @@ def decode_parts(segments: Sequence[Any], templates: int) -> tuple[list[SegmentP
 
 
 def _decode_part(part: Any) -> SegmentPart:
-    if type(part) is not list or len(part) != 7:
-        raise ProtocolError("segment: not seven fields")
-    x, y, z, since, rows, gone, edits = part
+    if type(part) is not list or len(part) != 8:
+        raise ProtocolError("segment: not eight fields")
+    x, y, z, since, rows, gone, edits, check = part
     for name, value in (("x", x), ("y", y), ("z", z)):
         if type(value) is not int or not -(1 << 23) <= value < 1 << 23:
-            raise ProtocolError(f"segment.{name} = {str(value)[:40]}: not allowed")
+            raise ProtocolError(f"segment.{name} = {shown(value)}: not allowed")
+    if type(check) is not int or not 0 <= check < 1 << 32:
+        raise ProtocolError(f"segment.check = {str(check)[:40]}: not allowed")
     if type(since) is not int or not -1 <= since < 1 << 53:
-        raise ProtocolError(f"segment.since = {str(since)[:40]}: not allowed")
+        raise ProtocolError(f"segment.since = {shown(since)}: not allowed")
     for name, value, size in (("rows", rows, ROW.itemsize), ("gone", gone, 4), ("edits", edits, EDIT.itemsize)):
         if type(value) is not bytes or len(value) > PART_MAX or len(value) % size:
             raise ProtocolError(f"segment.{name}: not allowed")
@@ -109,4 +134,4 @@ def _decode_part(part: Any) -> SegmentPart:
     if edits and int(edited["block"].max()) >= SEGMENT**3:
         raise ProtocolError("segment.edits: a block is out of range")
     left = np.frombuffer(gone, "<u4").tolist() if gone else []
-    return SegmentPart((x, y, z), since, len(rows) // ROW.itemsize, left, edited)
+    return SegmentPart((x, y, z), since, len(rows) // ROW.itemsize, left, edited, check)

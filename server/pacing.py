@@ -1,0 +1,66 @@
+"""How much may be on its way to one client: enough to keep its path busy, too little to make snapshots old.
+
+Theory of operation. What a TCP connection has not acknowledged yet stands in a queue somewhere, and the newest
+snapshot goes behind it. So a snapshot is sent only while the bytes on the way (unsent and unacknowledged) fit into
+
+    max(two snapshots, rate x (least round trip + one tick))
+
+where `rate` is the fastest the path has acknowledged bytes lately and the least round trip is that of an empty
+path. A client that lost some ticks that way gets their union in its next snapshot: latest wins.
+"""
+
+from collections import deque
+
+RATE_WINDOW_S = 1.0
+"""The rate is the best of the last second,"""
+RATE_SPAN_S = 0.25
+"""each measured over at least a quarter of one."""
+RTT_WINDOW_S = 10.0
+
+
+class Pacing:
+    """The path to one client, from what was sent and what is still on the way."""
+
+    def __init__(self) -> None:
+        self.sent_bytes = 0
+        self._acked: deque[tuple[float, int]] = deque()  # time, bytes acknowledged by then
+        self._rates: deque[tuple[float, float]] = deque()
+        self._rtts: deque[tuple[float, float]] = deque()
+
+    @property
+    def rate(self) -> float:
+        """Bytes per second that the path has lately been seen to carry."""
+        return max((rate for _, rate in self._rates), default=0.0)
+
+    @property
+    def least_rtt_s(self) -> float:
+        """The shortest time lately from sending a snapshot to hearing that it was applied."""
+        return min((rtt for _, rtt in self._rtts), default=0.0)
+
+    def sent(self, size: int) -> None:
+        """Bytes have been handed to the transport."""
+        self.sent_bytes += size
+
+    def answered(self, rtt_s: float, now: float) -> None:
+        """The client has acknowledged a snapshot `rtt_s` after it was sent."""
+        while self._rtts and (self._rtts[0][0] < now - RTT_WINDOW_S):
+            self._rtts.popleft()
+        while self._rtts and self._rtts[-1][1] >= rtt_s:
+            self._rtts.pop()
+        self._rtts.append((now, rtt_s))
+
+    def window(self, outstanding: int, snapshot_bytes: int, tick_s: float, now: float) -> int:
+        """How many bytes may be on the way now, given how many are; call once a tick."""
+        acked = self.sent_bytes - outstanding
+        self._acked.append((now, acked))
+        while len(self._acked) > 1 and self._acked[1][0] <= now - RATE_SPAN_S:
+            self._acked.popleft()
+        since, before = self._acked[0]
+        if now - since >= RATE_SPAN_S:
+            rate = (acked - before) / (now - since)
+            while self._rates and self._rates[-1][1] <= rate:
+                self._rates.pop()
+            self._rates.append((now, rate))
+        while self._rates and self._rates[0][0] < now - RATE_WINDOW_S:
+            self._rates.popleft()
+        return max(2 * snapshot_bytes, int(self.rate * (self.least_rtt_s + tick_s)))
