@@ -1,0 +1,183 @@
+"""The asyncio client on real loopback sockets, on asyncio's own loop and on uvloop."""
+
+import asyncio
+import random
+import socket
+import sys
+import threading
+from collections.abc import Callable, Coroutine, Iterator
+from typing import Any
+
+import pytest
+
+from client_sdk.bots import Bot, Wander
+from client_sdk.events import Event, Joined, Left
+from client_sdk.transports.aio import AsyncClient
+from client_sdk.transports.connection import ConnectError
+from shared import messages
+from shared.inputs import make_input
+from tests.client_sdk.servers import accept, real_server, scripted_server
+
+pytestmark = pytest.mark.e2e
+
+Run = Callable[[Coroutine[Any, Any, None]], None]
+LOOPS = ["asyncio"] if sys.platform == "win32" else ["asyncio", "uvloop"]
+
+
+@pytest.fixture(scope="module")
+def url() -> Iterator[str]:
+    with real_server("--scene", "flat") as url:
+        yield url
+
+
+@pytest.fixture(params=LOOPS)
+def run(request: pytest.FixtureRequest) -> Run:
+    """Runs a coroutine in each kind of loop, for at most 30 s."""
+
+    def limited(coroutine: Coroutine[Any, Any, None]) -> None:
+        factory = pytest.importorskip("uvloop").new_event_loop if request.param == "uvloop" else None
+        with asyncio.Runner(loop_factory=factory) as runner:
+            runner.run(asyncio.wait_for(coroutine, 30))
+
+    return limited
+
+
+async def first(client: AsyncClient, kind: type[Event]) -> Any:
+    async for event in client:
+        if isinstance(event, kind):
+            return event
+    raise AssertionError(f"it ended without {kind.__name__}")
+
+
+async def until(so: Callable[[], bool]) -> None:
+    while not so():  # noqa: ASYNC110  # what it waits for happens in the client, which has no event for it
+        await asyncio.sleep(0.01)
+
+
+def test_a_player_joins_walks_and_leaves(url: str, run: Run) -> None:
+    async def scene() -> None:
+        async with await AsyncClient.connect(url, name="Ann") as client:
+            joined = await first(client, Joined)
+            assert joined.entity == client.entity
+            before = client.view().me
+            client.set_input(make_input(1, 0))
+            goal = client.stats.inputs_sent + 32
+            await until(lambda: client.stats.inputs_sent >= goal)
+            after = client.view().me
+            assert before is not None
+            assert after is not None
+            assert after.position[0] - before.position[0] == pytest.approx(3.0, abs=0.8)
+            assert client.stats.corrections == 0
+            await client.close()
+            events = [event async for event in client]
+            assert events[-1] == Left(1000, "closed by this client")
+
+    run(scene())
+
+
+def test_small_messages_are_not_held_back(url: str, run: Run) -> None:
+    async def scene() -> None:
+        async with await AsyncClient.connect(url) as client:
+            assert client._transport is not None
+            sock = client._transport.get_extra_info("socket")
+            assert sock.getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY)
+
+    run(scene())
+
+
+def test_bots_play_side_by_side_without_a_task_each(url: str, run: Run) -> None:
+    async def scene() -> None:
+        bots = [Bot(Wander(random.Random(seed))) for seed in range(8)]
+        clients = await asyncio.gather(*(AsyncClient.connect(url, before_update=bot) for bot in bots))
+        await until(lambda: all(client.core.state == "playing" for client in clients))
+        goal = max(client.stats.snapshots for client in clients) + 32
+        await until(lambda: all(client.stats.snapshots >= goal for client in clients))
+        assert len(asyncio.all_tasks()) <= 2
+        for client in clients:
+            assert client.stats.snapshots_skipped == 0
+            assert len(client.view().others) == 7
+        await asyncio.gather(*(client.close() for client in clients))
+
+    run(scene())
+
+
+def test_a_server_that_vanishes_ends_the_events(run: Run) -> None:
+    async def scene() -> None:
+        client = await AsyncClient.connect(address)
+        left = [event async for event in client][-1]
+        assert isinstance(left, Left)
+        assert "broke off" in left.reason
+        await client.close()
+
+    with scripted_server(accept) as address:
+        run(scene())
+
+
+def test_a_server_that_stops_reading_is_left(run: Run) -> None:
+    over = threading.Event()
+
+    def script(sock: socket.socket) -> None:
+        sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+        accept(sock)
+        over.wait(20)
+
+    async def scene() -> None:
+        client = await AsyncClient.connect(address)
+        while client.core.state != "closed":
+            client.core._out.append(bytes(100_000))
+            client._update()
+            await asyncio.sleep(0)
+        left = [event async for event in client][-1]
+        assert isinstance(left, Left)
+        assert left.code == messages.TOO_SLOW
+        over.set()
+
+    with scripted_server(script) as address:
+        run(scene())
+
+
+def test_nobody_there_reads_like_advice(run: Run) -> None:
+    async def scene() -> None:
+        with pytest.raises(ConnectError, match="start one with: python -m server"):
+            await AsyncClient.connect(address)
+
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        address = f"ws://127.0.0.1:{listener.getsockname()[1]}"
+    run(scene())
+
+
+def test_a_page_that_is_no_game_reads_like_advice(run: Run) -> None:
+    def script(sock: socket.socket) -> None:
+        sock.recv(65536)
+        sock.sendall(b"HTTP/1.1 404 Not Found\r\nContent-Length: 0\r\n\r\n")
+
+    async def scene() -> None:
+        with pytest.raises(ConnectError, match="it is not a Sovereign Netcode server"):
+            await AsyncClient.connect(address)
+
+    with scripted_server(script) as address:
+        run(scene())
+
+
+def test_silence_ends_in_time(run: Run) -> None:
+    over = threading.Event()
+
+    async def scene() -> None:
+        with pytest.raises(ConnectError, match="no answer in time"):
+            await AsyncClient.connect(address, timeout=0.3)
+        over.set()
+
+    with scripted_server(lambda _: over.wait(20)) as address:
+        run(scene())
+
+
+def test_whoever_stops_waiting_may_ask_again(url: str, run: Run) -> None:
+    async def scene() -> None:
+        async with await AsyncClient.connect(url) as client:
+            await first(client, Joined)
+            with pytest.raises(TimeoutError):
+                await asyncio.wait_for(anext(client), 0.05)
+            await client.close()
+            assert isinstance(await first(client, Left), Left)
+
+    run(scene())

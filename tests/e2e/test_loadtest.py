@@ -1,0 +1,84 @@
+"""The load test as it is called: real processes, real sockets."""
+
+import json
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.client_sdk.servers import real_server
+
+pytestmark = pytest.mark.e2e
+
+ROOT = Path(__file__).resolve().parents[2]
+KEYS = """clients seconds tick_rate server_ticks tick_lateness_ms snapshots_per_client_per_s inputs_sent
+inputs_late_share corrections_per_client_minute correction_blocks bytes_per_client_per_s
+server_cpu_us_per_client_tick disconnects server_rss_mb""".split()
+
+
+def loadtest(*flags: str) -> "subprocess.CompletedProcess[str]":
+    command = [sys.executable, "scripts/loadtest.py", *flags]
+    return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=120, check=False)
+
+
+def test_all_clients_play_and_the_figures_are_there(tmp_path: Path) -> None:
+    out = tmp_path / "out.json"
+    done = loadtest("--clients", "10", "--seconds", "3", "--processes", "2", "--json", str(out), "--verdict")
+    assert done.returncode == 0, done.stdout + done.stderr
+    figures = json.loads(out.read_text())
+    assert set(KEYS) <= set(figures)
+    assert figures["clients"] == 10
+    assert figures["disconnects"] == 0
+    assert figures["malformed"] == 0
+    assert figures["clients_with_95_percent"] == 10
+    assert figures["inputs_sent"] > 10 * 32
+    assert set(figures["bytes_per_client_per_s"]) == {"up", "down"}
+    assert set(figures["tick_lateness_ms"]) == set(figures["correction_blocks"]) == {"p50", "p99", "max"}
+    assert len(figures["server_rss_mb"]) >= 2
+    assert figures["server_exit_code"] == 0
+    assert "10 of 10 clients got at least 95 % of their snapshots" in done.stdout
+
+
+def test_it_takes_a_server_that_runs_already(tmp_path: Path) -> None:
+    out = tmp_path / "out.json"
+    with real_server("--scene", "topdown", "--tick-rate", "20") as url:
+        done = loadtest("--url", url, "--clients", "4", "--seconds", "1", "--policy", "follow", "--json", str(out))
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert json.loads(out.read_text())["tick_rate"] == 20
+
+
+def test_no_server_is_one_clear_line() -> None:
+    done = loadtest("--url", "ws://127.0.0.1:9", "--clients", "2")
+    assert done.returncode == 2
+    assert "no server there" in done.stdout
+    assert "Traceback" not in done.stdout + done.stderr
+
+
+def test_a_broken_scene_is_one_clear_line() -> None:
+    done = loadtest("--scene", "nowhere")
+    assert done.returncode == 2
+    assert "nowhere" in done.stderr
+    assert "Traceback" not in done.stdout + done.stderr
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="looks for processes in /proc")
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_leaves_nothing_behind(number: signal.Signals) -> None:
+    command = [sys.executable, "-u", "scripts/loadtest.py", "--clients", "3", "--seconds", "60"]
+    with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True) as process:
+        try:
+            assert process.stdout is not None
+            for line in process.stdout:
+                if "3 play" in line:
+                    break
+            children = Path(f"/proc/{process.pid}/task/{process.pid}/children")
+            started = children.read_text().split()
+            assert len(started) == 2
+            process.send_signal(number)
+            assert process.wait(20) == 130
+        finally:
+            if process.poll() is None:
+                process.kill()
+    assert not [pid for pid in started if Path(f"/proc/{pid}").exists()]
