@@ -99,9 +99,10 @@ class Blocks:
         self.count = 1  # row 0 is layout.NOWHERE
         self.rows: dict[Cell, int] = {}
         self.kinds: Kinds = np.zeros((1, BLOCKS), np.uint8)
+        self.solid = np.zeros((1, SEGMENT * SEGMENT), np.uint32)  # what the kernel reads: an eighth of the memory
         self.segments = np.zeros((1, 3), np.int64)
         self.digests = np.zeros(1, np.uint64)
-        self.heads = np.full(CELLS, -1, np.int64)
+        self.heads = np.full(CELLS, -1, np.int32)
         self.table = np.zeros(2, np.int64)
         self.near = np.full(4, 1 << 40, np.int64)
         self._free: list[int] = []
@@ -126,6 +127,7 @@ class Blocks:
             self.segments[row] = index
             moved = self._enter(row) or moved
         self.kinds[row] = kinds
+        self.solid[row] = np.packbits(kinds != AIR, bitorder="little").view("<u4")
         self.digests[row] = digest_of(kinds)
         return moved
 
@@ -146,6 +148,8 @@ class Blocks:
         row, at = self.rows[segment_of(x, y, z)], _offset(x, y, z)
         change = _mix_one(at, int(self.kinds[row, at])) ^ _mix_one(at, kind)
         self.kinds[row, at] = kind
+        word, bit = at >> SEGMENT_SHIFT, 1 << (at & (SEGMENT - 1))
+        self.solid[row, word] = int(self.solid[row, word]) & ~bit | (bit if kind != AIR else 0)
         self.digests[row] ^= np.uint64(change)
 
     def segment(self, index: Cell) -> Kinds:
@@ -163,10 +167,11 @@ class Blocks:
         if self.rows == other.rows and len(self.kinds) == len(other.kinds):
             for row in np.flatnonzero(self.digests[: self.count] != other.digests[: self.count]):
                 self.kinds[row] = other.kinds[row]
+                self.solid[row] = other.solid[row]
             self.digests[:] = other.digests
             return False
         self.count, self.rows, self._free = other.count, dict(other.rows), list(other._free)
-        for name in ("kinds", "segments", "digests", "heads", "table", "near"):
+        for name in ("kinds", "solid", "segments", "digests", "heads", "table", "near"):
             setattr(self, name, getattr(other, name).copy())
         return True
 
@@ -197,6 +202,7 @@ class Blocks:
 
     def _grow(self, size: int) -> None:
         self.kinds = grown(self.kinds, 0, size)
+        self.solid = grown(self.solid, 0, size)
         self.segments = grown(self.segments, 0, size)
         self.digests = grown(self.digests, 0, size)
         self.heads = grown(self.heads, -1, size * CELLS)

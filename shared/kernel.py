@@ -25,9 +25,12 @@ from shared.inputs import JUMP, MOVE_MAX
 from shared.layout import (
     AWAKE,
     BUTTONS,
+    CANDIDATE,
     CELL,
     CELL_SHIFT,
+    CELL_SHIFT_Z,
     CELLS,
+    CELLS_SHIFT,
     CHANGED,
     EXACT,
     FALLING,
@@ -57,11 +60,13 @@ from shared.layout import (
     SIZE_X,
     SOLID,
     TEMPLATE,
+    TEMPLATE_COLUMNS,
     TERMINAL,
     VX,
     VY,
     VZ,
     WALKS,
+    WIDTH_SHIFT,
     Arrays,
     X,
     Y,
@@ -90,6 +95,12 @@ else:
 ROW_BITS = 32
 ROW_MASK = (1 << ROW_BITS) - 1
 INSIDE = (1 << SEGMENT_SHIFT) - 1
+TO_SEGMENT = BLOCK_SHIFT + SEGMENT_SHIFT
+TO_CELL = BLOCK_SHIFT + CELL_SHIFT
+TO_CELL_Z = BLOCK_SHIFT + CELL_SHIFT_Z
+CELL_TO_SEGMENT = SEGMENT_SHIFT - CELL_SHIFT
+CELL_TO_SEGMENT_Z = SEGMENT_SHIFT - CELL_SHIFT_Z
+MOVES = 2 * MOVE_MAX + 1
 
 
 # -- looking things up ---------------------------------------------------------------------------------------
@@ -97,7 +108,7 @@ INSIDE = (1 << SEGMENT_SHIFT) - 1
 
 @inlined
 def segment_row(w: Arrays, x: int, y: int, z: int) -> int:
-    """The row of a loaded segment, or -1; the latest answer is kept in `near`."""
+    """The row of a loaded segment, or NOWHERE; the latest answer is kept in `near`."""
     near = w.near
     if near[0] == x and near[1] == y and near[2] == z:
         return near[3]
@@ -109,10 +120,10 @@ def find_segment(table: Any, segments: Any, near: Any, x: int, y: int, z: int) -
     """The same through the hash table."""
     mask = len(table) - 1
     at = (x * 73856093 ^ y * 19349663 ^ z * 83492791) & mask
-    row = -1
+    row = NOWHERE
     while table[at] != 0:
         found = table[at] - 1
-        if segments[found, 0] == x and segments[found, 1] == y and segments[found, 2] == z:
+        if segments[3 * found] == x and segments[3 * found + 1] == y and segments[3 * found + 2] == z:
             row = found
             break
         at = (at + 1) & mask
@@ -124,58 +135,71 @@ def find_segment(table: Any, segments: Any, near: Any, x: int, y: int, z: int) -
 
 
 @inlined
-def solid_at(w: Arrays, x: int, y: int, z: int) -> bool:
-    """Whether this block stops things: what is not loaded does, the void below the floor does not."""
-    row = segment_row(w, x >> SEGMENT_SHIFT, y >> SEGMENT_SHIFT, z >> SEGMENT_SHIFT)
-    if row < 0:
-        return z >= w.parameters[FLOOR]
-    return w.blocks[row, (z & INSIDE) << 10 | (y & INSIDE) << 5 | (x & INSIDE)] != 0
+def solid_in(w: Arrays, x0: int, y0: int, z0: int, x1: int, y1: int, z1: int) -> bool:
+    """Whether any of the blocks from the first corner to the second, which is included, stops things.
+
+    What is not loaded does, the void below the floor does not.
+    """
+    for z in range(z0, z1 + 1):
+        for y in range(y0, y1 + 1):
+            x = x0
+            while x <= x1:
+                last = min(x1, x | INSIDE)  # all in one segment, and so in one word
+                row = segment_row(w, x >> SEGMENT_SHIFT, y >> SEGMENT_SHIFT, z >> SEGMENT_SHIFT)
+                if row == NOWHERE:
+                    if z >= w.parameters[FLOOR]:
+                        return True
+                else:
+                    asked = ((2 << (last - x)) - 1) << (x & INSIDE)
+                    if w.solid[row << 10 | (z & INSIDE) << 5 | (y & INSIDE)] & asked != 0:
+                        return True
+                x = last + 1
+    return False
 
 
 @jit
 def blocks_in(w: Arrays, x0: int, y0: int, z0: int, x1: int, y1: int, z1: int) -> bool:
     """Whether a solid block overlaps the open box between two corners."""
-    for z in range(z0 >> BLOCK_SHIFT, ((z1 - 1) >> BLOCK_SHIFT) + 1):
-        for y in range(y0 >> BLOCK_SHIFT, ((y1 - 1) >> BLOCK_SHIFT) + 1):
-            for x in range(x0 >> BLOCK_SHIFT, ((x1 - 1) >> BLOCK_SHIFT) + 1):
-                if solid_at(w, x, y, z):
-                    return True
-    return False
+    return solid_in(
+        w,
+        x0 >> BLOCK_SHIFT, y0 >> BLOCK_SHIFT, z0 >> BLOCK_SHIFT,
+        (x1 - 1) >> BLOCK_SHIFT, (y1 - 1) >> BLOCK_SHIFT, (z1 - 1) >> BLOCK_SHIFT,
+    )  # fmt: skip
 
 
 @jit
 def gather(w: Arrays, but: int, solid: bool, x0: int, y0: int, z0: int, x1: int, y1: int, z1: int) -> int:
-    """Fills `candidates` with the (solid) entities that overlap or touch a box, row `but` left out; how many."""
+    """Fills `candidates` with the (solid) entities that overlap or touch a box, row `but` left out; up to where."""
     p, e, t, found = w.parameters, w.entities, w.templates, w.candidates
-    shift = BLOCK_SHIFT + CELL_SHIFT
     n = 0
-    for cz in range((z0 - p[REACH_HI + 2]) >> shift, ((z1 + p[REACH_LO + 2]) >> shift) + 1):
-        for cy in range((y0 - p[REACH_HI + 1]) >> shift, ((y1 + p[REACH_LO + 1]) >> shift) + 1):
-            for cx in range((x0 - p[REACH_HI]) >> shift, ((x1 + p[REACH_LO]) >> shift) + 1):
-                segment = max(segment_row(w, cx >> 3, cy >> 3, cz >> 3), NOWHERE)
-                row = w.heads[segment * CELLS + ((cz & 7) << 6 | (cy & 7) << 3 | (cx & 7))]
+    for cz in range((z0 - p[REACH_HI + 2]) >> TO_CELL_Z, ((z1 + p[REACH_LO + 2]) >> TO_CELL_Z) + 1):
+        for cy in range((y0 - p[REACH_HI + 1]) >> TO_CELL, ((y1 + p[REACH_LO + 1]) >> TO_CELL) + 1):
+            for cx in range((x0 - p[REACH_HI]) >> TO_CELL, ((x1 + p[REACH_LO]) >> TO_CELL) + 1):
+                cell = cell_at(w, cx, cy, cz)
+                row = w.heads[cell]
                 while row >= 0:
-                    kind = e[row, TEMPLATE]
-                    here = segment != NOWHERE or (
-                        e[row, X] >> shift == cx and e[row, Y] >> shift == cy and e[row, Z] >> shift == cz
+                    at = row << WIDTH_SHIFT
+                    kind = e[at + TEMPLATE] * TEMPLATE_COLUMNS
+                    here = cell >= CELLS or (
+                        e[at + X] >> TO_CELL == cx and e[at + Y] >> TO_CELL == cy and e[at + Z] >> TO_CELL_Z == cz
                     )
-                    if here and row != but and (not solid or t[kind, SOLID] != 0):
-                        x = e[row, X] + t[kind, LO_X]
-                        y = e[row, Y] + t[kind, LO_X + 1]
-                        z = e[row, Z] + t[kind, LO_X + 2]
-                        hx = x + t[kind, SIZE_X]
-                        hy = y + t[kind, SIZE_X + 1]
-                        hz = z + t[kind, SIZE_X + 2]
+                    if here and row != but and (not solid or t[kind + SOLID] != 0):
+                        x = e[at + X] + t[kind + LO_X]
+                        y = e[at + Y] + t[kind + LO_X + 1]
+                        z = e[at + Z] + t[kind + LO_X + 2]
+                        hx = x + t[kind + SIZE_X]
+                        hy = y + t[kind + SIZE_X + 1]
+                        hz = z + t[kind + SIZE_X + 2]
                         if x <= x1 and hx >= x0 and y <= y1 and hy >= y0 and z <= z1 and hz >= z0:
-                            found[n, 0] = x
-                            found[n, 1] = y
-                            found[n, 2] = z
-                            found[n, 3] = hx
-                            found[n, 4] = hy
-                            found[n, 5] = hz
-                            found[n, 6] = row
-                            n += 1
-                    row = e[row, NEXT]
+                            found[n] = x
+                            found[n + 1] = y
+                            found[n + 2] = z
+                            found[n + 3] = hx
+                            found[n + 4] = hy
+                            found[n + 5] = hz
+                            found[n + 6] = row
+                            n += CANDIDATE
+                    row = e[at + NEXT]
     return n
 
 
@@ -183,30 +207,28 @@ def gather(w: Arrays, but: int, solid: bool, x0: int, y0: int, z0: int, x1: int,
 
 
 @inlined
-def cell_of(w: Arrays, row: int) -> int:
-    e = w.entities
-    x = e[row, X] >> (BLOCK_SHIFT + CELL_SHIFT)
-    y = e[row, Y] >> (BLOCK_SHIFT + CELL_SHIFT)
-    z = e[row, Z] >> (BLOCK_SHIFT + CELL_SHIFT)
-    segment = max(segment_row(w, x >> 3, y >> 3, z >> 3), NOWHERE)
-    return segment * CELLS + ((z & 7) << 6 | (y & 7) << 3 | (x & 7))
+def cell_at(w: Arrays, x: int, y: int, z: int) -> int:
+    """The number of a cell from its place among all cells of the world."""
+    segment = segment_row(w, x >> CELL_TO_SEGMENT, y >> CELL_TO_SEGMENT, z >> CELL_TO_SEGMENT_Z)
+    return segment << CELLS_SHIFT | (z & 1) << 6 | (y & 7) << 3 | (x & 7)
 
 
 @jit
 def unlink(w: Arrays, row: int) -> None:
     e = w.entities
-    cell = e[row, CELL]
+    at = row << WIDTH_SHIFT
+    cell = e[at + CELL]
     if cell < 0:
         return
-    before = e[row, PREV]
-    after = e[row, NEXT]
+    before = e[at + PREV]
+    after = e[at + NEXT]
     if before >= 0:
-        e[before, NEXT] = after
+        e[(before << WIDTH_SHIFT) + NEXT] = after
     else:
         w.heads[cell] = after
     if after >= 0:
-        e[after, PREV] = before
-    e[row, CELL] = -1
+        e[(after << WIDTH_SHIFT) + PREV] = before
+    e[at + CELL] = -1
     if cell < CELLS:
         w.lengths[N_HOMELESS] -= 1
 
@@ -214,17 +236,18 @@ def unlink(w: Arrays, row: int) -> None:
 @jit
 def relink(w: Arrays, row: int) -> None:
     """Puts an entity into the cell of its position, if it is not there."""
-    cell = cell_of(w, row)
     e = w.entities
-    if cell == e[row, CELL]:
+    at = row << WIDTH_SHIFT
+    cell = cell_at(w, e[at + X] >> TO_CELL, e[at + Y] >> TO_CELL, e[at + Z] >> TO_CELL_Z)
+    if cell == e[at + CELL]:
         return
     unlink(w, row)
     first = w.heads[cell]
-    e[row, CELL] = cell
-    e[row, PREV] = -1
-    e[row, NEXT] = first
+    e[at + CELL] = cell
+    e[at + PREV] = -1
+    e[at + NEXT] = first
     if first >= 0:
-        e[first, PREV] = row
+        e[(first << WIDTH_SHIFT) + PREV] = row
     w.heads[cell] = row
     if cell < CELLS:
         w.lengths[N_HOMELESS] += 1
@@ -233,7 +256,7 @@ def relink(w: Arrays, row: int) -> None:
 @jit
 def relink_range(w: Arrays, start: int, stop: int) -> None:
     for row in range(start, stop):
-        if w.entities[row, ID] != 0:
+        if w.entities[(row << WIDTH_SHIFT) + ID] != 0:
             relink(w, row)
 
 
@@ -273,14 +296,15 @@ def pop(heap: Any, n: int) -> int:
     return least
 
 
-@jit
+@inlined
 def wake(w: Arrays, row: int, turn: int) -> None:
     """Gives a sleeper its next turn: in this tick if it comes after key `turn`, else in the next."""
     e, n = w.entities, w.lengths
-    if e[row, FLAGS] & AWAKE:
+    at = row << WIDTH_SHIFT
+    if e[at + FLAGS] & AWAKE:
         return
-    e[row, FLAGS] |= AWAKE
-    key = e[row, ID] << ROW_BITS | row
+    e[at + FLAGS] |= AWAKE
+    key = e[at + ID] << ROW_BITS | row
     if key > turn:
         push(w.woken, n[N_WOKEN], key)
         n[N_WOKEN] += 1
@@ -291,11 +315,11 @@ def wake(w: Arrays, row: int, turn: int) -> None:
 
 @jit
 def wake_riders(w: Arrays, n: int, x0: int, y0: int, x1: int, y1: int, top: int, turn: int) -> None:
-    """Wakes those of `n` candidates that stand on the face between (x0, y0) and (x1, y1) at height `top`."""
+    """Wakes those candidates up to `n` that stand on the face between (x0, y0) and (x1, y1) at height `top`."""
     c = w.candidates
-    for i in range(n):
-        if c[i, 2] == top and c[i, 0] < x1 and c[i, 3] > x0 and c[i, 1] < y1 and c[i, 4] > y0:
-            wake(w, c[i, 6], turn)
+    for m in range(0, n, CANDIDATE):
+        if c[m + 2] == top and c[m] < x1 and c[m + 3] > x0 and c[m + 1] < y1 and c[m + 4] > y0:
+            wake(w, c[m + 6], turn)
 
 
 @jit
@@ -307,8 +331,8 @@ def wake_on(w: Arrays, but: int, x0: int, y0: int, x1: int, y1: int, top: int) -
 @jit
 def wake_in(w: Arrays, x0: int, y0: int, z0: int, x1: int, y1: int, z1: int) -> None:
     """Wakes whatever overlaps or touches a box."""
-    for i in range(gather(w, -1, False, x0, y0, z0, x1, y1, z1)):
-        wake(w, w.candidates[i, 6], -1)
+    for m in range(0, gather(w, -1, False, x0, y0, z0, x1, y1, z1), CANDIDATE):
+        wake(w, w.candidates[m + 6], -1)
 
 
 # -- the turn of one entity ----------------------------------------------------------------------------------
@@ -326,116 +350,113 @@ def displacement(p: Any, velocity_sum: int) -> int:
 
 
 @inlined
-def stands_on_block(w: Arrays) -> bool:
-    """Whether a solid block touches the underside of the box, with an area."""
-    b = w.box
-    if b[2] & (BLOCK - 1) != 0:
+def stands_on_block(w: Arrays, x0: int, y0: int, x1: int, y1: int, z: int) -> bool:
+    """Whether a solid block touches the underside of a box, with an area."""
+    if z & (BLOCK - 1) != 0:
         return False
-    z = (b[2] >> BLOCK_SHIFT) - 1
-    for y in range(b[1] >> BLOCK_SHIFT, ((b[4] - 1) >> BLOCK_SHIFT) + 1):
-        for x in range(b[0] >> BLOCK_SHIFT, ((b[3] - 1) >> BLOCK_SHIFT) + 1):
-            if solid_at(w, x, y, z):
-                return True
-    return False
+    below = (z >> BLOCK_SHIFT) - 1
+    return solid_in(
+        w, x0 >> BLOCK_SHIFT, y0 >> BLOCK_SHIFT, below, (x1 - 1) >> BLOCK_SHIFT, (y1 - 1) >> BLOCK_SHIFT, below
+    )
 
 
 @inlined
-def stands_on_entity(w: Arrays, row: int) -> bool:
+def stands_on_entity(w: Arrays, row: int, x0: int, y0: int, x1: int, y1: int, z: int) -> bool:
     """Whether a solid entity does."""
-    b, c = w.box, w.candidates
-    for i in range(gather(w, row, True, b[0], b[1], b[2], b[3], b[4], b[2])):
-        if c[i, 5] == b[2] and c[i, 0] < b[3] and c[i, 3] > b[0] and c[i, 1] < b[4] and c[i, 4] > b[1]:
+    c = w.candidates
+    for m in range(0, gather(w, row, True, x0, y0, z, x1, y1, z), CANDIDATE):
+        if c[m + 5] == z and c[m] < x1 and c[m + 3] > x0 and c[m + 1] < y1 and c[m + 4] > y0:
             return True
     return False
 
 
 @inlined
 def layer_solid(w: Arrays, k: int, layer: int, i0: int, i1: int, j0: int, j1: int) -> bool:
-    """Whether a solid block lies in a layer across axis k, rows i along axis k+1 and j along axis k+2."""
-    for i in range(i0, i1):
-        for j in range(j0, j1):
-            if k == 0:
-                hit = solid_at(w, layer, i, j)
-            elif k == 1:
-                hit = solid_at(w, j, layer, i)
-            else:
-                hit = solid_at(w, i, j, layer)
-            if hit:
-                return True
-    return False
+    """Whether a solid block lies in a layer across axis k, from i0 to i1 along axis k+1 and j0 to j1 along k+2."""
+    i0 >>= BLOCK_SHIFT
+    i1 = (i1 - 1) >> BLOCK_SHIFT
+    j0 >>= BLOCK_SHIFT
+    j1 = (j1 - 1) >> BLOCK_SHIFT
+    if k == 0:
+        return solid_in(w, layer, i0, j0, layer, i1, j1)
+    if k == 1:
+        return solid_in(w, j0, layer, i0, j1, layer, i1)
+    return solid_in(w, i0, j0, layer, i1, j1, layer)
 
 
 @inlined
-def sweep(w: Arrays, k: int, d: int, n: int) -> int:
-    """How far the box gets along axis k, wishing for d != 0, with `n` candidates; moves it."""
-    b, c = w.box, w.candidates
+def sweep(w: Arrays, k: int, d: int, n: int, a0: int, a1: int, i0: int, i1: int, j0: int, j1: int) -> int:
+    """How far a box gets along axis k, wishing for d, with candidates up to `n`.
+
+    It reaches from a0 to a1 along axis k, from i0 to i1 along axis k+1 and from j0 to j1 along axis k+2.
+    """
+    sign = 1 if d > 0 else -1
+    lead = a1 - 1 if d > 0 else a0
+    layer = lead >> BLOCK_SHIFT
+    last = (lead + d) >> BLOCK_SHIFT
+    while layer != last:
+        layer += sign
+        if layer_solid(w, k, layer, i0, i1, j0, j1):
+            d = (layer << BLOCK_SHIFT) - a1 if d > 0 else ((layer + 1) << BLOCK_SHIFT) - a0
+            break
+    c = w.candidates
     i = (k + 1) % 3
     j = (k + 2) % 3
-    i0 = b[i] >> BLOCK_SHIFT
-    i1 = ((b[i + 3] - 1) >> BLOCK_SHIFT) + 1
-    j0 = b[j] >> BLOCK_SHIFT
-    j1 = ((b[j + 3] - 1) >> BLOCK_SHIFT) + 1
-    if d > 0:
-        face = b[k + 3]
-        to = face + d
-        for layer in range((face + BLOCK - 1) >> BLOCK_SHIFT, (to + BLOCK - 1) >> BLOCK_SHIFT):
-            if layer_solid(w, k, layer, i0, i1, j0, j1):
-                to = layer << BLOCK_SHIFT
-                break
-        for m in range(n):
-            if c[m, k] >= face and c[m, k] < to:  # noqa: SIM102
-                if c[m, i] < b[i + 3] and c[m, i + 3] > b[i] and c[m, j] < b[j + 3] and c[m, j + 3] > b[j]:
-                    to = c[m, k]
-    else:
-        face = b[k]
-        to = face + d
-        for layer in range((face >> BLOCK_SHIFT) - 1, (to >> BLOCK_SHIFT) - 1, -1):
-            if layer_solid(w, k, layer, i0, i1, j0, j1):
-                to = (layer + 1) << BLOCK_SHIFT
-                break
-        for m in range(n):
-            if c[m, k + 3] <= face and c[m, k + 3] > to:  # noqa: SIM102
-                if c[m, i] < b[i + 3] and c[m, i + 3] > b[i] and c[m, j] < b[j + 3] and c[m, j + 3] > b[j]:
-                    to = c[m, k + 3]
-    b[k] += to - face
-    b[k + 3] += to - face
-    return to - face
+    for m in range(0, n, CANDIDATE):
+        if c[m + i] < i1 and c[m + i + 3] > i0 and c[m + j] < j1 and c[m + j + 3] > j0:
+            if d > 0:
+                if c[m + k] >= a1:
+                    d = min(d, c[m + k] - a1)
+            elif c[m + k + 3] <= a0:
+                d = max(d, c[m + k + 3] - a0)
+    return d
 
 
 @inlined
 def turn(w: Arrays, row: int, key: int, tick: int) -> bool:
     """The whole turn of one entity; whether it stays awake."""
-    e, p, b = w.entities, w.parameters, w.box
-    t = w.templates
-    kind = e[row, TEMPLATE]
-    flags = e[row, FLAGS]
-    vx = e[row, VX]
-    vy = e[row, VY]
-    vz = e[row, VZ]
-    for k in range(3):
-        b[k] = e[row, X + k] + t[kind, LO_X + k]
-        b[k + 3] = b[k] + t[kind, SIZE_X + k]
-    meets = p[PAIRS] != 0 and t[kind, SOLID] != 0
-    falling = flags & FALLING
-    jumps = p[GRAVITY] != 0 and e[row, BUTTONS] & JUMP != 0 and t[kind, JUMP_SPEED] != 0
+    e, p, t = w.entities, w.parameters, w.templates
+    at = row << WIDTH_SHIFT
+    near = w.near  # nearly all look-ups of this turn are about the segment that it is in
+    near[0] = e[at + X] >> TO_SEGMENT
+    near[1] = e[at + Y] >> TO_SEGMENT
+    near[2] = e[at + Z] >> TO_SEGMENT
+    near[3] = e[at + CELL] >> CELLS_SHIFT
+    kind = e[at + TEMPLATE] * TEMPLATE_COLUMNS
+    x0 = e[at + X] + t[kind + LO_X]
+    y0 = e[at + Y] + t[kind + LO_X + 1]
+    z0 = e[at + Z] + t[kind + LO_X + 2]
+    x1 = x0 + t[kind + SIZE_X]
+    y1 = y0 + t[kind + SIZE_X + 1]
+    z1 = z0 + t[kind + SIZE_X + 2]
+    vx = e[at + VX]
+    vy = e[at + VY]
+    vz = e[at + VZ]
+    falling = e[at + FLAGS] & FALLING
+    meets = p[PAIRS] != 0 and t[kind + SOLID] != 0
+    walks = False
+    jumps = False
 
-    if t[kind, WALKS] != 0:
-        vx = w.walk[kind, e[row, MOVE_X] + 127]
-        vy = w.walk[kind, e[row, MOVE_Y] + 127]
+    if t[kind + WALKS] != 0:
+        east = e[at + MOVE_X]
+        north = e[at + MOVE_Y]
+        walks = east != 0 or north != 0
+        walk = e[at + TEMPLATE] * MOVES + MOVE_MAX
+        vx = w.walk[walk + east]
+        vy = w.walk[walk + north]
     from_vz = vz
     if p[GRAVITY] != 0:
+        jumps = e[at + BUTTONS] & JUMP != 0 and t[kind + JUMP_SPEED] != 0
         if falling == 0 or jumps:
-            if stands_on_block(w) or (meets and stands_on_entity(w, row)):
+            if stands_on_block(w, x0, y0, x1, y1, z0) or (meets and stands_on_entity(w, row, x0, y0, x1, y1, z0)):
                 if jumps:
-                    vz = t[kind, JUMP_SPEED]
+                    vz = t[kind + JUMP_SPEED]
                     falling = FALLING
             else:
                 falling = FALLING
         from_vz = vz
         if falling != 0:
-            vz -= p[GRAVITY]
-            if vz < -p[TERMINAL]:
-                vz = -p[TERMINAL]
+            vz = max(vz - p[GRAVITY], -p[TERMINAL])
         if p[MEAN] == 0:
             from_vz = vz
 
@@ -444,52 +465,53 @@ def turn(w: Arrays, row: int, key: int, tick: int) -> bool:
         dx = displacement(p, 2 * vx)
         dy = displacement(p, 2 * vy)
         dz = displacement(p, from_vz + vz)
-        x0 = b[0]
-        y0 = b[1]
-        x1 = b[3]
-        y1 = b[4]
-        top = b[5]
         n = 0
         if meets:
             n = gather(
                 w, row, True,
-                x0 + min(dx, 0), y0 + min(dy, 0), b[2] + min(dz, 0),
-                x1 + max(dx, 0), y1 + max(dy, 0), top + max(dz, 0),
+                x0 + min(dx, 0), y0 + min(dy, 0), z0 + min(dz, 0),
+                x1 + max(dx, 0), y1 + max(dy, 0), z1 + max(dz, 0),
             )  # fmt: skip
+        went_x = 0
+        went_y = 0
+        went_z = 0
         if dz != 0:
-            went = sweep(w, 2, dz, n)
-            if went != dz:
+            went_z = sweep(w, 2, dz, n, z0, z1, x0, x1, y0, y1)
+            if went_z != dz:
                 vz = 0
                 if dz < 0:
                     falling = 0
-            moved = went != 0
         if dx != 0:
-            went = sweep(w, 0, dx, n)
-            if went != dx:
+            went_x = sweep(w, 0, dx, n, x0, x1, y0, y1, z0 + went_z, z1 + went_z)
+            if went_x != dx:
                 vx = 0
-            moved = moved or went != 0
         if dy != 0:
-            went = sweep(w, 1, dy, n)
-            if went != dy:
+            went_y = sweep(w, 1, dy, n, y0, y1, z0 + went_z, z1 + went_z, x0 + went_x, x1 + went_x)
+            if went_y != dy:
                 vy = 0
-            moved = moved or went != 0
-        if moved:
-            for k in range(3):
-                e[row, X + k] = b[k] - t[kind, LO_X + k]
-            relink(w, row)
+        if went_x != 0 or went_y != 0 or went_z != 0:
+            moved = True
+            x = e[at + X]
+            y = e[at + Y]
+            z = e[at + Z]
+            e[at + X] = x + went_x
+            e[at + Y] = y + went_y
+            e[at + Z] = z + went_z
+            if (x ^ x + went_x | y ^ y + went_y | z ^ z + went_z) >> TO_CELL != 0:
+                relink(w, row)
             if n > 0 and p[GRAVITY] != 0:
-                wake_riders(w, n, x0, y0, x1, y1, top, key)
+                wake_riders(w, n, x0, y0, x1, y1, z1, key)
+            z0 += went_z
 
-    if moved or vx != e[row, VX] or vy != e[row, VY] or vz != e[row, VZ] or falling != flags & FALLING:
-        e[row, VX] = vx
-        e[row, VY] = vy
-        e[row, VZ] = vz
-        e[row, FLAGS] = (e[row, FLAGS] & ~FALLING) | falling
+    if moved or vx != e[at + VX] or vy != e[at + VY] or vz != e[at + VZ] or falling != e[at + FLAGS] & FALLING:
+        e[at + VX] = vx
+        e[at + VY] = vy
+        e[at + VZ] = vz
+        e[at + FLAGS] = (e[at + FLAGS] & ~FALLING) | falling
         mark(w, row, tick)
-    if b[2] >> BLOCK_SHIFT < p[FLOOR]:
-        w.fell[w.lengths[N_FELL]] = e[row, ID]
+    if z0 >> BLOCK_SHIFT < p[FLOOR]:
+        w.fell[w.lengths[N_FELL]] = e[at + ID]
         w.lengths[N_FELL] += 1
-    walks = t[kind, WALKS] != 0 and (e[row, MOVE_X] != 0 or e[row, MOVE_Y] != 0)
     return moved or falling != 0 or vx != 0 or vy != 0 or vz != 0 or walks or jumps
 
 
@@ -499,8 +521,9 @@ def mark(w: Arrays, row: int, tick: int) -> None:
     if w.lengths[N_STEPPED] != 0:
         w.lengths[N_STEPPED] = 0
         w.lengths[N_CHANGED] = 0
-    if w.entities[row, CHANGED] != tick:
-        w.entities[row, CHANGED] = tick
+    at = row << WIDTH_SHIFT
+    if w.entities[at + CHANGED] != tick:
+        w.entities[at + CHANGED] = tick
         w.changed[w.lengths[N_CHANGED]] = row
         w.lengths[N_CHANGED] += 1
 
@@ -517,13 +540,14 @@ def step(w: Arrays, inputs: Any, n_inputs: int, tick: int) -> None:
     n[N_STEPPED] = 0
     n[N_FELL] = 0
     for i in range(n_inputs):
-        row = inputs[i, 0]
+        row = inputs[4 * i]
+        wishes = (row << WIDTH_SHIFT) + MOVE_X
         for k in range(3):
-            wish = inputs[i, 1 + k]
+            wish = inputs[4 * i + 1 + k]
             if k < 2:
                 wish = min(max(wish, -MOVE_MAX), MOVE_MAX)
-            if e[row, MOVE_X + k] != wish:
-                e[row, MOVE_X + k] = wish
+            if e[wishes + k] != wish:
+                e[wishes + k] = wish
                 mark(w, row, tick)
         wake(w, row, -1)
 
@@ -538,14 +562,14 @@ def step(w: Arrays, inputs: Any, n_inputs: int, tick: int) -> None:
             key = w.awake[at]
             at += 1
         row = key & ROW_MASK
-        if key == last or e[row, ID] != key >> ROW_BITS:
+        if key == last or e[(row << WIDTH_SHIFT) + ID] != key >> ROW_BITS:
             continue  # gone since it was woken
         last = key
         if turn(w, row, key, tick):
             w.next_awake[kept] = key
             kept += 1
         else:
-            e[row, FLAGS] &= ~AWAKE
+            e[(row << WIDTH_SHIFT) + FLAGS] &= ~AWAKE
     for i in range(kept):
         w.awake[i] = w.next_awake[i]
     n[N_AWAKE] = kept
@@ -561,17 +585,18 @@ def step(w: Arrays, inputs: Any, n_inputs: int, tick: int) -> None:
 
 @jit
 def leave(w: Arrays, row: int, states: Any, i: int) -> None:
-    """Wakes what stands on an entity that state `i` moves or changes."""
+    """Wakes what stands on an entity that the state at `i` moves or changes."""
     e, t = w.entities, w.templates
-    kind = e[row, TEMPLATE]
-    same = kind == states[i, TEMPLATE]
+    at = row << WIDTH_SHIFT
+    same = e[at + TEMPLATE] == states[i + TEMPLATE]
     for k in range(X, X + 3):
-        same = same and e[row, k] == states[i, k]
+        same = same and e[at + k] == states[i + k]
     if not same:
-        x = e[row, X] + t[kind, LO_X]
-        y = e[row, Y] + t[kind, LO_X + 1]
-        top = e[row, Z] + t[kind, LO_X + 2] + t[kind, SIZE_X + 2]
-        wake_on(w, row, x, y, x + t[kind, SIZE_X], y + t[kind, SIZE_X + 1], top)
+        kind = e[at + TEMPLATE] * TEMPLATE_COLUMNS
+        x = e[at + X] + t[kind + LO_X]
+        y = e[at + Y] + t[kind + LO_X + 1]
+        top = e[at + Z] + t[kind + LO_X + 2] + t[kind + SIZE_X + 2]
+        wake_on(w, row, x, y, x + t[kind + SIZE_X], y + t[kind + SIZE_X + 1], top)
 
 
 @jit
@@ -580,12 +605,13 @@ def store(w: Arrays, rows: Any, states: Any, n: int, tick: int) -> None:
     e = w.entities
     for i in range(n):
         row = rows[i]
-        if e[row, CELL] >= 0:
-            leave(w, row, states, i)
-        awake = e[row, FLAGS] & AWAKE
+        at = row << WIDTH_SHIFT
+        if e[at + CELL] >= 0:
+            leave(w, row, states, CELL * i)
+        awake = e[at + FLAGS] & AWAKE
         for k in range(CELL):
-            e[row, k] = states[i, k]
-        e[row, FLAGS] = e[row, FLAGS] & FALLING | awake
+            e[at + k] = states[CELL * i + k]
+        e[at + FLAGS] = e[at + FLAGS] & FALLING | awake
         mark(w, row, tick)
         relink(w, row)
         wake(w, row, -1)

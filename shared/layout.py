@@ -15,6 +15,9 @@ ENTITY = np.dtype([(name, np.int64) for name in COLUMNS])
 """An entity. `id` 0 is a free row; position and velocity in grid steps; `cell` its place in the index of
 cells (-1: none) with its `next` and `prev` neighbour rows; `changed` the tick that last changed it."""
 
+WIDTH_SHIFT = 4
+"""In the kernel's flat view the row r of an entity begins at r << WIDTH_SHIFT."""
+
 STATE = slice(ID, CELL)
 """The columns that are the state of an entity; the rest is bookkeeping of this process."""
 
@@ -37,8 +40,12 @@ N_AWAKE, N_WOKEN, N_CHANGED, N_FELL, N_LATER, N_HOMELESS, N_STEPPED = range(7)
 LENGTHS = 7
 
 CELL_SHIFT = 2
-"""A cell of the entity index is a cube of 4 blocks; a segment has 8 x 8 x 8 of them."""
-CELLS = 512
+CELL_SHIFT_Z = 4
+"""A cell of the entity index is 4 x 4 x 16 blocks: crowds spread on the ground; a segment has 8 x 8 x 2 of them."""
+CELLS_SHIFT = 7
+CELLS = 1 << CELLS_SHIFT
+CANDIDATE = 7
+"""Numbers of a candidate: low corner, high corner, row."""
 NOWHERE = 0
 """The segment row whose cells hold the entities of all segments that are not loaded: they are still obstacles."""
 
@@ -46,23 +53,22 @@ Int64s = npt.NDArray[np.int64]
 
 
 class Arrays(NamedTuple):
-    """All that `kernel.step` reads and writes (arrays, or memoryviews of them for the plain source)."""
+    """All that `kernel.step` reads and writes: int64 unless said (flat arrays, or memoryviews for the plain source)."""
 
-    entities: Any  # [rows, 16]
-    templates: Any  # [templates, 9]
-    walk: Any  # [templates, 255] velocity for a move intent of -127..127
+    entities: Any  # [rows * 16]
+    templates: Any  # [templates * 9]
+    walk: Any  # [templates * 255] velocity for a move intent of -127..127
     parameters: Any  # [13]
-    blocks: Any  # uint8 [segments, 32768], index z << 10 | y << 5 | x within the segment
-    segments: Any  # [segments, 3] index of each loaded segment
+    solid: Any  # uint32 [segments * 1024] bit x of word z << 5 | y within the segment
+    segments: Any  # [segments * 3] index of each loaded segment
     table: Any  # [power of two] open addressing: segment row + 1, 0 is empty
-    heads: Any  # [segments * 512] first entity row of each cell, -1 is empty
+    heads: Any  # int32 [segments * 128] first entity row of each cell, -1 is empty
     awake: Any  # [rows + 1] keys (id << 32 | row), ascending: whose turn it is
     next_awake: Any  # [rows + 1] the same for the next tick, in the making
     woken: Any  # [rows + 1] heap of keys that join the awake
     later: Any  # [rows + 1] keys woken after their turn had passed
-    candidates: Any  # [rows + 1, 7] row and box of the entities near the one whose turn it is
+    candidates: Any  # [(rows + 1) * 7] box and row of the entities near the one whose turn it is
     changed: Any  # [rows + 1] rows whose state the step changed
     fell: Any  # [rows + 1] ids below the scene's floor
     lengths: Any  # [7]; N_HOMELESS counts the entities nowhere, N_STEPPED says nothing changed since a step
     near: Any  # [4] the segment looked up last: index and row
-    box: Any  # [6] low and high corner of the box whose turn it is

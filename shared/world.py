@@ -53,7 +53,9 @@ class World:
         self._free: list[int] = []
         self._limbo: list[int] = []  # freed since the last step: still in the kernel's lists
         self._lengths = np.zeros(layout.LENGTHS, np.int64)
-        self._box = np.zeros(6, np.int64)
+        self._edits: dict[Cell, int] = {}
+        self.edited: dict[Cell, int] = {}
+        """The blocks that were changed ahead of the latest step, after the one before it, and their kinds until then."""
         self._inputs = np.zeros((8, 4), np.int64)
         self._entities = np.zeros((0, len(layout.COLUMNS)), np.int64)
         self._awake = self._next_awake = self._woken = self._later = np.zeros(0, np.int64)
@@ -136,6 +138,30 @@ class World:
         return alive
 
     @property
+    def matrix(self) -> layout.Int64s:
+        """Every row as it lies, [rows ever used, 16], free ones with id 0. A view, read-only."""
+        view: layout.Int64s = self._entities[: self._rows]
+        view.flags.writeable = False
+        return view
+
+    @property
+    def changed_rows(self) -> layout.Int64s:
+        """The rows of `matrix` that hold, or held, what `changed` lists. A copy."""
+        rows: layout.Int64s = self._changed[: self._lengths[layout.N_CHANGED]].copy()
+        return rows
+
+    @property
+    def next_id(self) -> int:
+        """The id of the next entity to be spawned. It may be raised, never lowered."""
+        return self._next_id
+
+    @next_id.setter
+    def next_id(self, entity: int) -> None:
+        if entity < self._next_id:
+            raise SceneError(f"next_id = {entity!r}: must be at least {self._next_id}")
+        self._next_id = entity
+
+    @property
     def fell(self) -> list[int]:
         """The entities that the latest step left below the scene's floor."""
         return [int(entity) for entity in self._fell[: self._lengths[layout.N_FELL]]]
@@ -216,8 +242,9 @@ class World:
             if in_the_way and not push:
                 raise OverlapError(f"blocks {low} to {high}: entity {in_the_way[0]} is there")
         changed = [(cell, before) for cell in cells if (before := self.blocks.get(*cell) or blocks.AIR) != kind]
-        for (x, y, z), _ in changed:
+        for (x, y, z), before in changed:
             self.blocks.set(x, y, z, kind)
+            self._edits.setdefault((x, y, z), before)
             if kind == blocks.AIR:
                 face = (x * BLOCK, y * BLOCK, (x + 1) * BLOCK, (y + 1) * BLOCK, (z + 1) * BLOCK)
                 self._kernel.wake_on(self._arrays, -1, *face)
@@ -312,6 +339,7 @@ class World:
                 part * SEGMENT + ((at >> shift) & (SEGMENT - 1))
                 for part, shift in zip(segment, (0, 5, 10), strict=True)
             )
+            self._edits.setdefault((x, y, z), self.blocks.get(x, y, z) or blocks.AIR)
             self.blocks.set(x, y, z, kind)
             self._kernel.wake_on(
                 self._arrays, -1, x * BLOCK, y * BLOCK, (x + 1) * BLOCK, (y + 1) * BLOCK, (z + 1) * BLOCK
@@ -320,6 +348,7 @@ class World:
     def rebase(self, tick: int) -> None:
         """Declares what has been written to be the world at the end of `tick`, without a step."""
         self._tick = tick
+        self._edits, self.edited = {}, {}
         self._entities[: self._rows, layout.CHANGED] = -1  # it may be a tick that has been before
         self._lengths[layout.N_CHANGED] = self._lengths[layout.N_FELL] = 0
         if self._limbo:
@@ -345,6 +374,7 @@ class World:
                 self._inputs = np.zeros((2 * n, 4), np.int64)
             self._inputs[:n] = [(self._row_of[entity], *wish) for entity, wish in inputs.items()]
         self._tick += 1
+        self.edited, self._edits = self._edits, {}
         self._kernel.step(self._arrays, self._lent(self._inputs), n, self._tick)
         if self._limbo:
             self._free += self._limbo
@@ -362,6 +392,7 @@ class World:
         self.blocks.heads[cells[cells >= 0]] = -1
         if len(self._entities) != len(other._entities):
             self._allocate(len(other._entities))
+        self._edits, self.edited = dict(other._edits), dict(other.edited)
         self._tick, self._next_id, self._rows = other._tick, other._next_id, other._rows
         self._row_of, self._free, self._limbo = dict(other._row_of), list(other._free), list(other._limbo)
         n = self._rows
@@ -384,21 +415,22 @@ class World:
         self._entities = blocks.grown(self._entities, 0, rows)
         for name in ("_awake", "_next_awake", "_woken", "_later", "_changed", "_fell"):
             setattr(self, name, blocks.grown(getattr(self, name), 0, rows + 1))
-        self._candidates = np.zeros((rows + 1, 7), np.int64)
+        self._candidates = np.zeros((rows + 1, layout.CANDIDATE), np.int64)
 
     def _bind(self) -> None:
         """Hands the kernel the arrays as they lie now."""
         b = self.blocks
         arrays: tuple[np.ndarray[Any, Any], ...] = (
-            self._entities, self._templates, self._walk, self._parameters, b.kinds, b.segments, b.table, b.heads,
+            self._entities, self._templates, self._walk, self._parameters, b.solid, b.segments, b.table, b.heads,
             self._awake, self._next_awake, self._woken, self._later, self._candidates, self._changed, self._fell,
-            self._lengths, b.near, self._box,
+            self._lengths, b.near,
         )  # fmt: skip
         self._arrays = Arrays(*(self._lent(array) for array in arrays))
 
     def _lent(self, array: np.ndarray[Any, Any]) -> Any:
         """An array as the kernel wants it: memoryviews give the plain source Python's own whole numbers."""
-        return array if self.compiled else memoryview(array)  # type: ignore[arg-type]
+        flat = array.reshape(-1)
+        return flat if self.compiled else memoryview(flat)  # type: ignore[arg-type]
 
     def _row(self, entity: int) -> int:
         """The row of an entity, a new one if it is not known."""
@@ -434,9 +466,14 @@ class World:
         low = [part + row[layout.LO_X + k] for k, part in enumerate(position)]
         return low + [part + row[layout.SIZE_X + k] for k, part in enumerate(low)]
 
+    def _near(self, but: int, box: list[int]) -> layout.Int64s:
+        """The candidates of the kernel for a box (`but`: a row left out, or -1), [n, 7]."""
+        end = self._kernel.gather(self._arrays, but, True, *box)
+        return self._candidates[: end // layout.CANDIDATE]
+
     def _overlapping(self, but: int, box: list[int]) -> list[int]:
         """The ids of the solid entities that overlap a box, ascending (`but`: a row left out, or -1)."""
-        near = self._candidates[: self._kernel.gather(self._arrays, but, True, *box)]
+        near = self._near(but, box)
         low, high = np.array(box[:3]), np.array(box[3:])
         hits = (near[:, :3] < high).all(axis=1) & (near[:, 3:6] > low).all(axis=1)
         return sorted(self._entities[near[hits, 6], ID].tolist())
@@ -485,7 +522,7 @@ class World:
         if self._meets(kind):
             reach = list(box)
             reach[axis + 3 if sign > 0 else axis] += sign * BLOCK
-            near = self._candidates[: self._kernel.gather(self._arrays, row, True, *reach)]
+            near = self._near(row, reach)
             faces += near[:, axis + 3 if sign > 0 else axis].tolist()
         return sorted(set(faces), reverse=sign < 0)
 
