@@ -124,7 +124,7 @@ def _decode_part(part: Any) -> SegmentPart:
         if type(value) is not int or not -(1 << 23) <= value < 1 << 23:
             raise ProtocolError(f"segment.{name} = {shown(value)}: not allowed")
     if type(check) is not int or not 0 <= check < 1 << 32:
-        raise ProtocolError(f"segment.check = {str(check)[:40]}: not allowed")
+        raise ProtocolError(f"segment.check = {shown(check)}: not allowed")
     if type(since) is not int or not -1 <= since < 1 << 53:
         raise ProtocolError(f"segment.since = {shown(since)}: not allowed")
     for name, value, size in (("rows", rows, ROW.itemsize), ("gone", gone, 4), ("edits", edits, EDIT.itemsize)):

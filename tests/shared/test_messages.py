@@ -1,0 +1,290 @@
+"""The wire: what goes in comes out, and no bytes of a peer's do anything but that or raise `ProtocolError`."""
+
+import contextlib
+import math
+from typing import Any
+
+import msgpack
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from shared import messages
+from shared.messages import (
+    CLIENT_KINDS,
+    CLIENT_LIST_MAX,
+    CLIENT_MESSAGE_MAX,
+    KINDS,
+    LIST_MAX,
+    MESSAGE_MAX,
+    SERVER_KINDS,
+    TICK_MAX,
+    Bye,
+    Command,
+    Hello,
+    Inputs,
+    Message,
+    Ping,
+    Pong,
+    ProtocolError,
+    Resync,
+    Snapshot,
+    Terrain,
+    Welcome,
+    decode_from_client,
+    decode_from_server,
+    encode,
+    join_snapshot,
+)
+
+PART = [0, -1, 2, 7, bytes(33), bytes(4), bytes(3), 0]
+BLANK = Snapshot(0, 0, b"", 0, b"", b"", b"", ())
+FROM_CLIENT: list[Message] = [
+    Hello(1, {}, ""),
+    Hello(1 << 31, {f"field {i}": bytes(8) for i in range(32)}, "n" * 32),
+    Inputs(0, -1, b""),
+    Inputs(TICK_MAX - 64, TICK_MAX, bytes(range(192))),
+    Ping(-0.5),
+    Ping(7),
+    Command(0, -1, -0.5, "", b""),
+    Command((1 << 32) - 1, TICK_MAX, 1e300, "n" * 32, bytes(1024)),
+    Resync(),
+    Bye(0, "", -1.0),
+    Bye(4999, "é" * 500, 1e300),
+]
+FROM_SERVER: list[Message] = [
+    Bye(1001, "going down", 2.0),
+    Welcome(1, -1, 1, {"name": "flat", "spawns": [[0.5, 1, 2]]}),
+    Snapshot(0, -1, b"", -1, b"", b"", b"", ()),
+    Snapshot(TICK_MAX, TICK_MAX, bytes(512), TICK_MAX, bytes(256), bytes(640), bytes(12 * 4096), (PART, PART)),
+    Terrain(-(1 << 23), 0, (1 << 23) - 1, 0, 1, b""),
+    Terrain(0, 0, 0, 48 * 1024, 48 * 1024, bytes(48 * 1024)),
+    Pong(1.5, 17.25),
+]
+
+
+@pytest.mark.parametrize("message", FROM_CLIENT, ids=str)
+def test_what_a_client_sends_arrives_as_it_was(message: Message) -> None:
+    assert decode_from_client(encode(message)) == message
+
+
+@pytest.mark.parametrize("message", FROM_SERVER, ids=lambda message: type(message).__name__)
+def test_what_a_server_sends_arrives_as_it_was(message: Message) -> None:
+    assert decode_from_server(encode(message)) == message
+
+
+def test_every_kind_is_tried_and_has_a_check_for_each_field() -> None:
+    assert {type(message) for message in FROM_CLIENT + FROM_SERVER} == {kind for kind, _ in KINDS.values()}
+    assert set(KINDS) == CLIENT_KINDS | SERVER_KINDS
+    for kind, checks in KINDS.values():
+        assert len(checks) == len(kind._fields) - (kind is Snapshot)
+
+
+@pytest.mark.parametrize("segments", [0, 1, 15, 16, 1024])
+def test_a_snapshot_joined_from_encoded_segments_is_the_snapshot(segments: int) -> None:
+    message = Snapshot(9, 12, b"\x01\x02", 8, b"\x00\x01", bytes(5), bytes(12), (PART,) * segments)
+    assert decode_from_server(join_snapshot(message[:7], [msgpack.packb(PART)] * segments)) == message
+
+
+def test_each_side_refuses_what_only_it_may_say() -> None:
+    for message in FROM_CLIENT:
+        if not isinstance(message, Bye):
+            assert_refused(encode(message), server=True)
+    for message in FROM_SERVER:
+        if not isinstance(message, Bye):
+            assert_refused(encode(message))
+
+
+OUT_OF_BOUNDS: list[tuple[Message, str, list[Any]]] = [
+    (Hello(1, {}, ""), "version", [-1, (1 << 31) + 1, True, 1.0, None]),
+    (
+        Hello(1, {}, ""),
+        "scene",
+        [{str(i): b"" for i in range(33)}, {"a": bytes(9)}, {"a": "text"}, {b"a": b""}, [], None],
+    ),
+    (Hello(1, {}, ""), "name", ["n" * 33, b"name", None, []]),
+    (Inputs(0, 0, b""), "first", [-1, TICK_MAX - 63, False, 0.0]),
+    (Inputs(0, 0, b""), "acked", [-2, TICK_MAX + 1, None]),
+    (Inputs(0, 0, b""), "rows", [bytes(195), bytes(4), bytes(1), "abc", None, [0, 0, 0]]),
+    (Ping(0.0), "sent", [math.nan, math.inf, -math.inf, "1", True, None, [1.0]]),
+    (Command(0, 0, 0.0, "", b""), "number", [-1, 1 << 32, 0.0]),
+    (Command(0, 0, 0.0, "", b""), "tick", [-2, TICK_MAX + 1]),
+    (Command(0, 0, 0.0, "", b""), "seen", [math.nan, math.inf, None]),
+    (Command(0, 0, 0.0, "", b""), "name", ["n" * 33, b"edit"]),
+    (Command(0, 0, 0.0, "", b""), "payload", [bytes(1025), "text", [0, 0, 0, 1]]),
+    (Bye(0, "", 0.0), "code", [-1, 5000, None]),
+    (Bye(0, "", 0.0), "reason", ["r" * 501, b"r"]),
+    (Bye(0, "", 0.0), "wait", [math.nan, math.inf, None]),
+    (Welcome(1, 0, 1, {}), "version", [-1, (1 << 31) + 1]),
+    (Welcome(1, 0, 1, {}), "tick", [-2, TICK_MAX + 1]),
+    (Welcome(1, 0, 1, {}), "entity", [0, -1, 1 << 31]),
+    (Welcome(1, 0, 1, {}), "scene", [[], None, {str(i): 0 for i in range(65)}]),
+    (BLANK, "tick", [-2, TICK_MAX + 1, None]),
+    (BLANK, "newest", [-2, TICK_MAX + 1]),
+    (BLANK, "margins", [bytes(514), bytes(3), ""]),
+    (BLANK, "first", [-2, TICK_MAX + 1]),
+    (BLANK, "fates", [bytes(257), ""]),
+    (BLANK, "verdicts", [bytes(645), bytes(4), ""]),
+    (BLANK, "drops", [bytes(12 * 4097), bytes(11)]),
+    (Terrain(0, 0, 0, 0, 1, b""), "x", [-(1 << 23) - 1, 1 << 23, 0.0]),
+    (Terrain(0, 0, 0, 0, 1, b""), "y", [-(1 << 23) - 1, 1 << 23]),
+    (Terrain(0, 0, 0, 0, 1, b""), "z", [-(1 << 23) - 1, 1 << 23]),
+    (Terrain(0, 0, 0, 0, 1, b""), "offset", [-1, 48 * 1024 + 1, None]),
+    (Terrain(0, 0, 0, 0, 1, b""), "total", [0, 48 * 1024 + 1]),
+    (Terrain(0, 0, 0, 0, 1, b""), "chunk", [bytes(48 * 1024 + 1), "chunk"]),
+    (Pong(0.0, 0.0), "sent", [math.nan, None]),
+    (Pong(0.0, 0.0), "tick", [math.inf, "0"]),
+]
+
+
+@pytest.mark.parametrize(("message", "field", "values"), OUT_OF_BOUNDS)
+def test_a_field_beyond_its_bounds_is_refused_by_name(message: Message, field: str, values: list[Any]) -> None:
+    for value in values:
+        data = encode(message._replace(**{field: value}))
+        with pytest.raises(ProtocolError, match=rf"{type(message).__name__}\.{field}|not MessagePack"):
+            messages.decode(data, frozenset(KINDS), MESSAGE_MAX)
+
+
+def test_every_field_has_a_case_beyond_its_bounds() -> None:
+    tried = {(type(message), field) for message, field, _ in OUT_OF_BOUNDS}
+    fields = {(kind, name) for kind, _ in KINDS.values() for name in kind._fields} - {(Snapshot, "segments")}
+    assert tried == fields
+
+
+@pytest.mark.parametrize("message", FROM_CLIENT + FROM_SERVER, ids=lambda message: type(message).__name__)
+def test_a_field_too_many_or_too_few_is_refused(message: Message) -> None:
+    parts = msgpack.unpackb(encode(message))
+    if isinstance(message, Snapshot):
+        assert_refused(msgpack.packb(parts[:7]), server=True)
+        assert_refused(msgpack.packb([*parts[:8], *[PART] * 1025]), server=True)
+        return
+    for wrong in (parts[:-1], [*parts, 0]):  # (of a message without fields: one without a kind)
+        assert_refused(msgpack.packb(wrong))
+        assert_refused(msgpack.packb(wrong), server=True)
+
+
+HOSTILE = {
+    "nothing": b"",
+    "not a list": b"\x80",
+    "an empty list": b"\x90",
+    "an unknown kind": b"\x91\x63",
+    "a kind that is true": b"\x92\x01\x01".replace(b"\x01", b"\xc3", 1),
+    "a kind that is a float": msgpack.packb([3.0, 1.0]),
+    "a kind that is a list": msgpack.packb([[3], 1.0]),
+    "a reserved byte": b"\xc1",
+    "trailing bytes": encode(Ping(1.0)) + b"\x00",
+    "a list of four thousand million": b"\xdd\xff\xff\xff\xff",
+    "a table of four thousand million": b"\x92\x01\xdf\xff\xff\xff\xff",
+    "bytes without an end": b"\x94\x02\x00\x00\xc6\xff\xff\xff\xff",
+    "text without an end": b"\x92\x03\xdb\xff\xff\xff\xff",
+    "text that is not UTF-8": b"\x94\x01\x01\x80\xa2\xff\xfe",
+    "a table with a table as key": b"\x94\x01\x01\x81\x80\x00\xa0",
+    "an extension type": msgpack.packb([3, msgpack.ExtType(5, bytes(100))]),
+    "a time": msgpack.packb([3, msgpack.Timestamp(1, 1)]),
+    "a time that is none": b"\x92\x03\xd7\xff\xff\xff\xff\xff\xff\xff\xff\xff",
+    "NaN": msgpack.packb([3, math.nan]),
+}
+HOSTILE |= {f"nested {depth} deep": b"\x92\x03" + b"\x91" * depth + b"\xc0" for depth in (100, 990, 1020, 1100, 8000)}
+HOSTILE |= {
+    f"tables nested {depth} deep": b"\x94\x01\x01" + b"\x81\xa0" * depth + b"\xc0\xa0" for depth in (100, 990, 1100)
+}
+
+
+@pytest.mark.parametrize("name", HOSTILE)
+def test_hostile_bytes_are_refused(name: str) -> None:
+    assert_refused(HOSTILE[name])
+    assert_refused(HOSTILE[name], server=True)
+
+
+def test_a_server_is_not_hurt_by_nesting_in_any_field() -> None:
+    deep: Any = None
+    for _ in range(500):
+        deep = [deep]
+    for message in FROM_CLIENT + FROM_SERVER:
+        for field in set(message._fields) - {"segments"}:
+            data = encode(message._replace(**{field: deep}))
+            with pytest.raises(ProtocolError):
+                messages.decode(data, frozenset(KINDS), MESSAGE_MAX)
+
+
+def test_a_list_cannot_claim_memory_that_its_bytes_do_not_fill() -> None:
+    # A thousand lists in each other, each said to be as long as the message: 65 MB before the first is filled.
+    for data, server in ((claims(CLIENT_MESSAGE_MAX), False), (claims(MESSAGE_MAX), True)):
+        with pytest.raises(ProtocolError, match="not MessagePack"):
+            (decode_from_server if server else decode_from_client)(data)
+    for items, refused in ((CLIENT_LIST_MAX, "fields instead of"), (CLIENT_LIST_MAX + 1, "not MessagePack")):
+        with pytest.raises(ProtocolError, match=refused):
+            decode_from_client(msgpack.packb([3] * items))
+    assert LIST_MAX > messages.SEGMENTS_MAX + 8
+
+
+def claims(size: int) -> bytes:
+    data = b"\x92\x03" + (b"\xdc" + min(size, 0xFFFF).to_bytes(2, "big")) * 1000
+    return data + b"\xc0" * (size - len(data))
+
+
+def test_of_two_equal_keys_the_last_counts() -> None:
+    message = decode_from_client(b"\x94\x01\x01\x82\xa1a\xc4\x01\x01\xa1a\xc4\x01\x02\xa0")
+    assert message == Hello(1, {"a": b"\x02"}, "")
+
+
+def test_a_message_that_is_too_long_is_not_even_looked_at() -> None:
+    for decode, longest in ((decode_from_client, CLIENT_MESSAGE_MAX), (decode_from_server, MESSAGE_MAX)):
+        with pytest.raises(ProtocolError, match=f"longer than {longest}"):
+            decode(bytes(longest + 1))
+
+
+def test_an_error_shows_little_of_what_was_sent() -> None:
+    with pytest.raises(ProtocolError) as caught:
+        decode_from_client(msgpack.packb([4, 1000, "x" * 8000, 0.0]))
+    assert len(str(caught.value)) < 100
+
+
+scalars = st.one_of(
+    st.none(), st.booleans(), st.integers(-(1 << 63), (1 << 64) - 1), st.floats(), st.binary(max_size=40),
+    st.text(max_size=40), st.builds(msgpack.ExtType, st.integers(0, 127), st.binary(max_size=8)),
+    st.integers(0, 1 << 33).map(msgpack.Timestamp),
+)  # fmt: skip
+keys = st.one_of(st.text(max_size=8), st.binary(max_size=8), st.integers(-9, 9))
+structures = st.recursive(
+    scalars, lambda inner: st.lists(inner, max_size=8) | st.dictionaries(keys, inner, max_size=4), max_leaves=12
+)
+near_misses = st.builds(
+    lambda kind, fields: [kind, *fields], st.sampled_from(sorted(KINDS)), st.lists(structures, max_size=9)
+)
+valid = st.sampled_from([encode(message) for message in FROM_CLIENT + FROM_SERVER])
+
+
+@st.composite
+def mutated(draw: st.DrawFn) -> bytes:
+    """A valid message, cut off, with bits flipped, with bytes put in or taken out."""
+    data = bytearray(draw(valid))
+    for _ in range(draw(st.integers(1, 4))):
+        at = draw(st.integers(0, max(len(data) - 1, 0)))
+        match draw(st.sampled_from(["cut", "flip", "insert", "delete", "set"])):
+            case "cut":
+                del data[at:]
+            case "flip" if data:
+                data[at] ^= 1 << draw(st.integers(0, 7))
+            case "insert":
+                data[at:at] = draw(st.binary(max_size=6))
+            case "delete":
+                del data[at : at + draw(st.integers(1, 6))]
+            case "set" if data:
+                data[at] = draw(st.sampled_from([0xC0, 0xC1, 0xC6, 0xCB, 0xD6, 0xDB, 0xDC, 0xDD, 0xDF, 0xFF]))
+    return bytes(data)
+
+
+@settings(derandomize=True, deadline=None, max_examples=300)
+@given(st.one_of(st.binary(max_size=300), (structures | near_misses).map(msgpack.packb), mutated()))
+def test_any_bytes_are_a_message_or_a_protocol_error(data: bytes) -> None:
+    for decode in (decode_from_client, decode_from_server):
+        with contextlib.suppress(ProtocolError):
+            message = decode(data)
+            # What was let through is within all bounds: it can be said again, and is understood the same.
+            assert decode(encode(message)) == message
+
+
+def assert_refused(data: bytes, *, server: bool = False) -> None:
+    with pytest.raises(ProtocolError):
+        (decode_from_server if server else decode_from_client)(data)

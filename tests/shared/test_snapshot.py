@@ -1,0 +1,249 @@
+"""One segment's part: lossless for any legal state, and refused for anything that could harm a world."""
+
+import zlib
+from typing import Any
+
+import msgpack
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from shared.blocks import BLOCKS, PACKED_MAX, pack, unpack
+from shared.checks import Cell
+from shared.layout import CELL, FALLING, FLAGS, ID, MOVE_X, TEMPLATE, VX, X
+from shared.messages import ENTITY_MAX, TICK_MAX, ProtocolError
+from shared.snapshot import ACTED, FIELDS, ROW, SIDE, SegmentPart, checksum, decode_parts, encode_part, encode_rows
+from tests.worlds import build
+
+FAR = (1 << 23) - 1
+SPEED_EXTREME = 1 << 30
+State = tuple[int, ...]
+
+
+def sent(
+    segment: Cell,
+    states: list[State],
+    since: int = 5,
+    gone: list[int] | None = None,
+    edits: list[tuple[int, int]] | None = None,
+) -> tuple[SegmentPart, list[State]]:
+    """What a peer makes of a part."""
+    rows = np.array(states, np.int64).reshape(-1, CELL)
+    part = msgpack.unpackb(encode_part(segment, since, rows, gone or [], edits or [], check=9))
+    parts, decoded = decode_parts([part], 255)
+    return parts[0], [tuple(row) for row in decoded.tolist()]
+
+
+def low_corner(segment: Cell) -> list[int]:
+    return [place * SIDE for place in segment]
+
+
+def state_in(segment: Cell, inside: int, velocity: int, move: int, entity: int = 1, **_: Any) -> State:
+    x, y, z = (low + inside for low in low_corner(segment))
+    return (entity, 254, 1, x, y, z, velocity, -velocity, velocity, move, -move, 255)
+
+
+def part_of(**fields: Any) -> list[Any]:
+    """A legal part, with some fields changed."""
+    row = encode_rows(np.array([state_in((0, 0, 0), 5, 6, 7)], np.int64), (0, 0, 0))
+    values = {"x": 0, "y": 0, "z": 0, "since": 3, "rows": row, "gone": b"\x01\0\0\0", "edits": b"\0\0\x01", "check": 0}
+    return list((values | fields).values())
+
+
+def row_with(column: int, value: int) -> bytes:
+    """A packed row in which one field has a value that no state has."""
+    packed = np.frombuffer(part_of()[4], ROW).copy()
+    packed[FIELDS[column]] = value
+    return packed.tobytes()
+
+
+def test_a_row_is_33_bytes() -> None:
+    assert ROW.itemsize == 33
+
+
+@pytest.mark.parametrize("segment", [(0, 0, 0), (-1, -1, -1), (FAR, -FAR - 1, FAR), (-FAR - 1, FAR, 0)])
+@pytest.mark.parametrize("inside", [0, 1, SIDE // 2, SIDE - 1])
+def test_extreme_states_come_out_as_they_went_in(segment: Cell, inside: int) -> None:
+    for velocity in (0, -1, SPEED_EXTREME, -SPEED_EXTREME):
+        for move in (0, 127, -127):
+            for entity in (1, ENTITY_MAX):
+                state = state_in(segment, inside, velocity, move, entity)
+                assert sent(segment, [state]) == (sent(segment, [state])[0], [state])
+
+
+cells = st.tuples(*[st.integers(-FAR - 1, FAR)] * 3)
+states = st.tuples(
+    st.integers(1, ENTITY_MAX), st.integers(0, 254), st.integers(0, 1), *[st.integers(0, SIDE - 1)] * 3,
+    *[st.integers(-SPEED_EXTREME, SPEED_EXTREME)] * 3, *[st.integers(-127, 127)] * 2, st.integers(0, 255),
+)  # fmt: skip
+
+
+@settings(derandomize=True, deadline=None)
+@given(
+    cells,
+    st.integers(-1, TICK_MAX),
+    st.lists(states, max_size=5),
+    st.lists(st.integers(0, (1 << 32) - 1), max_size=5),
+    st.lists(st.tuples(st.integers(0, BLOCKS - 1), st.integers(0, 255)), max_size=5),
+)
+def test_any_legal_part_is_lossless(
+    segment: Cell, since: int, inside: list[State], gone: list[int], edits: list[tuple[int, int]]
+) -> None:
+    corner = low_corner(segment)
+    absolute = [(*s[:X], *(low + part for low, part in zip(corner, s[X:VX], strict=True)), *s[VX:]) for s in inside]
+    part, decoded = sent(segment, absolute, since, gone, edits)
+    assert decoded == absolute
+    assert (part.segment, part.since, part.entities, part.gone, part.check) == (segment, since, len(inside), gone, 9)
+    assert part.edits.tolist() == edits
+
+
+def test_parts_share_one_table_of_states_and_each_has_its_own_corner() -> None:
+    segments = [(0, 0, 0), (-2, 1, 3), (5, 5, -5)]
+    tables = [[state_in(s, 9, 1, 2, 10 * i + j) for j in range(i)] for i, s in enumerate(segments)]
+    encoded = [
+        msgpack.unpackb(encode_part(s, -1, np.array(t, np.int64).reshape(-1, CELL), [], []))
+        for s, t in zip(segments, tables, strict=True)
+    ]
+    parts, decoded = decode_parts(encoded, 255)
+    assert [part.entities for part in parts] == [0, 1, 2]
+    assert [tuple(row) for row in decoded.tolist()] == [state for table in tables for state in table]
+
+
+def test_no_parts_are_no_states() -> None:
+    parts, decoded = decode_parts([], 1)
+    assert (parts, decoded.shape) == ([], (0, CELL))
+
+
+def test_bookkeeping_of_a_process_does_not_travel() -> None:
+    row = np.array([[*state_in((0, 0, 0), 1, 0, 0)[:2], 0b11, 0, 0, 0, 0, 0, 0, 0, 0, 0, 77, 78, 79, 80]], np.int64)
+    parts, decoded = decode_parts([msgpack.unpackb(encode_part((0, 0, 0), 0, row, [], []))], 255)
+    assert decoded.tolist() == [[1, 254, 1, 0, 0, 0, 0, 0, 0, 0, 0, 0]]
+    assert parts[0].entities == 1
+
+
+def test_who_was_acted_upon_is_flagged_and_nobody_else() -> None:
+    rows = np.array([state_in((0, 0, 0), 1, 0, 0, entity) for entity in (3, 5, 8)], np.int64)
+    _, decoded = decode_parts([msgpack.unpackb(encode_part((0, 0, 0), 0, rows, acted={5, 9}))], 255)
+    assert [flags & ACTED for flags in decoded[:, FLAGS].tolist()] == [0, ACTED, 0]
+    assert (decoded[:, FLAGS] & FALLING).tolist() == [1, 1, 1]
+
+
+def test_a_checksum_is_of_all_a_segment_holds_and_of_nothing_else() -> None:
+    world, other = build(), build()
+    for each in (world, other):
+        each.spawn("box", (1, 1, 1))
+        each.spawn("box", (-9, 1, 1))
+    first = checksum(world, (0, 0, 0))
+    assert first == checksum(other, (0, 0, 0)) > 0
+    other.place(2, (-12, 1, 1))  # elsewhere
+    assert first == checksum(other, (0, 0, 0))
+    other.set_block(3, 3, 3, 1)
+    changed = checksum(other, (0, 0, 0))
+    assert changed != first
+    other.set_velocity(1, (0, 0, 1))
+    assert checksum(other, (0, 0, 0)) not in (first, changed)
+
+
+@pytest.mark.parametrize(
+    "fields",
+    [
+        {"x": FAR + 1}, {"y": -FAR - 2}, {"z": 1 << 63}, {"x": True}, {"y": 0.0}, {"z": None}, {"x": "0"},
+        {"since": -2}, {"since": 1 << 53}, {"since": False}, {"since": None},
+        {"rows": bytes(32)}, {"rows": ""}, {"rows": None}, {"rows": []}, {"rows": bytes(33 * 7000)},
+        {"gone": bytes(3)}, {"gone": "gone"}, {"gone": [1]}, {"gone": bytes(4 * 60_000)},
+        {"check": -1}, {"check": 1 << 32}, {"check": True}, {"check": None},
+        {"edits": bytes(4)}, {"edits": {}}, {"edits": b"\x00\x80\x01"}, {"edits": b"\xff\xff\x00"},
+    ],
+    ids=lambda fields: f"{fields}"[:30],
+)  # fmt: skip
+def test_a_part_beyond_its_bounds_is_refused(fields: dict[str, Any]) -> None:
+    decode_parts([part_of()], 255)
+    with pytest.raises(ProtocolError, match="segment"):
+        decode_parts([part_of(), part_of(**fields)], 255)
+
+
+@pytest.mark.parametrize(
+    ("column", "value"),
+    [
+        (ID, 0), (ID, 1 << 31), (ID, (1 << 32) - 1), (TEMPLATE, 255), (2, 8), (2, 255),
+        *[(X + axis, value) for axis in range(3) for value in (-1, SIDE, -(1 << 31), (1 << 31) - 1)],
+        *[(VX + axis, value) for axis in range(3) for value in (SPEED_EXTREME + 1, -SPEED_EXTREME - 1, -(1 << 31))],
+        (MOVE_X, -128), (MOVE_X + 1, -128),
+    ],
+)  # fmt: skip
+def test_a_state_that_no_world_has_is_refused(column: int, value: int) -> None:
+    with pytest.raises(ProtocolError, match=r"segment\.rows"):
+        decode_parts([part_of(), part_of(rows=part_of()[4] + row_with(column, value))], 255)
+
+
+def test_a_template_is_one_of_the_scene() -> None:
+    decode_parts([part_of(rows=row_with(TEMPLATE, 2))], 3)
+    with pytest.raises(ProtocolError, match=r"segment\.rows"):
+        decode_parts([part_of(rows=row_with(TEMPLATE, 3))], 3)
+
+
+def test_nesting_a_thousand_deep_is_refused_like_anything_else() -> None:
+    deep: Any = None
+    for _ in range(1000):
+        deep = [deep]
+    for name in ("x", "since", "rows", "gone", "edits", "check"):
+        with pytest.raises(ProtocolError):
+            decode_parts([part_of(**{name: deep})], 255)
+
+
+anything = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.binary(max_size=70) | st.text(max_size=4),
+    lambda inner: st.lists(inner, max_size=8) | st.dictionaries(st.text(max_size=4), inner, max_size=2),
+    max_leaves=9,
+)
+field = st.sampled_from(["x", "y", "z", "since", "rows", "gone", "edits", "check"])
+
+
+@settings(derandomize=True, deadline=None)
+@given(st.lists(st.one_of(anything, st.dictionaries(field, anything, max_size=2).map(lambda f: part_of(**f)))))
+def test_any_value_is_a_part_or_a_protocol_error(segments: list[Any]) -> None:
+    try:
+        parts, decoded = decode_parts(segments, 3)
+    except ProtocolError:
+        return
+    assert sum(part.entities for part in parts) == len(decoded)
+
+
+# -- terrain -------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_segment_is_packed_and_unpacked_without_loss(seed: int) -> None:
+    kinds = np.random.default_rng(seed).integers(0, (2, 5, 256)[seed], BLOCKS).astype(np.uint8)
+    packed = pack(kinds)
+    assert len(packed) <= PACKED_MAX
+    assert (unpack(packed) == kinds).all()
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        b"", b"\0" * 40, b"not zlib at all",
+        zlib.compress(bytes(BLOCKS - 1)), zlib.compress(bytes(BLOCKS + 1)), zlib.compress(b""),
+        zlib.compress(bytes(BLOCKS))[:-1], zlib.compress(bytes(BLOCKS)) + b"\0",
+        zlib.compress(bytes(16 << 20)),  # 16 KB that would be 16 MB
+        zlib.compress(zlib.compress(bytes(BLOCKS))),
+        bytes(PACKED_MAX + 1),
+    ],
+)  # fmt: skip
+def test_what_is_not_one_packed_segment_is_refused(data: bytes) -> None:
+    with pytest.raises(ValueError, match="packed segment"):
+        unpack(data)
+
+
+@settings(derandomize=True, deadline=None)
+@given(st.binary(max_size=80), st.integers(0, 60), st.integers(0, 7))
+def test_any_bytes_unpack_to_a_segment_or_a_value_error(data: bytes, at: int, bit: int) -> None:
+    flipped = bytearray(pack(np.arange(BLOCKS, dtype=np.uint64).astype(np.uint8)))
+    flipped[at % len(flipped)] ^= 1 << bit
+    for candidate in (data, bytes(flipped)):
+        try:
+            assert len(unpack(candidate)) == BLOCKS
+        except ValueError:
+            continue
