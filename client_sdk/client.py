@@ -13,8 +13,9 @@ import time
 from types import TracebackType
 from typing import Protocol
 
-from client_sdk.core import Core, View
+from client_sdk.core import Core
 from client_sdk.events import Event, Stats
+from client_sdk.picture import View
 from client_sdk.transports.connection import Connection
 from client_sdk.transports.polling import PollingTransport
 from shared.inputs import make_input

@@ -9,7 +9,6 @@
 
 import math
 from collections import deque
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -25,14 +24,13 @@ from client_sdk.events import (
     SegmentLoaded,
     Stats,
 )
-from client_sdk.interpolation import Interpolation
+from client_sdk.picture import NOTHING, Picture, View
 from client_sdk.prediction import NONDETERMINISM, Prediction, check_scene
-from client_sdk.smoothing import Smoothing
 from shared import edits, messages
 from shared.blocks import unpack
-from shared.checks import Cell, Vec
+from shared.checks import Cell
 from shared.inputs import NEUTRAL, Input, clamp
-from shared.layout import ID, TEMPLATE, VX, X
+from shared.layout import X
 from shared.messages import (
     MARGIN_ONE,
     MARGIN_REFUSED,
@@ -54,33 +52,15 @@ from shared.messages import (
 )
 from shared.ring import Ring
 from shared.scene import Scene
-from shared.units import BLOCK, BLOCK_SHIFT, SEGMENT_SHIFT, SPEED
+from shared.units import BLOCK_SHIFT, SEGMENT_SHIFT
 
 VERDICT = np.dtype([("number", "<u4"), ("verdict", "u1")])
 TICKS_PER_UPDATE_MAX = 16
 """A program that was away for longer does not catch up tick by tick: it begins anew."""
 UNCONFIRMED_MAX = 96
 """So many ticks beyond the newest snapshot, prediction waits."""
+INPUT_DELAY_MAX = 3
 EVENTS_MAX = 1000
-
-
-@dataclass(frozen=True)
-class Figure:
-    """One entity as it is to be drawn: position in blocks, velocity in blocks/s."""
-
-    entity: int
-    template: int
-    position: Vec
-    velocity: Vec
-
-
-@dataclass(frozen=True)
-class View:
-    """What to draw at one moment. `me` is the own entity, `others` are the rest, ascending by id."""
-
-    tick: float
-    me: Figure | None
-    others: list[Figure]
 
 
 class Core:
@@ -90,6 +70,7 @@ class Core:
         name: shown to others.
         scene: the scene this program was built for, checked by the server; None: the server's is taken.
         compiled: run the physics compiled by Numba; None: where it is installed.
+        neighbours: predict blocking others, too (see `Prediction`).
         lead: decides how far to live ahead of the server.
     """
 
@@ -99,6 +80,7 @@ class Core:
         scene: Scene | None = None,
         *,
         compiled: bool | None = None,
+        neighbours: bool = True,
         lead: LeadController | None = None,
     ) -> None:
         self.name = name
@@ -121,8 +103,11 @@ class Core:
         self._number = 0
         self._seen = 0.0
         self._newest = -1
-        self._interpolation: Interpolation | None = None
-        self._smoothing = Smoothing()
+        self.picture: Picture | None = None
+        self._neighbours = neighbours
+        self._delay = 0
+        self._late = False
+        self._wrong = ""
         self._open = False
 
     # -- what comes in -------------------------------------------------------------------------------------
@@ -186,19 +171,18 @@ class Core:
         if self.state != "playing":
             return
         assert self.timeline is not None
-        assert self.prediction is not None
-        assert self._interpolation is not None
+        assert self.picture is not None
+        self._reconcile(now)
         if self.timeline.steer(self._lead, self.clock, now):
             self._restart(now)
-        self._interpolation.advance(self.clock.tick(now), now)
-        self._seen = self.clock.tick(now) - self._interpolation.delay_ticks
+        self._seen = self.picture.advance(self.clock, now)
         self._predict(math.floor(self.timeline.tick(now)), now)
 
     def next_update(self, now: float) -> float:
         """The local time at which `update` has something to do."""
         due = self.clock.next_ping
         if self.timeline is not None and self.prediction is not None:
-            due = min(due, self.timeline.when(self.prediction.predicted.tick + 1))
+            due = min(due, self.timeline.when(self._newest + 1))
         return max(due, now)  # inf: only once something has come in
 
     # -- what goes out -------------------------------------------------------------------------------------
@@ -217,16 +201,9 @@ class Core:
 
     def view(self, now: float) -> View:
         """What to draw now: the own entity predicted, the others as they were a moment ago."""
-        if self.prediction is None or self.timeline is None or self._interpolation is None:
-            return View(0.0, None, [])
-        tick = self.timeline.tick(now)
-        states, places = self._interpolation.sample(self.clock.tick(now))
-        others = [
-            figure(state, place)
-            for state, place in zip(states.tolist(), places.tolist(), strict=True)
-            if state[ID] != self.entity
-        ]
-        return View(tick, self._me(tick, now), others)
+        if self.picture is None or self.timeline is None:
+            return NOTHING
+        return self.picture.view(self.timeline, self.clock, now)
 
     # -- inside --------------------------------------------------------------------------------------------
 
@@ -254,8 +231,8 @@ class Core:
             raise ProtocolError("Welcome.scene: not the scene that was asked for")
         self.scene = scene
         self.entity = welcome.entity
-        self.prediction = Prediction(scene, welcome.entity, compiled=self._compiled)
-        self._interpolation = Interpolation(scene.tick_rate)
+        self.prediction = Prediction(scene, welcome.entity, neighbours=self._neighbours, compiled=self._compiled)
+        self.picture = Picture(scene, self.prediction)
         self.clock.rate = float(scene.tick_rate)
 
     def _terrain(self, terrain: Terrain) -> None:
@@ -279,32 +256,39 @@ class Core:
 
     def _snapshot(self, snapshot: Snapshot, now: float) -> None:
         prediction = self.prediction
-        if prediction is None or self._interpolation is None:
+        if prediction is None or self.picture is None:
             raise ProtocolError("Snapshot before Welcome")
         if snapshot.tick <= prediction.confirmed.tick:
             raise ProtocolError(f"Snapshot.tick = {snapshot.tick}: not newer than the one before")
         self.stats.snapshots += 1
         if self.stats.snapshots > 1:
             self.stats.snapshots_skipped += snapshot.tick - prediction.confirmed.tick - 1
-        late = self._fates(snapshot, now)
+        self._late |= self._fates(snapshot, now)
         for number, verdict in np.frombuffer(snapshot.verdicts, VERDICT).tolist():
             prediction.settle(number, verdict == messages.DONE)
             text = messages.VERDICT_TEXTS[min(verdict, len(messages.VERDICT_TEXTS) - 1)]
             self._events.append(Answered(number, verdict == messages.DONE, text))
-        wrong = prediction.apply(snapshot)
-        self._interpolation.push(snapshot.tick, prediction.confirmed.states())
-        done = prediction.reconcile(late)
+        self._wrong = prediction.apply(snapshot) or self._wrong
+        self.picture.interpolation.push(snapshot.tick, prediction.confirmed.states())
+
+    def _reconcile(self, now: float) -> None:
+        """Compares the prediction with the newest snapshot: once per update, however many have come."""
+        prediction, picture = self.prediction, self.picture
+        assert prediction is not None
+        assert picture is not None
+        done = prediction.reconcile(self._late)
+        self._late = False
         self.stats.replayed_ticks += done.replayed
         self.stats.repredictions += done.repredicted
-        if done.replayed and not done.acted:
-            self._smoothing.add(done.offset, now)
+        picture.smooth(done, now)
         if done.correction:
             self._corrected(done.correction)
             if done.correction.cause == NONDETERMINISM:
-                wrong = f"own {', '.join(done.correction.fields)}"
-        if wrong:
+                self._wrong = f"own {', '.join(done.correction.fields)}"
+        if self._wrong:
             self.stats.divergences += 1
-            self._events.append(Diverged(snapshot.tick, wrong))
+            self._events.append(Diverged(prediction.confirmed.tick, self._wrong))
+            self._wrong = ""
             self._send(Resync())
 
     def _fates(self, snapshot: Snapshot, now: float) -> bool:
@@ -358,54 +342,53 @@ class Core:
         )
         return x, y, z
 
+    def set_input_delay(self, ticks: int) -> None:
+        """Shows the effect of inputs so many ticks (0 to 3) later than they are sent: fewer and shorter replays.
+
+        Raises:
+            ValueError: not 0 to 3.
+        """
+        if not 0 <= ticks <= INPUT_DELAY_MAX:
+            raise ValueError(f"ticks = {ticks!r}: must be 0 to {INPUT_DELAY_MAX}")
+        self._delay = ticks
+        if self.prediction is not None:
+            self.prediction.ahead = ticks
+
     def _restart(self, now: float) -> None:
         """Begins the prediction at the timeline's tick."""
         assert self.timeline is not None
         assert self.prediction is not None
         tick = max(math.floor(self.timeline.tick(now)), self.prediction.confirmed.tick, self._newest)
-        skipped = tick - self.prediction.predicted.tick
         if self.prediction.begun:
             self.stats.resyncs += 1
-            self._events.append(Resynchronised(tick, skipped))
-        self.prediction.begin(tick)
+            self._events.append(Resynchronised(tick, tick - self._newest))
+        self._newest = tick
+        self.prediction.ahead = self._delay
+        self.prediction.begin(max(tick - self._delay, self.prediction.confirmed.tick))
 
     def _predict(self, to: int, now: float) -> None:
+        """Files and sends the wish for every tick up to `to`, and predicts up to there but for the input delay."""
         prediction, timeline = self.prediction, self.timeline
         assert prediction is not None
         assert timeline is not None
-        if to - prediction.predicted.tick > TICKS_PER_UPDATE_MAX:
+        if to - self._newest > TICKS_PER_UPDATE_MAX:
             if to - prediction.confirmed.tick <= UNCONFIRMED_MAX:
                 self._restart(now)
             return
-        first = prediction.predicted.tick + 1
-        rows = bytearray()
-        while prediction.predicted.tick < to:
-            if prediction.predicted.tick - prediction.confirmed.tick >= UNCONFIRMED_MAX:
-                break
-            prediction.step(self.wish)
-            self._phases.put(prediction.predicted.tick, timeline.phase)
-            rows += bytes(part & 0xFF for part in self.wish)
-        if rows:
-            self._newest = prediction.predicted.tick
-            self.stats.inputs_sent += len(rows) // messages.INPUT_ROW_BYTES
+        to = min(to, prediction.confirmed.tick + UNCONFIRMED_MAX)
+        if to > self._newest:
+            first = self._newest + 1
+            for tick in range(first, to + 1):
+                prediction.file(tick, self.wish)
+                self._phases.put(tick, timeline.phase)
+            self._newest = to
+            self.stats.inputs_sent += to + 1 - first
             self.stats.rtt_s = self.clock.rtt_s
             self.stats.lead_ticks = timeline.phase - self.clock.phase
-            self._send(Inputs(first, prediction.confirmed.tick, bytes(rows)))
-
-    def _me(self, tick: float, now: float) -> Figure | None:
-        """The own entity between its last two predicted ticks, with what smoothing adds."""
-        prediction = self.prediction
-        if prediction is None or self.entity not in prediction.predicted:
-            return None
-        state = prediction.predicted.state(self.entity)
-        before = prediction.state_before(self.entity) or state
-        share = min(max(tick - prediction.predicted.tick, 0.0), 1.0)
-        offset = self._smoothing.offset(now)
-        x, y, z = (
-            (a + (b - a) * share) / BLOCK + off
-            for a, b, off in zip(before[X : X + 3], state[X : X + 3], offset, strict=True)
-        )
-        return figure(list(state), (x, y, z))
+            row = bytes(part & 0xFF for part in self.wish)
+            self._send(Inputs(first, prediction.confirmed.tick, row * (to + 1 - first)))
+        while prediction.predicted.tick < self._newest - self._delay:
+            prediction.step()
 
     def _send(self, message: messages.Message) -> None:
         self._out.append(encode(message))
@@ -418,10 +401,3 @@ class Core:
         if self.state != "closed":
             self.state = "closed"
             self._events.append(left)
-
-
-def figure(state: list[int], place: tuple[float, float, float] | list[float]) -> Figure:
-    """A state with the position to draw it at."""
-    x, y, z = place
-    vx, vy, vz = (part / SPEED for part in state[VX : VX + 3])
-    return Figure(state[ID], state[TEMPLATE], (x, y, z), (vx, vy, vz))

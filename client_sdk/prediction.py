@@ -49,20 +49,28 @@ class Reconciled:
     correction: Corrected | None
     repredicted: bool
     replayed: int
-    offset: Place
-    """Where the own entity was shown, minus where it is now."""
-    acted: bool
-    """Whether the server's rules moved it: then the picture jumps, too."""
+    offsets: dict[int, Place]
+    """Where each predicted entity was, minus where it is now, in blocks."""
+    acted: frozenset[int]
+    """Entities that the server's rules have moved: their pictures jump."""
 
 
-NOTHING = Reconciled(None, False, 0, (0.0, 0.0, 0.0), False)
+NOTHING = Reconciled(None, False, 0, {}, frozenset())
 
 
 class Prediction:
-    """Confirmed and predicted world of one client, for its entity."""
+    """Confirmed and predicted world of one client, for its entity.
 
-    def __init__(self, scene: Scene, entity: int, *, compiled: bool | None = None) -> None:
+    Args:
+        neighbours: carry others on in the predicted world, too, so that blocking each other is predicted; else they
+            are left out of it.
+    """
+
+    def __init__(self, scene: Scene, entity: int, *, neighbours: bool = True, compiled: bool | None = None) -> None:
         self.entity = entity
+        self.neighbours = neighbours
+        self.ahead = 0
+        """Inputs are filed so many ticks ahead of the predicted world: the input delay."""
         self.confirmed = World(scene, compiled=compiled)
         self.predicted = World(scene, compiled=compiled)
         self.begun = False
@@ -151,14 +159,24 @@ class Prediction:
         self._replay(tick)
         self.begun = True
 
-    def step(self, wish: Input) -> None:
-        """Predicts one tick with this input."""
-        self._inputs.put(self.predicted.tick + 1, wish)
-        self._step()
+    def file(self, tick: int, wish: Input) -> None:
+        """The own input for a tick to come."""
+        self._inputs.put(tick, wish)
+
+    def step(self) -> None:
+        """Predicts one tick."""
+        tick = self.predicted.tick + 1
+        for due, edit in self._edits.values():
+            # One that is due but has no verdict yet is carried out as soon as the replay begins.
+            if due == tick or (due < tick and tick == self.confirmed.tick + 1):
+                edits.apply(self.predicted, self.entity, edit)
+        known = self.entity in self.predicted
+        self.predicted.step({self.entity: self._inputs.get(tick) or NEUTRAL} if known else None)
+        self._states.put(tick, self.predicted.states())
 
     def edit(self, number: int, edit: Edit) -> int:
-        """Files an edit for the next tick to be predicted; that tick."""
-        tick = self.predicted.tick + 1
+        """Files an edit for the next tick that has no input yet; that tick."""
+        tick = self.predicted.tick + self.ahead + 1
         self._edits[number] = (tick, edit)
         return tick
 
@@ -167,29 +185,32 @@ class Prediction:
 
         `late`: an input up to that tick, and after the one before, was late or missing at the server.
         """
-        tick, gap = self.confirmed.tick, self.confirmed.tick - self._compared > 1
+        tick = self.confirmed.tick
+        if tick == self._compared:
+            return NOTHING
+        skipped = tick - self._compared > 1
         self._compared = tick
-        acted, self._acted = self.entity in self._acted, set()
+        acted, self._acted = frozenset(self._acted), set()
         if not self.begun or tick > self.predicted.tick:
             return NOTHING
-        guess, truth = self._states.get(tick), self.confirmed.states()
+        guess, truth = self._states.get(tick), self._truth()
         if guess is not None and not self._terrain_changed and np.array_equal(guess, truth):
             return NOTHING
         correction = None
         if guess is not None and (mine := self._difference(guess, truth)):
+            others = len(self.confirmed) > 1
             causes = (
                 (late, "late input"),
-                (acted, "server act"),
+                (self.entity in acted, "server act"),
                 (self._terrain_changed, "unknown edit"),
-                (gap or self._others_differ(guess, truth), "other entity"),
+                (others and (skipped or not self.neighbours), "other entity"),
+                (others and self._others_differ(guess, truth), "other entity"),
             )
             cause = next((cause for holds, cause in causes if holds), NONDETERMINISM)
             correction = Corrected(tick, *mine, self.predicted.tick - tick, cause)
-        shown, now = self._place(), self.predicted.tick
+        before, now = self.predicted.states(), self.predicted.tick
         self._replay(now)
-        place = self._place()
-        offset = (shown[0] - place[0], shown[1] - place[1], shown[2] - place[2])
-        return Reconciled(correction, correction is None, now - tick, offset, acted)
+        return Reconciled(correction, correction is None, now - tick, _offsets(before, self.predicted.states()), acted)
 
     def state_before(self, entity: int) -> tuple[int, ...] | None:
         """The state of an entity one tick before the newest predicted one."""
@@ -203,21 +224,19 @@ class Prediction:
         """Goes back to the confirmed world and replays all since: the sync test. Changes nothing, if all is well."""
         self._replay(self.predicted.tick)
 
+    def _truth(self) -> Int64s:
+        states = self.confirmed.states()
+        return states if self.neighbours else states[states[:, ID] == self.entity]
+
     def _replay(self, to: int) -> None:
         self.predicted.restore(self.confirmed)
         self._terrain_changed = False
+        if not self.neighbours:
+            for entity in self.predicted.states()[:, ID].tolist():
+                if entity != self.entity:
+                    self.predicted.remove(entity)
         while self.predicted.tick < to:
-            self._step()
-
-    def _step(self) -> None:
-        tick = self.predicted.tick + 1
-        for due, edit in self._edits.values():
-            # One that is due but has no verdict yet is carried out as soon as the replay begins.
-            if due == tick or (due < tick and tick == self.confirmed.tick + 1):
-                edits.apply(self.predicted, self.entity, edit)
-        known = self.entity in self.predicted
-        self.predicted.step({self.entity: self._inputs.get(tick) or NEUTRAL} if known else None)
-        self._states.put(tick, self.predicted.states())
+            self.step()
 
     def _difference(self, guess: Int64s, truth: Int64s) -> tuple[tuple[str, ...], float] | None:
         """In which fields, and by how many blocks, the own entity is not as predicted."""
@@ -230,9 +249,14 @@ class Prediction:
     def _others_differ(self, guess: Int64s, truth: Int64s) -> bool:
         return not np.array_equal(guess[guess[:, ID] != self.entity], truth[truth[:, ID] != self.entity])
 
-    def _place(self) -> Place:
-        world = self.predicted
-        return world.position(self.entity) if self.entity in world else (0.0, 0.0, 0.0)
+
+def _offsets(before: Int64s, after: Int64s) -> dict[int, Place]:
+    """How far each entity that is in both has jumped back, in blocks."""
+    _, i, j = np.intersect1d(before[:, ID], after[:, ID], assume_unique=True, return_indices=True)
+    ways = (before[i, X : X + 3] - after[j, X : X + 3]) / BLOCK
+    moved = ways.any(axis=1)
+    ids = after[j[moved], ID].tolist()
+    return {entity: (x, y, z) for entity, (x, y, z) in zip(ids, ways[moved].tolist(), strict=True)}
 
 
 def check_scene(table: object) -> Scene:

@@ -22,6 +22,7 @@ SEGMENTS_MAX = 1 << 16
 BOX_MAX = 32.0
 """No box is longer, in blocks."""
 INTEGRATORS = ("mean", "semi")
+SHOWN = ("interpolated", "predicted")
 
 SCENES = Path(__file__).parent / "scenes"
 
@@ -36,6 +37,8 @@ class Template:
         walk_speed: an entity of this template moves by its move intent; 0: it keeps its velocity instead.
         jump_speed: upward speed of a jump; 0: it cannot.
         solid: whether solid entities stop each other (and stand on each other); blocks stop all.
+        shown: how clients draw those of others: "interpolated" (as they were a moment ago) or "predicted" (as they
+            are now, if they go on as they did).
     """
 
     name: str
@@ -44,6 +47,7 @@ class Template:
     walk_speed: float = 0.0
     jump_speed: float = 0.0
     solid: bool = True
+    shown: str = "interpolated"
 
     def __post_init__(self) -> None:
         at = f"templates.{self.name}"
@@ -59,6 +63,8 @@ class Template:
             if to_velocity(getattr(self, name), f"{at}.{name}") < 0:
                 raise SceneError(f"{at}.{name} = {getattr(self, name)!r}: must not be negative")
         boolean(self.solid, f"{at}.solid")
+        if self.shown not in SHOWN:
+            raise SceneError(f"{at}.shown = {self.shown!r}: must be one of {', '.join(SHOWN)}")
         object.__setattr__(self, "box_offset", offset)
         object.__setattr__(self, "box_size", size)
 

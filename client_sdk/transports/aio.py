@@ -15,8 +15,9 @@ from collections.abc import Callable
 from types import TracebackType
 from typing import cast
 
-from client_sdk.core import EVENTS_MAX, Core, View
+from client_sdk.core import EVENTS_MAX, Core
 from client_sdk.events import Event, Stats
+from client_sdk.picture import View
 from client_sdk.transports.connection import CLOSE_S, UNSENT_MAX, ConnectError, Connection, stalled, unreachable
 from shared.inputs import Input
 from shared.scene import Scene

@@ -1,0 +1,93 @@
+"""What to draw: the own entity (and templates shown so) as predicted, all others a moment ago, corrections smoothed."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from client_sdk.clock import ServerClock, Timeline
+from client_sdk.interpolation import Interpolation
+from client_sdk.prediction import Prediction, Reconciled
+from client_sdk.smoothing import Smoothing
+from shared.checks import Vec
+from shared.layout import ID, TEMPLATE, VX, X
+from shared.scene import Scene
+from shared.units import BLOCK, SPEED
+
+
+@dataclass(frozen=True)
+class Figure:
+    """One entity as it is to be drawn: position in blocks, velocity in blocks/s, `template` by number in the scene."""
+
+    entity: int
+    template: int
+    position: Vec
+    velocity: Vec
+
+
+@dataclass(frozen=True)
+class View:
+    """What to draw at one moment. `me` is the own entity, `others` are the rest, ascending by id."""
+
+    tick: float
+    me: Figure | None
+    others: list[Figure]
+
+
+NOTHING = View(0.0, None, [])
+
+
+class Picture:
+    """Puts predicted, interpolated and smoothed positions together."""
+
+    def __init__(self, scene: Scene, prediction: Prediction) -> None:
+        self.interpolation = Interpolation(scene.tick_rate)
+        self._prediction = prediction
+        self._predicted = {i for i, template in enumerate(scene.templates) if template.shown == "predicted"}
+        self._smoothing: dict[int, Smoothing] = {}
+
+    def advance(self, clock: ServerClock, now: float) -> float:
+        """Adapts the delay of the others; the tick at which they are drawn."""
+        self.interpolation.advance(clock.tick(now), now)
+        return clock.tick(now) - self.interpolation.delay_ticks
+
+    def smooth(self, done: Reconciled, now: float) -> None:
+        """A replay has moved things: they are shown to go there gradually (what the rules placed jumps)."""
+        known = self._prediction.predicted
+        self._smoothing = {entity: old for entity, old in self._smoothing.items() if entity in known}
+        for entity, offset in done.offsets.items():
+            if offset != (0.0, 0.0, 0.0) and entity not in done.acted:
+                self._smoothing.setdefault(entity, Smoothing()).add(offset, now)
+
+    def view(self, timeline: Timeline, clock: ServerClock, now: float) -> View:
+        """The picture at `now`."""
+        prediction = self._prediction
+        tick = timeline.tick(now)
+        states, places = self.interpolation.sample(clock.tick(now))
+        others = []
+        for state, place in zip(states.tolist(), places.tolist(), strict=True):
+            entity = state[ID]
+            if entity == prediction.entity:
+                continue
+            ahead = self._ahead(entity, tick, now) if state[TEMPLATE] in self._predicted else None
+            others.append(ahead or figure(state, place))
+        return View(tick, self._ahead(prediction.entity, tick, now), others)
+
+    def _ahead(self, entity: int, tick: float, now: float) -> Figure | None:
+        """An entity between its last two predicted ticks, with what smoothing adds."""
+        prediction = self._prediction
+        if entity not in prediction.predicted:
+            return None
+        state = prediction.predicted.state(entity)
+        before = prediction.state_before(entity) or state
+        share = min(max(tick - prediction.ahead - prediction.predicted.tick, 0.0), 1.0)
+        old, new = np.array(before[X : X + 3]) / BLOCK, np.array(state[X : X + 3]) / BLOCK
+        smoothing = self._smoothing.get(entity)
+        place = old + (new - old) * share + (smoothing.offset(now) if smoothing else 0.0)
+        return figure(list(state), place.tolist())
+
+
+def figure(state: list[int], place: list[float]) -> Figure:
+    """A state with the position to draw it at."""
+    x, y, z = place
+    vx, vy, vz = (part / SPEED for part in state[VX : VX + 3])
+    return Figure(state[ID], state[TEMPLATE], (x, y, z), (vx, vy, vz))
