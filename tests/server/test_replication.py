@@ -1,0 +1,364 @@
+"""What changed since any tick, and that a client which is told so has exactly what the server has."""
+
+import random
+
+import msgpack
+import numpy as np
+import pytest
+
+from server.game import Game
+from server.limits import Limits
+from server.replication import HISTORY, KEYFRAME, ChangeLog
+from server.session import Session
+from shared.blocks import Kinds, unpack
+from shared.checks import Cell
+from shared.layout import FALLING, FLAGS, ID
+from shared.messages import Hello, Resync, Snapshot, Terrain, Welcome, decode_from_server, encode
+from shared.scene import Scene
+from shared.snapshot import ACTED, decode_parts
+from shared.units import BLOCK, SEGMENT
+from shared.world import OverlapError, World
+from tests.worlds import scene
+
+HOME, EAST, WEST = (0, 0, 0), (1, 0, 0), (-1, 0, 0)
+
+
+def row_of_segments() -> Scene:
+    """Seven segments in a row along x, their floor with holes into the void at either end."""
+    return scene(
+        [[-60, 0, 0, 90, 32, 1, 1], [40, 8, 1, 42, 9, 3, 2]],
+        origin=(-3, 0, 0),
+        size=(7, 1, 1),
+        spawns=((16.0, 16.0, 1.0),),
+    )
+
+
+class Recorded:
+    """A world with its log, ticking."""
+
+    def __init__(self) -> None:
+        self.world = World(row_of_segments(), compiled=False)
+        self.world.load_terrain()
+        self.log = ChangeLog(self.world)
+
+    def tick(self, n: int = 1) -> None:
+        for _ in range(n):
+            self.world.step()
+            self.log.record()
+
+    def remove(self, entity: int) -> None:
+        self.world.remove(entity)
+        self.log.note_removal(entity)
+
+    def edit(self, x: int, y: int, z: int, kind: int) -> None:
+        if self.world.set_block(x, y, z, kind):
+            self.log.note_edit(x, y, z)
+
+    def part(self, segment: Cell, since: int) -> tuple[list[int], list[int], list[tuple[int, int]]]:
+        """Ids of the rows, ids of the gone, edits."""
+        (part,), states = decode_parts([msgpack.unpackb(self.log.part(segment, since))], 255)
+        assert (part.segment, part.since) == (segment, since)
+        for state in states.tolist():
+            state[FLAGS] &= FALLING
+            assert tuple(state) == self.world.state(state[ID])
+        return states[:, ID].tolist(), part.gone, part.edits.tolist()
+
+
+@pytest.fixture
+def told() -> Recorded:
+    return Recorded()
+
+
+def test_what_nothing_happened_to_is_not_mentioned(told: Recorded) -> None:
+    told.world.spawn("box", (5, 5, 1))
+    told.tick(3)
+    assert told.log.changed_segments(2) == set()
+    assert told.part(HOME, 2) == ([], [], [])
+    assert told.part(HOME, 0) == ([1], [], [])
+
+
+def test_a_keyframe_is_all_that_is_there_however_long_ago_it_moved(told: Recorded) -> None:
+    for x in (5, 9, 40, -5):
+        told.world.spawn("box", (x, 5, 1))
+    told.tick(HISTORY + 5)
+    assert told.part(HOME, KEYFRAME) == ([1, 2], [], [])
+    assert told.part(EAST, KEYFRAME) == ([3], [], [])
+    assert told.part((2, 0, 0), KEYFRAME) == ([], [], [])
+
+
+def test_who_crosses_a_border_is_gone_here_and_there_whole(told: Recorded) -> None:
+    told.world.spawn("box", (31, 5, 1))
+    told.tick()
+    told.world.place(1, (33, 5, 1))
+    told.tick()
+    assert told.log.changed_segments(1) == {HOME, EAST}
+    assert told.part(HOME, 1) == ([], [1], [])
+    assert told.part(EAST, 1) == ([1], [], [])
+    assert told.log.segment(1) == EAST
+
+
+def test_who_came_back_is_not_gone(told: Recorded) -> None:
+    told.world.spawn("box", (31, 5, 1))
+    told.tick()
+    for x in (33, 31):
+        told.world.place(1, (x, 5, 1))
+        told.tick()
+    assert told.part(HOME, 1) == ([1], [], [])
+    assert told.part(EAST, 1) == ([], [1], [])
+    assert told.part(EAST, 2) == ([], [1], [])
+
+
+def test_the_removed_are_gone_and_an_entity_never_recorded_is_not_mentioned(told: Recorded) -> None:
+    told.world.spawn("box", (5, 5, 1))
+    told.tick()
+    told.remove(1)
+    told.remove(told.world.spawn("box", (9, 5, 1)))
+    told.tick()
+    assert told.part(HOME, 1) == ([], [1], [])
+    assert told.part(HOME, 0) == ([], [1], [])
+    assert told.part(HOME, KEYFRAME) == ([], [], [])
+
+
+def test_ids_are_not_used_again_but_rows_are(told: Recorded) -> None:
+    told.world.spawn("box", (5, 5, 1))
+    told.tick(3)
+    told.remove(1)
+    assert told.world.spawn("box", (5, 5, 1)) == 2
+    told.tick()
+    assert told.part(HOME, 3) == ([2], [1], [])
+
+
+def test_an_edit_is_told_as_the_block_is_now(told: Recorded) -> None:
+    at = 3 << 10 | 2 << 5 | 1
+    for kind in (7, 0, 9):
+        told.edit(1, 2, 3, kind)
+        told.tick()
+    assert [told.part(HOME, since)[2] for since in (0, 1, 2, 3)] == [[(at, 9)]] * 3 + [[]]
+
+
+def test_an_edit_back_is_told_too(told: Recorded) -> None:
+    told.edit(-1, 31, 31, 5)
+    told.tick()
+    told.edit(-1, 31, 31, 0)
+    told.tick()
+    assert told.part(WEST, 1)[2] == [(31 << 10 | 31 << 5 | 31, 0)]
+    assert told.log.changed_segments(1) == {WEST}
+
+
+def test_who_was_acted_upon_is_flagged_in_every_part_that_tells_of_it(told: Recorded) -> None:
+    for x in (5, 9):
+        told.world.spawn("box", (x, 5, 1))
+    told.tick()
+    told.world.place(1, (7, 5, 3))
+    told.log.note_act(1)
+    told.tick(2)
+    for since, flagged in ((1, [1]), (0, [1]), (2, [])):
+        _, states = decode_parts([msgpack.unpackb(told.log.part(HOME, since))], 255)
+        assert states[states[:, FLAGS] & ACTED != 0, ID].tolist() == flagged
+
+
+def test_history_reaches_back_as_far_as_it_says_and_not_further(told: Recorded) -> None:
+    told.world.spawn("box", (5, 5, 1))
+    told.tick(1)
+    told.world.place(1, (6, 5, 1))
+    told.tick(HISTORY)
+    assert told.log.changed_segments(1) == {HOME}
+    assert told.part(HOME, 1)[0] == [1]
+    told.tick()
+    assert told.log.changed_segments(1) is None
+    assert told.log.changed_segments(2) == set()
+
+
+def test_the_void_below_the_floor_has_parts_like_any_segment(told: Recorded) -> None:
+    told.world.spawn("box", (-80, 5, 0))
+    told.world.spawn("box", (5, 5, 1))
+    told.tick(20)
+    below = told.log.segment(1)
+    assert below == (-3, 0, -1)
+    assert told.part(below, KEYFRAME) == ([1], [], [])
+    assert told.part(below, 19) == ([1], [], [])
+    told.remove(1)
+    told.tick()
+    assert told.part(below, 20) == ([], [1], [])
+
+
+def test_one_encoding_serves_all_who_ask_for_the_same(told: Recorded) -> None:
+    told.world.spawn("box", (5, 5, 9))
+    told.tick(2)
+    assert told.log.part(HOME, 1) is told.log.part(HOME, 1)
+    assert told.log.packed(HOME) is told.log.packed(HOME)
+    before = told.log.packed(HOME)
+    told.edit(1, 1, 1, 1)
+    assert told.log.packed(HOME) != before
+    assert unpack(told.log.packed(HOME)).reshape(SEGMENT, SEGMENT, SEGMENT)[1, 1, 1] == 1
+
+
+def test_memory_is_bounded_by_history_and_by_what_exists(told: Recorded) -> None:
+    for i in range(HISTORY + 50):
+        told.world.spawn("box", (5, 5, 20))
+        told.tick()
+        told.log.part(HOME, max(0, i - 3))
+        told.remove(i + 1)
+    told.tick(HISTORY + 1)
+    assert told.log._home == {}
+    assert len(told.log._parts) == 0
+    assert not any(slot[1].changed or slot[1].gone for slot in told.log._ticks._slots if slot)
+
+
+# -- a client that is told, with any skips and any interest --------------------------------------------------
+
+
+class Model:
+    """All that a client must do with what it is told, as plainly as possible. It is the link as well."""
+
+    def __init__(self, templates: int) -> None:
+        self.templates = templates
+        self.entities: dict[int, tuple[int, ...]] = {}
+        self.blocks: dict[Cell, Kinds] = {}
+        self.coming: dict[Cell, bytearray] = {}
+        self.edits: dict[Cell, list[np.ndarray]] = {}
+        self.tick = -1
+        self.stuck = False
+        self.sent = 0
+
+    def outstanding(self) -> int:
+        return 1 << 30 if self.stuck else 0
+
+    def close(self, code: int, reason: str) -> None:
+        raise AssertionError(reason)
+
+    def send(self, message: bytes) -> None:
+        match decode_from_server(message):
+            case Snapshot() as snapshot:
+                self.snapshot(snapshot)
+            case Terrain(x, y, z, offset, total, chunk):
+                self.terrain((x, y, z), offset, total, chunk)
+            case other:
+                assert isinstance(other, Welcome)
+
+    def snapshot(self, snapshot: Snapshot) -> None:
+        assert snapshot.tick > self.tick
+        parts, states = decode_parts(snapshot.segments, self.templates)
+        states[:, FLAGS] &= FALLING
+        new = {state[ID]: tuple(state) for state in states.tolist()}
+        dropped = {tuple(segment) for segment in np.frombuffer(snapshot.drops, "<i4").reshape(-1, 3).tolist()}
+        for segment in dropped:
+            self.blocks.pop(segment, None)
+            self.edits.pop(segment, None)
+        anew = dropped | {part.segment for part in parts if part.since == KEYFRAME}
+        gone = {(part.segment, entity) for part in parts for entity in part.gone}
+        for entity, state in list(self.entities.items()):
+            home = home_of(state)
+            if home in anew or (home, entity) in gone:
+                del self.entities[entity]
+        self.entities.update(new)
+        for part in parts:
+            assert part.since in (KEYFRAME, self.tick)
+            self.edits.setdefault(part.segment, []).append(part.edits)
+            if part.segment in self.blocks:
+                self.write(part.segment, part.edits)
+        self.tick = snapshot.tick
+
+    def terrain(self, segment: Cell, offset: int, total: int, chunk: bytes) -> None:
+        if offset == 0:
+            self.coming[segment] = bytearray()
+            self.edits[segment] = []  # what was told before is in what was packed now
+        assert len(self.coming[segment]) == offset
+        self.coming[segment] += chunk
+        if len(self.coming[segment]) == total:
+            self.blocks[segment] = unpack(bytes(self.coming.pop(segment))).copy()
+            for edits in self.edits.pop(segment, []):
+                self.write(segment, edits)
+
+    def write(self, segment: Cell, edits: np.ndarray) -> None:
+        self.blocks[segment][edits["block"]] = edits["kind"]
+
+
+def home_of(state: tuple[int, ...]) -> Cell:
+    x, y, z = (part // (BLOCK * SEGMENT) for part in state[3:6])
+    return x, y, z
+
+
+class Told:
+    """A game in which everything changes at random, and one client with a link that stalls at random."""
+
+    def __init__(self, seed: int) -> None:
+        self.rng = random.Random(seed)
+        limits = Limits(terrain_chunk_bytes=16, terrain_bytes_per_tick=64, stalled_s=1e9, silence_s=1e9)
+        self.game = Game(row_of_segments(), limits=limits, compiled=False)
+        self.model = Model(len(self.game.scene.templates))
+        self.now = 0.0
+        self.session: Session = self.game.open(self.model, 0.0)
+        self.game.receive(self.session, encode(Hello(1, {}, "")), 0.0)
+        self.others: list[int] = []
+        self.stuck_until = 0
+
+    def tick(self) -> None:
+        self.now += 1 / self.game.scene.tick_rate
+        self.game.tick(self.now, self.now)
+
+    def place(self) -> tuple[float, float, float]:
+        return self.rng.uniform(-95, 127), self.rng.uniform(1, 31), self.rng.choice([1.0, 1.0, 5.0, 30.9, -3.0])
+
+    def stir(self) -> None:
+        world, log, rng = self.game.world, self.game.log, self.rng
+        try:
+            match rng.randrange(12):
+                case 0:
+                    self.others.append(world.spawn(rng.choice(["box", "cube", "ghost"]), self.place()))
+                case 1 if self.others:
+                    entity = self.others.pop(rng.randrange(len(self.others)))
+                    world.remove(entity)
+                    log.note_removal(entity)
+                case 2 if self.others:
+                    world.place(rng.choice(self.others), self.place())
+                case 3 if self.others:
+                    world.set_velocity(rng.choice(self.others), (rng.uniform(-9, 9), 0, rng.uniform(0, 9)))
+                case 4:
+                    world.place(self.session.entity, self.place())
+                case 5 | 6 | 7:
+                    at = (rng.choice([-33, -32, -1, 0, 31, 32, 64]), rng.choice([3, 4]), rng.choice([2, 3]))
+                    if world.set_block(*at, rng.choice([0, 0, 1, 200])):
+                        log.note_edit(*at)
+                case 8 if rng.random() < 0.3:
+                    self.game.receive(self.session, encode(Resync()), self.now)
+        except OverlapError:
+            pass
+
+    def stall(self) -> None:
+        tick = self.game.world.tick
+        if self.rng.random() < 0.06:
+            self.stuck_until = tick + self.rng.choice([1, 2, 5, 20, 63, 64, 65, 66])
+        self.model.stuck = tick < self.stuck_until
+
+    def check(self) -> None:
+        """The client has just what the server has in the segments it sees."""
+        game, model, session = self.game, self.model, self.session
+        assert model.tick == game.world.tick
+        here = [entity for entity in game.world.entities["id"].tolist() if game.log.segment(entity) in session.sees]
+        assert model.entities == {entity: game.world.state(entity) for entity in here}
+        assert session.entity in model.entities
+        under_way = {*session.terrain_due, session.terrain_now[0] if session.terrain_now else None}
+        assert set(model.blocks) - session.sees == set()
+        for segment in session.sees - under_way:
+            if segment in game.world.blocks:
+                assert (model.blocks[segment] == game.world.blocks.segment(segment).reshape(-1)).all()
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_a_client_has_what_the_server_has_whatever_it_skipped_and_wherever_it_looked(seed: int) -> None:
+    told = Told(seed)
+    told.tick()
+    for _ in range(400):
+        told.stir()
+        told.stir()
+        told.stall()
+        told.tick()
+        if not told.model.stuck:
+            told.check()
+    told.model.stuck = False
+    for _ in range(60):
+        told.tick()
+    told.check()
+    assert not told.session.terrain_due
+    assert told.game.counters.snapshots_skipped > 50
