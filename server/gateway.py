@@ -294,7 +294,9 @@ class Connection(asyncio.Protocol):
             length, mask = second & 127, at + 2
             if length == 126 and size - at >= 4:
                 length, mask = data[at + 2] << 8 | data[at + 3], at + 4
-            odd = second < MASKED or second == MASKED | 127 or length > CLIENT_MESSAGE_MAX or self._deaf
+            elif length == 127 and size - at >= 10:
+                length, mask = int.from_bytes(data[at + 2 : at + 10], "big"), at + 10
+            odd = second < MASKED or length > CLIENT_MESSAGE_MAX or self._deaf
             if odd or (first != FINAL_BINARY and first & 15 not in OPCODES):
                 self._plain = False
                 self._parse(data[at:])

@@ -129,7 +129,7 @@ def stats(address: tuple[str, int]) -> dict[str, Any]:
 
 @contextmanager
 def joined(address: tuple[str, int]) -> Iterator[tuple[ClientConnection, Welcome]]:
-    with connect(f"ws://{address[0]}:{address[1]}", compression=None) as link:
+    with connect(f"ws://{address[0]}:{address[1]}", compression=None, max_queue=None) as link:
         link.send(encode(Hello(VERSION, {}, "test")))
         welcome = decode_from_server(link.recv(END_S, decode=False))
         assert isinstance(welcome, Welcome), welcome
