@@ -600,18 +600,45 @@ def leave(w: Arrays, row: int, states: Any, i: int) -> None:
 
 
 @jit
-def store(w: Arrays, rows: Any, states: Any, n: int, tick: int) -> None:
-    """Writes `n` whole states ([n, 12], the state columns) into rows ahead of `tick`, wakes them and their riders."""
+def write(w: Arrays, row: int, states: Any, i: int, tick: int) -> None:
+    """Writes the whole state at `i` (the state columns) into a row ahead of `tick`, wakes it and its riders."""
     e = w.entities
+    at = row << WIDTH_SHIFT
+    if e[at + CELL] >= 0:
+        leave(w, row, states, i)
+    awake = e[at + FLAGS] & AWAKE
+    for k in range(CELL):
+        e[at + k] = states[i + k]
+    e[at + FLAGS] = e[at + FLAGS] & FALLING | awake
+    mark(w, row, tick)
+    relink(w, row)
+    wake(w, row, -1)
+
+
+@jit
+def store(w: Arrays, rows: Any, states: Any, n: int, tick: int) -> None:
+    """Writes `n` whole states."""
     for i in range(n):
-        row = rows[i]
-        at = row << WIDTH_SHIFT
-        if e[at + CELL] >= 0:
-            leave(w, row, states, CELL * i)
-        awake = e[at + FLAGS] & AWAKE
-        for k in range(CELL):
-            e[at + k] = states[CELL * i + k]
-        e[at + FLAGS] = e[at + FLAGS] & FALLING | awake
-        mark(w, row, tick)
-        relink(w, row)
-        wake(w, row, -1)
+        write(w, rows[i], states, CELL * i, tick)
+
+
+@jit
+def settle(w: Arrays, rows: Any, states: Any, n: int, tick: int) -> int:
+    """The same for newcomers, up to the first whose place is taken; how many."""
+    t, c = w.templates, w.candidates
+    for i in range(n):
+        kind = states[CELL * i + TEMPLATE] * TEMPLATE_COLUMNS
+        x0 = states[CELL * i + X] + t[kind + LO_X]
+        y0 = states[CELL * i + Y] + t[kind + LO_X + 1]
+        z0 = states[CELL * i + Z] + t[kind + LO_X + 2]
+        x1 = x0 + t[kind + SIZE_X]
+        y1 = y0 + t[kind + SIZE_X + 1]
+        z1 = z0 + t[kind + SIZE_X + 2]
+        if blocks_in(w, x0, y0, z0, x1, y1, z1):
+            return i
+        if w.parameters[PAIRS] != 0 and t[kind + SOLID] != 0:
+            for m in range(0, gather(w, -1, True, x0, y0, z0, x1, y1, z1), CANDIDATE):
+                if c[m] < x1 and c[m + 3] > x0 and c[m + 1] < y1 and c[m + 4] > y0 and c[m + 2] < z1 and c[m + 5] > z0:
+                    return i
+        write(w, rows[i], states, CELL * i, tick)
+    return n

@@ -7,6 +7,9 @@ means `==`. Values of people (floats, in blocks and blocks/s) are rounded once, 
 
 import math
 
+import numpy as np
+import numpy.typing as npt
+
 from shared.checks import SceneError, finite
 
 BLOCK_SHIFT = 24
@@ -41,6 +44,25 @@ def to_position(value: object, field: str) -> int:
     if abs(blocks) > RANGE_BLOCKS:
         raise SceneError(f"{field} = {value!r}: outside of +-{RANGE_BLOCKS} blocks")
     return rounded(blocks * BLOCK)
+
+
+def to_positions(values: npt.ArrayLike, field: str) -> npt.NDArray[np.int64]:
+    """The same for many positions at once, [n, 3].
+
+    Raises:
+        SceneError: another shape, or a row in which a value is not finite or out of range.
+    """
+    blocks = np.asarray(values, np.float64)
+    if blocks.ndim != 2 or blocks.shape[1] != 3:
+        raise SceneError(f"{field}: must be rows of three numbers, not of shape {blocks.shape}")
+    bad = np.flatnonzero(~(np.abs(blocks) <= RANGE_BLOCKS).all(axis=1))
+    if len(bad):
+        raise SceneError(f"{field}[{bad[0]}] = {blocks[bad[0]].tolist()}: outside of +-{RANGE_BLOCKS} blocks")
+    size = np.abs(blocks) * BLOCK
+    whole = np.floor(size)
+    whole += size - whole >= 0.5
+    steps: npt.NDArray[np.int64] = np.where(blocks >= 0, whole, -whole).astype(np.int64)
+    return steps
 
 
 def to_velocity(value: object, field: str) -> int:

@@ -15,13 +15,14 @@ from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from shared import blocks, kernels, layout, terrain
 from shared.checks import Cell, SceneError, whole
 from shared.inputs import Input
 from shared.layout import ENTITY, FALLING, FLAGS, ID, NEXT, PREV, TEMPLATE, VX, Arrays, X
 from shared.scene import Scene
-from shared.units import BLOCK, SEGMENT, SPEED, to_position, to_velocity
+from shared.units import BLOCK, SEGMENT, SPEED, to_position, to_positions, to_velocity
 
 STATES = layout.CELL
 """Columns of an entity's state: id, template, flags, x, y, z, vx, vy, vz, move_x, move_y, buttons."""
@@ -55,7 +56,7 @@ class World:
         self._lengths = np.zeros(layout.LENGTHS, np.int64)
         self._edits: dict[Cell, int] = {}
         self.edited: dict[Cell, int] = {}
-        """The blocks that were changed ahead of the latest step, after the one before it, and their kinds until then."""
+        """The blocks changed between the latest step and the one before it, and their kinds until then."""
         self._inputs = np.zeros((8, 4), np.int64)
         self._entities = np.zeros((0, len(layout.COLUMNS)), np.int64)
         self._awake = self._next_awake = self._woken = self._later = np.zeros(0, np.int64)
@@ -289,6 +290,39 @@ class World:
         entity = self._next_id
         self.put([(entity, kind, self._thrown(speed[2]), *at, *speed, 0, 0, 0)])
         return entity
+
+    def spawn_many(self, template: str, positions: npt.ArrayLike) -> range:
+        """Adds entities at rest, all or none, as `spawn` would one after the other; their ids, in order.
+
+        Args:
+            template: its name in the scene.
+            positions: [n, 3] in blocks, rounded to the grid.
+
+        Raises:
+            OverlapError: a place is taken, if only by an earlier one.
+            SceneError: a value is not finite or out of range, or there is no such template.
+        """
+        kind = self._template(template)
+        at = to_positions(positions, "positions")
+        n, first = len(at), self._next_id
+        if first + n - 1 > ID_MAX:
+            raise SceneError("ids: used up")
+        ids = range(first, first + n)
+        states = np.zeros((n, STATES), np.int64)
+        states[:, ID] = ids
+        states[:, TEMPLATE] = kind
+        states[:, X : X + 3] = at
+        rows = np.array([self._row(entity) for entity in ids], np.int64)
+        settled = self._kernel.settle(self._arrays, self._lent(rows), self._lent(states), n, self._tick + 1)
+        if settled < n:
+            for entity in ids[settled:]:
+                self._free.append(self._row_of.pop(entity))
+            for entity in ids[:settled]:
+                self.remove(entity)
+            self._next_id = first
+            place = (at[settled] / BLOCK).tolist()
+            raise OverlapError(f"positions[{settled}] = {place}: no room for a {template!r} there")
+        return ids
 
     def place(self, entity: int, position: tuple[float, float, float], *, push: bool = False) -> None:
         """Teleports an entity, which keeps its velocity. Raises as `spawn` does, and `KeyError`."""
