@@ -327,7 +327,7 @@ class Told:
 
     def stall(self) -> None:
         tick = self.game.world.tick
-        if self.rng.random() < 0.06:
+        if tick >= self.stuck_until and self.rng.random() < 0.06:
             self.stuck_until = tick + self.rng.choice([1, 2, 5, 20, 63, 64, 65, 66])
         self.model.stuck = tick < self.stuck_until
 
