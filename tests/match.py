@@ -1,14 +1,12 @@
 """A match in simulated time: the real server core and real SDK cores, one `now`, one seed.
 
 Nothing sleeps and nothing depends on the machine: every delivery, tick and frame is an entry in one queue, ordered
-by simulated time. A `Wire` is one direction of a TCP connection: nothing is lost or reordered, but sometimes late.
+by simulated time. The wires are those of `tests.links`: TCP, nothing lost or reordered, but sometimes late.
 """
 
 import heapq
 import random
-from collections import deque
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from itertools import count
 
 from client_sdk.core import Core
@@ -18,41 +16,10 @@ from server.limits import Limits
 from server.session import Session
 from shared.inputs import Input
 from shared.scene import Scene
+from tests.links import Path as Path
+from tests.links import Weather, Wire
 
 Policy = Callable[[Core, random.Random], Input]
-
-
-@dataclass(frozen=True)
-class Path:
-    """How a connection behaves, each way. Times in seconds."""
-
-    delay_s: float = 0.0
-    jitter_s: float = 0.0
-
-
-class Wire:
-    """One direction: in order, each message delayed by the path."""
-
-    def __init__(self, match: "Match", path: Path, rng: random.Random, deliver: Callable[[bytes], None]) -> None:
-        self._match, self._path, self._rng, self._deliver = match, path, rng, deliver
-        self._last = 0.0
-        self._unacked: deque[tuple[float, int]] = deque()  # when the acknowledgement is back, bytes
-        self._bytes = 0
-
-    def send(self, message: bytes) -> None:
-        """Delivers in order, after the path's delay."""
-        now = self._match.now
-        way = self._path.delay_s + self._rng.random() * self._path.jitter_s
-        self._last = max(self._last, now + way)
-        self._unacked.append((self._last + self._path.delay_s, len(message)))
-        self._bytes += len(message)
-        self._match.at(self._last, lambda: self._deliver(message))
-
-    def outstanding(self) -> int:
-        """Bytes sent and not yet acknowledged."""
-        while self._unacked and self._unacked[0][0] <= self._match.now:
-            self._bytes -= self._unacked.popleft()[1]
-        return self._bytes
 
 
 class Player:
@@ -66,9 +33,14 @@ class Player:
         self.events: list[Event] = []
         self.closed: tuple[int, str] | None = None
         self.session: Session | None = None
-        self._up = Wire(match, path, random.Random(seed + 1), self._at_server)
-        self._down = Wire(match, path, random.Random(seed + 2), self._at_client)
+        self.weather = Weather(path, seed + 3)
+        self.up = Wire(match, self.weather, seed + 1, self._at_server)
+        self.down = Wire(match, self.weather, seed + 2, self._at_client)
         self._acted = -1
+        self.frame_s = 0.0
+        """The program draws, reads and updates only so often; 0: at once when something is due."""
+        self._inbox: list[bytes] = []
+        self._away = False
 
     @property
     def local(self) -> float:
@@ -87,13 +59,23 @@ class Player:
         self.match.game.lost(self.session, self.match.now)
         self.core.lost(1006, "gone", self.local)
 
+    def suspend(self, seconds: float) -> None:
+        """The program stands still; what comes in meanwhile waits."""
+        self._away = True
+        self.match.at(self.match.now + seconds, self._resume)
+
+    def _resume(self) -> None:
+        self._away = False
+        self._read()
+        self._update()
+
     # As the server's link:
 
     def send(self, message: bytes) -> None:
-        self._down.send(message)
+        self.down.send(message)
 
     def outstanding(self) -> int:
-        return self._down.outstanding()
+        return self.down.outstanding()
 
     def close(self, code: int, reason: str) -> None:
         self.closed = (code, reason)
@@ -105,20 +87,34 @@ class Player:
         self.match.game.receive(self.session, message, self.match.now)
 
     def _at_client(self, message: bytes) -> None:
+        self._inbox.append(message)
+        if self._away or self.frame_s:
+            return
         waiting = self.core.state == "joining"
-        self.core.receive(message, self.local)
-        self._flush()
+        self._read()
         if waiting:
             self._update()
 
+    def _read(self) -> None:
+        for message in self._inbox:
+            self.core.receive(message, self.local)
+        self._inbox.clear()
+        self._flush()
+
     def _update(self) -> None:
         core = self.core
+        if self._away:
+            return
+        if self.frame_s:
+            self._read()
         if core.state == "playing" and core.prediction and core.prediction.predicted.tick != self._acted:
             self._acted = core.prediction.predicted.tick
             core.set_input(self.policy(core, self.rng))
         core.update(self.local)
         self._flush()
-        if core.state != "closed":
+        if self.frame_s:
+            self.match.at(self.match.now + self.frame_s, self._update, key=self)
+        elif core.state != "closed":
             due = core.next_update(self.local)
             if due < float("inf"):
                 when = self.match.now + max(due - self.local, 1e-4) / (1 + self.drift)
@@ -126,7 +122,7 @@ class Player:
 
     def _flush(self) -> None:
         for message in self.core.outgoing():
-            self._up.send(message)
+            self.up.send(message)
         self.events += self.core.events()
         if self.core.close_request and self.closed is None:
             self.close(*self.core.close_request)

@@ -1,0 +1,224 @@
+"""One direction of a TCP connection in simulated time: nothing lost, nothing reordered, sometimes late, then a burst.
+
+Theory of operation. A message is cut into packets. Each waits for the line (`rate`), flies (`delay`, jitter, the
+weather's spikes; the path itself is first in, first out) and may be lost. A lost packet is found missing the way
+RACK does it: a transmission sent after it is acknowledged (acknowledgements are lost as often), and a reorder window
+of a quarter of the round trip has passed; where nothing else is sent, a time-out of a round trip and 200 ms, doubled
+each time, does it. It is sent again, may be lost again, and whatever arrived behind it waits. Left out, because a
+game's thin stream hardly ever meets them: the congestion window, delayed acknowledgements, tail loss probes.
+
+`Weather` is what happens to both directions of a connection at the same time; it is drawn from a seed as time goes on.
+"""
+
+import math
+import random
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Protocol
+
+PACKET_BYTES = 1448
+HEADER_BYTES = 66
+"""Ethernet, IP, and TCP with its time stamps, per packet."""
+FRAME_BYTES = 6
+"""WebSocket, per message."""
+TIMEOUT_S = 0.2
+TIMER_S = 0.01
+"""A kernel's timer for the reorder window fires so much later: two to three jiffies of 4 ms."""
+
+
+class Scheduler(Protocol):
+    """Simulated time."""
+
+    now: float
+
+    def at(self, when: float, act: Callable[[], None]) -> None:
+        """Files something for a time."""
+
+
+@dataclass(frozen=True)
+class Path:
+    """How a connection behaves, each way. Times in seconds.
+
+    Args:
+        delay_s: from one end to the other, at least.
+        jitter_s: up to so much more, evenly drawn per packet.
+        loss: share of packets lost.
+        rate: bits per second.
+        dip: during the last `dip[1]` of every `dip[0]` seconds, the rate is `dip[2]`.
+        spike: about every `spike[0]` seconds, for about `spike[1]` seconds, up to `spike[2]` more delay.
+        outage: during the last `outage[1]` of every `outage[0]` seconds, everything is lost.
+    """
+
+    delay_s: float = 0.0
+    jitter_s: float = 0.0
+    loss: float = 0.0
+    rate: float = math.inf
+    dip: tuple[float, float, float] | None = None
+    spike: tuple[float, float, float] | None = None
+    outage: tuple[float, float] | None = None
+
+    @property
+    def rtt_s(self) -> float:
+        """The round trip, on average and in fair weather."""
+        return 2 * self.delay_s + self.jitter_s
+
+
+def path(rtt_ms: float, jitter_ms: float, loss: float = 0.0) -> Path:
+    """A path whose round trip is `rtt_ms` +- `jitter_ms`."""
+    return Path((rtt_ms - jitter_ms) / 2000, jitter_ms / 1000, loss)
+
+
+PRESETS = {
+    "lan": path(0.5, 0.1),
+    "regional": path(30, 2, 0.001),
+    "typical": path(100, 10, 0.01),
+    "far": path(200, 25, 0.02),
+    "wifi": replace(path(8.5, 2), spike=(10.0, 1.0, 0.0708)),
+    "dip": replace(path(50, 2), rate=2e6, dip=(40.0, 10.0, 120e3)),
+    "outage": replace(path(50, 2), outage=(3.0, 0.12)),
+    "thin": replace(path(60, 5), rate=30e3),
+}
+
+
+class Weather:
+    """What changes about a path, the same for both directions."""
+
+    def __init__(self, path: Path, seed: int) -> None:
+        self.path = path
+        self.spikes: list[tuple[float, float, float]] = []
+        """Drawn so far: begin, end, extra delay."""
+        self._rng = random.Random(seed)
+        self._drawn = 0.0 if path.spike else math.inf
+
+    def rate(self, now: float) -> float:
+        """Bits per second."""
+        path = self.path
+        return path.dip[2] if path.dip and _late(now, path.dip) else path.rate
+
+    def out(self, now: float) -> bool:
+        """Whether nothing comes through."""
+        return self.path.outage is not None and _late(now, self.path.outage)
+
+    def extra(self, now: float) -> float:
+        """The delay on top, in seconds."""
+        while now >= self._drawn:
+            self._draw()
+        for begin, end, extra in reversed(self.spikes):
+            if begin <= now:
+                return extra if now < end else 0.0
+        return 0.0
+
+    def dipped(self, now: float) -> float:
+        """Seconds since the dip began; negative outside of one."""
+        dip = self.path.dip
+        return now % dip[0] - (dip[0] - dip[1]) if dip else -1.0
+
+    def _draw(self) -> None:
+        assert self.path.spike is not None
+        every, length, extra = self.path.spike
+        begin = self._drawn + every * self._rng.uniform(0.4, 1.6)
+        end = begin + length * self._rng.uniform(0.7, 1.3)
+        self.spikes.append((begin, end, extra * self._rng.uniform(0.4, 1.0)))
+        self._drawn = end
+
+
+def _late(now: float, cycle: tuple[float, ...]) -> bool:
+    return now % cycle[0] >= cycle[0] - cycle[1]
+
+
+class _Packet:
+    __slots__ = ("arrived", "bytes", "last_of", "lost", "sent", "timeout_s")
+
+    def __init__(self, size: int, last_of: bytes | None, timeout_s: float) -> None:
+        self.bytes = size
+        self.last_of = last_of
+        self.timeout_s = timeout_s
+        self.sent = 0.0
+        self.lost = self.arrived = False
+
+
+class Wire:
+    """One direction.
+
+    Args:
+        time: delivers.
+        weather: the path, and what changes about it; share it with the other direction.
+        seed: everything random of this direction comes from it.
+        deliver: takes the messages in order.
+    """
+
+    def __init__(self, time: Scheduler, weather: Weather, seed: int, deliver: Callable[[bytes], None]) -> None:
+        self._time, self._weather, self._path, self._deliver = time, weather, weather.path, deliver
+        self._rng = random.Random(seed)
+        self._waiting: deque[_Packet] = deque()  # in order of the stream; the first has not arrived
+        self._missing: list[_Packet] = []  # lost, not yet sent again
+        self._free = 0.0  # when the line is
+        self._last = 0.0  # when the newest transmission arrives
+        self._bytes = 0
+        self._unacked: deque[tuple[float, int]] = deque()  # when the acknowledgement is back, bytes
+        self.sent_bytes = 0
+        """Everything that was transmitted, headers too."""
+        self.resent = 0
+
+    def send(self, message: bytes) -> None:
+        """Takes a message; never blocks."""
+        left = len(message) + FRAME_BYTES
+        self._bytes += left
+        while left > 0:
+            size = min(left, PACKET_BYTES)
+            left -= size
+            packet = _Packet(size, message if left == 0 else None, TIMEOUT_S + self._path.rtt_s)
+            self._waiting.append(packet)
+            self._transmit(packet)
+
+    def outstanding(self) -> int:
+        """Bytes sent and not yet acknowledged."""
+        while self._unacked and self._unacked[0][0] <= self._time.now:
+            self._bytes -= self._unacked.popleft()[1]
+        return self._bytes
+
+    def _transmit(self, packet: _Packet) -> None:
+        path, weather, now = self._path, self._weather, self._time.now
+        size = packet.bytes + HEADER_BYTES
+        self.sent_bytes += size
+        packet.sent = now
+        gone = self._free = max(now, self._free) + 8 * size / weather.rate(now)
+        packet.lost = self._rng.random() < path.loss or weather.out(gone)
+        if packet.lost:
+            self._missing.append(packet)
+            wait = gone - now + packet.timeout_s
+            packet.timeout_s *= 2
+            self._time.at(now + wait, lambda: self._timeout(packet, now))
+            return
+        extra = weather.extra(gone)
+        self._last = max(self._last, gone + path.delay_s + self._rng.random() * path.jitter_s + extra)
+        self._time.at(self._last, lambda: self._arrive(packet))
+        if self._missing and self._rng.random() >= path.loss:  # its acknowledgement tells of the missing
+            told = self._last + path.delay_s + path.jitter_s / 2 + extra + path.rtt_s / 4 + TIMER_S
+            self._time.at(told, lambda: self._find_missing(now))
+
+    def _find_missing(self, sent: float) -> None:
+        found = [packet for packet in self._missing if packet.sent < sent]
+        if found:
+            self._missing = [packet for packet in self._missing if packet.sent >= sent]
+            for packet in found:
+                self._resend(packet)
+
+    def _timeout(self, packet: _Packet, sent: float) -> None:
+        if packet.lost and packet.sent == sent:
+            self._missing.remove(packet)
+            self._resend(packet)
+
+    def _resend(self, packet: _Packet) -> None:
+        self.resent += 1
+        self._transmit(packet)
+
+    def _arrive(self, packet: _Packet) -> None:
+        packet.arrived = True
+        back = self._time.now + self._path.delay_s + self._path.jitter_s / 2
+        while self._waiting and self._waiting[0].arrived:
+            first = self._waiting.popleft()
+            self._unacked.append((back, first.bytes))
+            if first.last_of is not None:
+                self._deliver(first.last_of)
