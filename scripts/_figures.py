@@ -4,6 +4,7 @@ from collections import Counter
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
+from client_sdk.prediction import NONDETERMINISM
 from shared.messages import MALFORMED
 
 SNAPSHOTS_SHARE_MIN = 0.95
@@ -32,14 +33,16 @@ def quantiles(values: Sequence[float]) -> dict[str, float]:
 
 
 def figures(
-    clients: Sequence[Figures], seconds: float, before: Figures, after: Figures, bots_cpu_s: float, rss_mb: list[float]
+    results: Sequence[Figures], seconds: float, before: Figures, after: Figures, rss_mb: list[float]
 ) -> Figures:
     """The figures of the window.
 
     Args:
-        clients: what each bot counted in the window (`_swarm.Player.figures`).
+        results: what each process of bots counted in the window (the last thing that `_swarm.py` says).
         before, after: `/stats` at its ends; empty if the server does not tell.
     """
+    clients = [client for result in results for client in result["clients"]]
+    bots_cpu_s = sum(result["cpu_s"] for result in results)
     n = len(clients)
     ticks = after["ticks"] - before["ticks"] if before and after else None
     expected = max((client["ticks"] for client in clients), default=0)
@@ -82,6 +85,7 @@ def figures(
         "server_cpu_us_per_client_tick": per_client_tick_us(after["cpu_s"] - before["cpu_s"]) if ticks else None,
         "server_cpu_share": round((after["cpu_s"] - before["cpu_s"]) / seconds, 4) if ticks else None,
         "bots_cpu_us_per_client_tick": per_client_tick_us(bots_cpu_s),
+        "bots_lag_ms": quantiles([lag * 1e3 for result in results for lag in result["lags_s"]]),
         "server_rss_mb": rss_mb,
         "disconnects": len(gone),
         "malformed": sum(left["code"] == MALFORMED for left in gone),
@@ -106,8 +110,9 @@ def rows(f: Figures) -> list[tuple[str, str]]:
         ("corrections", f"{f['corrections']} ({f['corrections_per_client_minute']:.1f} per client and minute)"),
         ("their size", _three(sizes, "blocks") if f["corrections"] else "none"),
         ("bytes per client", f"{bytes_s['up'] / 1e3:.2f} KB/s up, {bytes_s['down'] / 1e3:.2f} KB/s down"),
-        ("server CPU", _or_unknown(f["server_cpu_us_per_client_tick"], " us per client and tick")),
+        ("server's CPU", _or_unknown(f["server_cpu_us_per_client_tick"], " us per client and tick")),
         ("bots' CPU", _or_unknown(f["bots_cpu_us_per_client_tick"], " us per client and tick")),
+        ("bots' own lag", _three(f["bots_lag_ms"], "ms")),
         ("server memory", f"{memory[0]:.0f} to {memory[-1]:.0f} MB" if memory else "not told"),
         ("disconnects", str(f["disconnects"])),
     ]
@@ -138,6 +143,15 @@ def verdict(f: Figures) -> list[Judgement]:
         )
     )
     judgements.append(_corrections(f))
+    period_ms, lag_ms = 1e3 / (f["tick_rate"] or 32), f["bots_lag_ms"]["p99"]
+    if lag_ms > period_ms:
+        judgements.append(
+            Judgement(
+                False,
+                f"the bots themselves were held up by {lag_ms:.0f} ms and more for 1 % of the time: late inputs and "
+                "corrections tell of this busy machine, not of the server",
+            )
+        )
     memory = f["server_rss_mb"]
     if len(memory) >= 2 * MEMORY_SETTLED_S:
         grown = memory[-1] - memory[MEMORY_SETTLED_S]
@@ -163,20 +177,24 @@ def failures(f: Figures) -> list[str]:
 def _pace(f: Figures) -> Judgement:
     wanted = f["tick_rate"] * f["seconds"]
     pace, period_ms, p99 = f["server_ticks"] / wanted, 1e3 / f["tick_rate"], f["tick_lateness_ms"]["p99"]
-    text = f"the server made {pace:.1%} of its ticks; 99 % began within {p99:.1f} ms (a tick is {period_ms:.0f} ms)"
+    text = (
+        f"the server made {pace:.1%} of its ticks; since its start 99 % began within {p99:.1f} ms "
+        f"(a tick is {period_ms:.0f} ms)"
+    )
     return Judgement(pace >= PACE_MIN and p99 < period_ms, text)
 
 
 def _corrections(f: Figures) -> Judgement:
     if not f["corrections"]:
         return Judgement(True, "no prediction had to be corrected")
-    by_late = f["corrections_by_cause"].get("late input", 0)
-    met = f["corrections"] - by_late
+    causes: Counter[str] = Counter(f["corrections_by_cause"])
+    by_late, unexplained = causes["late input"], causes[NONDETERMINISM]
     text = (
         f"{f['corrections']} corrections of {f['inputs_sent']} predicted ticks, half of them under "
-        f"{max(f['correction_blocks']['p50'], 0.01):.2f} blocks: {met} where players met, {by_late} after late inputs"
+        f"{max(f['correction_blocks']['p50'], 0.01):.2f} blocks, by cause: "
+        + ", ".join(f"{cause} {n}" for cause, n in causes.most_common())
     )
-    return Judgement(by_late <= LATE_SHARE_MAX * f["inputs_sent"], text)
+    return Judgement(not unexplained and by_late <= LATE_SHARE_MAX * f["inputs_sent"], text)
 
 
 def _three(values: dict[str, float], unit: str) -> str:

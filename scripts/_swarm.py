@@ -2,7 +2,7 @@
 
 argument  {"url", "first", "clients", "seed", "policy", "joins_per_s"}, as JSON
 stdin     "measure": the window begins; "stop": it ends, say goodbye; the end of the pipe: give up
-stdout    one JSON object per line: {"playing", "ended"} while joining and playing, and last {"clients", "cpu_s"}
+stdout    a JSON object per line: {"playing", "ended"} while joining and playing, and last {"clients", "cpu_s", "lags_s"}
 """
 
 import asyncio
@@ -21,6 +21,7 @@ from client_sdk.transports.aio import AsyncClient
 from client_sdk.transports.connection import ConnectError
 
 REPORT_S = 0.2
+LAG_S = 0.02
 COUNTERS = (
     *("snapshots", "inputs_sent", "inputs_late", "corrections", "repredictions", "replayed_ticks", "resyncs"),
     *("bytes_up", "bytes_down"),
@@ -104,6 +105,8 @@ async def swarm(order: dict[str, Any]) -> int:
     make = POLICIES[order["policy"]]
     lives: list[asyncio.Task[None]] = []
     joining = asyncio.create_task(join(order, players, make, lives))
+    lags_s: list[float] = []
+    measuring = asyncio.create_task(lag(lags_s))
     cpu_s = 0.0
     while True:
         say({"playing": sum(p.playing for p in players), "ended": [p.left for p in players if p.left]})
@@ -114,14 +117,17 @@ async def swarm(order: dict[str, Any]) -> int:
         if command == "measure":
             gc.collect()
             gc.freeze()
+            lags_s.clear()
             cpu_s = time.process_time()
             for player in players:
                 player.mark()
         elif command == "stop":
-            say({"clients": [player.figures() for player in players], "cpu_s": time.process_time() - cpu_s})
+            cpu_s = time.process_time() - cpu_s
+            say({"clients": [player.figures() for player in players], "cpu_s": cpu_s, "lags_s": lags_s})
         if command != "measure":
             break
     joining.cancel()
+    measuring.cancel()
     await asyncio.gather(*(p.client.close() for p in players if p.client is not None))
     for life in lives:
         life.cancel()
@@ -136,6 +142,14 @@ async def join(order: dict[str, Any], players: list[Player], make: Any, lives: l
         bot = Bot(make(random.Random(f"{order['seed']} {player.name}")))
         lives.append(asyncio.create_task(player.play(order["url"], bot)))
         await asyncio.sleep(max(0.0, begun + (i + 1) / order["joins_per_s"] - time.monotonic()))
+
+
+async def lag(found_s: list[float]) -> None:
+    """How late this process is with everything it does, looked at every 20 ms."""
+    while True:
+        due = time.monotonic() + LAG_S
+        await asyncio.sleep(LAG_S)
+        found_s.append(round(time.monotonic() - due, 5))
 
 
 def listen() -> asyncio.Queue[str]:

@@ -114,9 +114,7 @@ async def measure(args: argparse.Namespace, url: str, workers: "list[Worker]", c
         seconds = time.monotonic() - began
         after = await stats(url)
         results = [await worker.result() for worker in workers]
-    clients = [client for result in results for client in result["clients"]]
-    cpu_s = sum(result["cpu_s"] for result in results)
-    return figures(clients, seconds, before, after, cpu_s, rss_mb)
+    return figures(results, seconds, before, after, rss_mb)
 
 
 class Worker:
