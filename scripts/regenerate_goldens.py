@@ -1,0 +1,32 @@
+#!/usr/bin/env python3
+"""Writes tests/golden/physics.json anew. Only on purpose: every client in the world must be updated with it.
+
+Both executors must agree on every hash first. Run by the environment of the repository: `.venv/bin/python`.
+"""
+
+import json
+import sys
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parent.parent
+sys.path.insert(0, str(ROOT))
+
+from shared import kernels  # noqa: E402
+from tests.golden.scripts import SCRIPTS, run  # noqa: E402
+
+
+def main() -> int:
+    goldens = {}
+    for name in SCRIPTS:
+        plain = dict(run(name, compiled=False))
+        if kernels.available() and dict(run(name, compiled=True)) != plain:
+            print(f"{name}: compiled and plain differ; nothing is written", file=sys.stderr)
+            return 1
+        goldens[name] = {str(tick): digest for tick, digest in plain.items()}
+        print(f"{name:<8} {plain[max(plain)]}")
+    (ROOT / "tests" / "golden" / "physics.json").write_text(json.dumps(goldens, indent=2) + "\n")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
