@@ -29,12 +29,14 @@ from shared.messages import ProtocolError, Snapshot
 from shared.ring import Ring
 from shared.scene import Scene
 from shared.snapshot import ACTED, SegmentPart, checksum, decode_parts
-from shared.units import BLOCK, BLOCK_SHIFT, SEGMENT_SHIFT
+from shared.units import BLOCK, BLOCK_SHIFT, SEGMENT, SEGMENT_SHIFT
 from shared.world import World
 
 HISTORY = 256
 """Ticks for which predictions and inputs are kept."""
 KEYFRAME = -1
+NEAR_BLOCKS = 5.0
+"""An edit this near may explain a correction."""
 
 NONDETERMINISM = "nondeterminism"
 """The cause that must never occur: both sides knew the same and computed something else."""
@@ -77,7 +79,7 @@ class Prediction:
         self._inputs: Ring[Input] = Ring(HISTORY)
         self._states: Ring[Int64s] = Ring(HISTORY)
         self._templates = len(scene.templates)
-        self._terrain_changed = False
+        self._terrain_changed = self._edited_near = False
         self._acted: set[int] = set()
         self._edits: dict[int, tuple[int, Edit]] = {}  # by number, with its tick; until there is a verdict
         self._compared = -1
@@ -120,6 +122,7 @@ class Prediction:
                 if part.segment in world.blocks:
                     world.write_blocks(part.segment, *changes)
                     self._terrain_changed = True
+                    self._edited_near |= self._near(part.segment, part.edits["block"].astype(np.int64))
                 else:  # its terrain is on the way, and was perhaps packed before this
                     self._early.setdefault(part.segment, []).append(changes)
         if here:
@@ -129,6 +132,17 @@ class Prediction:
             if part.check and part.segment in world.blocks and checksum(world, part.segment) != part.check:
                 return f"segment {part.segment} is not the server's"
         return ""
+
+    def _near(self, segment: Cell, offsets: Int64s) -> bool:
+        """Whether one of these blocks is so near to the own entity that it may have met it."""
+        if self.entity not in self.confirmed:
+            return False
+        inside = SEGMENT - 1
+        blocks = (
+            np.stack((offsets & inside, offsets >> 5 & inside, offsets >> 10), axis=1) + np.array(segment) * SEGMENT
+        )
+        ways = np.abs(blocks - np.array(self.confirmed.position(self.entity)))
+        return bool((ways.max(axis=1) < NEAR_BLOCKS).any())
 
     def _gone(self, part: SegmentPart, homes: dict[int, Cell]) -> list[int]:
         if part.since == KEYFRAME:
@@ -202,7 +216,7 @@ class Prediction:
             causes = (
                 (late, "late input"),
                 (self.entity in acted, "server act"),
-                (self._terrain_changed, "unknown edit"),
+                (self._edited_near, "unknown edit"),
                 (others and (skipped or not self.neighbours), "other entity"),
                 (others and self._others_differ(guess, truth), "other entity"),
             )
@@ -230,7 +244,7 @@ class Prediction:
 
     def _replay(self, to: int) -> None:
         self.predicted.restore(self.confirmed)
-        self._terrain_changed = False
+        self._terrain_changed = self._edited_near = False
         if not self.neighbours:
             for entity in self.predicted.states()[:, ID].tolist():
                 if entity != self.entity:

@@ -86,7 +86,7 @@ class Game:
         self._numbers = count(1)
         self._leaving: list[Session] = []
         self._respawn: list[int] = []
-        self._deadline = 0.0
+        self._deadline: float | None = None
         self._spawned = 0
 
     # -- what arrives is filed -----------------------------------------------------------------------------
@@ -178,9 +178,8 @@ class Game:
         self._leaving.clear()
 
     def _join(self) -> None:
-        for session in self.sessions:
-            if not session.joining or session.closed:
-                continue
+        joining = [session for session in self.sessions if session.joining and not session.closed]
+        for session in joining[: self.limits.joins_per_tick]:
             session.joining = False
             entity = self._spawn()
             if entity is None:
@@ -329,6 +328,8 @@ class Game:
 
     def _ticks_left(self, now: float) -> float:
         """Ticks until the next tick's deadline."""
+        if self._deadline is None:
+            return 1.0
         return 1.0 - (now - self._deadline) * self.scene.tick_rate
 
     def _acked(self, session: Session, tick: int, now: float) -> None:
@@ -378,7 +379,7 @@ class Game:
     def _spawn(self) -> int | None:
         for place in self._places():
             try:
-                return self.world.spawn(self.scene.player, place, push=True)
+                return self.world.spawn(self.scene.player, place)
             except OverlapError:
                 continue
         return None
@@ -386,7 +387,7 @@ class Game:
     def _to_spawn(self, entity: int) -> None:
         for place in self._places():
             try:
-                self.world.place(entity, place, push=True)
+                self.world.place(entity, place)
                 self.world.set_velocity(entity, (0.0, 0.0, 0.0))
                 self.log.note_act(entity)
             except OverlapError:

@@ -8,6 +8,8 @@ class Limits:
     """Bounds per server and per client."""
 
     clients_max: int = 2000
+    joins_per_tick: int = 8
+    """More wait for the next tick: a spawn costs up to a millisecond."""
     hello_s: float = 5.0
     """A connection that has not introduced itself by then is closed."""
     silence_s: float = 15.0

@@ -3,7 +3,7 @@
 Theory of operation. What a TCP connection has not acknowledged yet stands in a queue somewhere, and the newest
 snapshot goes behind it. So a snapshot is sent only while the bytes on the way (unsent and unacknowledged) fit into
 
-    max(two snapshots, rate x (least round trip + one tick))
+    max(two snapshots, one packet, rate x (least round trip + one tick))
 
 where `rate` is the fastest the path has acknowledged bytes lately and the least round trip is that of an empty
 path. A client that lost some ticks that way gets their union in its next snapshot: latest wins.
@@ -16,6 +16,7 @@ RATE_WINDOW_S = 1.0
 RATE_SPAN_S = 0.25
 """each measured over at least a quarter of one."""
 RTT_WINDOW_S = 10.0
+PACKET_BYTES = 1448
 
 
 class Pacing:
@@ -63,4 +64,4 @@ class Pacing:
             self._rates.append((now, rate))
         while self._rates and self._rates[0][0] < now - RATE_WINDOW_S:
             self._rates.popleft()
-        return max(2 * snapshot_bytes, int(self.rate * (self.least_rtt_s + tick_s)))
+        return max(2 * snapshot_bytes, PACKET_BYTES, int(self.rate * (self.least_rtt_s + tick_s)))

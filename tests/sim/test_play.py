@@ -1,0 +1,130 @@
+"""Slow programs, suspended programs, input delay and crowds: what the player feels, in defined ways."""
+
+import random
+
+import pytest
+
+from client_sdk.core import Core
+from client_sdk.events import Diverged, Left, Resynchronised, SegmentLoaded
+from shared.inputs import JUMP, Input
+from shared.scene import load_scene
+from tests.match import Match, Path, Player, wander
+
+
+def joined(match: Match, *players: Player) -> None:
+    match.run_until(lambda: all(player.core.state == "playing" for player in players), 30)
+
+
+def ahead(player: Player) -> int:
+    assert player.core.prediction is not None
+    return player.core.prediction.predicted.tick - player.core.prediction.confirmed.tick
+
+
+@pytest.mark.parametrize("frames_per_s", [5, 12, 30, 60, 144])
+def test_any_frame_rate_plays_without_corrections(frames_per_s: int) -> None:
+    match = Match(load_scene("hills"), 3)
+    player = match.join(wander, Path(0.05, 0.01))
+    player.frame_s = 1 / frames_per_s
+    joined(match, player)
+    match.run(5)  # the lead has learned how long a frame is
+    stats = player.core.stats
+    substituted, corrections = stats.inputs_substituted, stats.corrections
+    match.run(60)
+    assert stats.corrections == corrections
+    assert stats.resyncs == 0
+    assert stats.inputs_substituted == substituted
+    assert stats.inputs_sent >= 60 * 32
+    assert set(stats.corrections_by_cause) <= {"late input"}
+    # A replay comes with new terrain only.
+    assert stats.repredictions <= sum(isinstance(event, SegmentLoaded) for event in player.events)
+
+
+@pytest.mark.parametrize("seconds", [0.3, 1.0, 2.0, 5.0, 12.0])
+def test_a_suspended_program_begins_anew_without_a_spiral(seconds: float) -> None:
+    match = Match(load_scene("hills"), 4)
+    player = match.join(wander, Path(0.05, 0.01))
+    joined(match, player)
+    match.run(5)
+    stats = player.core.stats
+    player.events.clear()
+    steps = stats.replayed_ticks + stats.inputs_sent
+    player.suspend(seconds)
+    match.run(seconds + 1)
+    assert stats.resyncs == (seconds > 0.5)
+    assert [type(event) for event in player.events if isinstance(event, Resynchronised)] == [
+        Resynchronised
+    ] * stats.resyncs
+    # What was missed is not caught up tick by tick.
+    assert stats.replayed_ticks + stats.inputs_sent - steps < 200
+    assert ahead(player) < 16
+    corrections = stats.corrections
+    match.run(20)
+    assert stats.corrections == corrections
+    assert player.closed is None
+    assert set(stats.corrections_by_cause) <= {"late input"}
+
+
+def test_a_long_sleep_ends_the_connection_with_a_reason() -> None:
+    match = Match(load_scene("flat"), 5)
+    player = match.join(wander, Path(0.05))
+    joined(match, player)
+    player.suspend(20)
+    match.run(21)
+    left = [event for event in player.events if isinstance(event, Left)]
+    assert [event.reason for event in left] == ["nothing heard for 15 s"]
+    assert len(match.game.world) == 0
+    assert match.game.sessions == []
+
+
+def test_the_input_delay_changes_in_mid_play_without_a_correction() -> None:
+    match = Match(load_scene("arena"), 6)
+    player = match.join(wander, Path(0.05, 0.01))
+    joined(match, player)
+    depths = {}
+    for ticks in (0, 3, 1, 2, 0):
+        player.core.set_input_delay(ticks)
+        match.run(20)
+        depths[ticks] = ahead(player)
+    assert depths[3] < depths[0]
+    assert player.core.stats.corrections == 0
+    with pytest.raises(ValueError, match="ticks = 4"):
+        player.core.set_input_delay(4)
+
+
+class Crowd:
+    """Everyone presses to the middle, jumps, and sometimes goes away: blocking each other, jumping on heads."""
+
+    def __init__(self) -> None:
+        self._wish = Input()
+
+    def __call__(self, core: Core, rng: random.Random) -> Input:
+        assert core.prediction is not None
+        if rng.random() < 0.06:
+            x, y, _ = core.prediction.predicted.position(core.entity)
+            sign = -1 if rng.random() < 0.2 else 1
+            way = (
+                rng.randint(20, 127) * sign * (1 if x < 64 else -1),
+                rng.randint(20, 127) * sign * (1 if y < 64 else -1),
+            )
+            self._wish = Input(*way, JUMP if rng.random() < 0.3 else 0)
+        return self._wish
+
+
+def crowd(size: int, seconds: float, neighbours: bool, seed: int = 7) -> tuple[Match, list[Player]]:
+    match = Match(load_scene("flat"), seed)
+    players = [match.join(Crowd(), Path(0.05, 0.01), Core(neighbours=neighbours)) for _ in range(size)]
+    joined(match, *players)
+    match.run(seconds)
+    return match, players
+
+
+@pytest.mark.parametrize(("size", "seconds"), [(12, 10), pytest.param(30, 30, marks=pytest.mark.slow)])
+def test_a_crowd_has_no_nondeterminism_and_predicting_neighbours_pays(size: int, seconds: float) -> None:
+    corrections = {}
+    for neighbours in (True, False):
+        _, players = crowd(size, seconds, neighbours)
+        causes = {cause for player in players for cause in player.core.stats.corrections_by_cause}
+        assert causes <= {"other entity", "late input"}
+        assert not any(isinstance(event, Diverged) for player in players for event in player.events)
+        corrections[neighbours] = sum(player.core.stats.corrections for player in players)
+    assert 0 < corrections[True] < corrections[False]
