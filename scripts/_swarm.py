@@ -2,7 +2,7 @@
 
 argument  {"url", "first", "clients", "seed", "policy", "joins_per_s"}, as JSON
 stdin     "measure": the window begins; "stop": it ends, say goodbye; the end of the pipe: give up
-stdout    a JSON object per line: {"playing", "ended"} while joining and playing, and last {"clients", "cpu_s", "lags_s"}
+stdout    a JSON object per line: {"playing", "ended"} while joining and playing; at last {"clients", "cpu_s", "lags_s"}
 """
 
 import asyncio
