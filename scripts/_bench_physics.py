@@ -1,0 +1,201 @@
+"""What `bench.py physics` measures. Every function returns samples in seconds per unit, taken in turn."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+import _step_c
+from _crowds import Samples, crowd, hills, take_turns, wishes
+from _slabs import Slabs, boxes_on, dense_hits
+from shared.scene import Scene, Template
+from shared.units import SEGMENT
+from shared.world import World
+
+WALKERS = 10_000
+TICKS = 10
+"""One sample is the mean of so many ticks."""
+
+Found = tuple[Samples, dict[str, Any]]
+
+
+def _run(world: World, ticks: int = TICKS) -> float:
+    """Entity-steps done; an awake entity is one, a sleeper is none."""
+    turns = 0
+    for _ in range(ticks):
+        turns += world.awake_count
+        world.step()
+    return turns
+
+
+def _run_in_c(world: World, ticks: int = TICKS) -> float:
+    turns = world.awake_count * ticks
+    _step_c.run(world, ticks)
+    return turns
+
+
+def walk(rounds: int, *, pairs: bool) -> Found:
+    """10,000 walkers on hills, all awake: the product beside the same step in C, and their hashes."""
+    ours = crowd(hills(pairs=pairs), WALKERS, compiled=True)
+    worlds, work = [ours], {"ours": lambda: _run(ours)}
+    if _step_c.available():
+        _step_c.library()
+        theirs = ours.copy()
+        worlds.append(theirs)
+        work["c"] = lambda: _run_in_c(theirs)
+
+    def between(number: int) -> None:
+        for world in worlds:
+            world.step(wishes(world, number))
+            for _ in range(3):
+                world.step()
+
+    samples = take_turns(work, rounds, between)
+    return samples, {"hash_equal": len({world.state_hash() for world in worlds}) == 1, "c": len(worlds) == 2}
+
+
+def rest(rounds: int) -> Samples:
+    """10,000 sleepers: the whole tick, shared among them."""
+    world = crowd(hills(), WALKERS, compiled=True)
+
+    def tick() -> float:
+        for _ in range(100):
+            world.step()
+        return 100.0 * WALKERS
+
+    return take_turns({"rest": tick}, rounds)
+
+
+def million(rounds: int, count: int = 1_000_000) -> Found:
+    """A million solid entities on a hill-side of 2 x 2 km, one per cent of them walking: seconds per tick."""
+    spawned: list[World] = []
+
+    def spawn() -> float:
+        spawned.append(crowd(hills(64), count, compiled=True))
+        return 1.0
+
+    seconds = take_turns({"spawn": spawn}, 1)["spawn"][0]
+    world = spawned[0]
+
+    def tick() -> float:
+        for _ in range(TICKS):
+            world.step()
+        return TICKS
+
+    def between(number: int) -> None:
+        world.step(wishes(world, number, 0.01))
+
+    samples = take_turns({"million": tick}, rounds, between)
+    return samples, {"spawn_s": seconds, "awake": world.awake_count, "entities": len(world)}
+
+
+def scenes(rounds: int) -> Samples:
+    """The same walkers on one plain, and what each thing that a scene leaves out saves."""
+    full = Scene("plain", size=(16, 16, 1))
+    alone = replace(full, entity_collision=False)
+    weightless = replace(alone, gravity=0.0)
+    worlds = {"full": full, "no entity collision": alone, "and no gravity": weightless}
+    crowds = {name: crowd(scene, WALKERS, compiled=True) for name, scene in worlds.items()}
+    empty = crowd(replace(weightless, terrain={"generator": "boxes", "fill": []}), WALKERS, compiled=True)
+    crowds["and no blocks"] = empty
+
+    def between(number: int) -> None:
+        for world in crowds.values():
+            world.step(wishes(world, number))
+
+    return take_turns({name: _task(world) for name, world in crowds.items()}, rounds, between)
+
+
+def _task(world: World) -> Callable[[], float]:
+    return lambda: _run(world)
+
+
+def edits(rounds: int) -> Samples:
+    """A block set and removed, in the air and under a sleeper, and a cube of 8 x 8 x 8 filled and cleared."""
+    world = crowd(hills(), WALKERS, compiled=True)
+    x, y, z = (int(part // 1) for part in world.position(1))
+
+    def one() -> float:
+        for kind in (1, 0) * 50:
+            world.set_block(300, 300, 30, kind)
+        return 100
+
+    def under() -> float:
+        for kind in (0, 1) * 50:
+            world.set_block(x, y, z - 1, kind)
+        return 100
+
+    def cube() -> float:
+        for kind in (1, 0):
+            world.fill((300, 300, 23), (308, 308, 31), kind)
+        return 2 * 512
+
+    return take_turns({"set_block": one, "set_block under a sleeper": under, "fill, per block": cube}, rounds)
+
+
+def obstacles(rounds: int) -> Found:
+    """Is anything solid in this box? Dense cells beside greedily merged xy slabs, and one edit of each."""
+    world = crowd(hills(4), 4, compiled=True)
+    slabs = Slabs.of(world.blocks)
+    boxes = boxes_on(world, 20_000)
+    layer = np.ascontiguousarray(world.blocks.segment((1, 1, 0))[12] != 0)
+    answers = dense_hits(world, boxes), slabs.hits(boxes)
+
+    def dense() -> float:
+        dense_hits(world, boxes)
+        return len(boxes)
+
+    def merged() -> float:
+        slabs.hits(boxes)
+        return len(boxes)
+
+    def dense_edit() -> float:
+        for kind in (1, 0) * 50:
+            world.blocks.set(40, 40, 30, kind)
+        return 100
+
+    def merged_edit() -> float:
+        for _ in range(5):
+            slabs.merge_layer(layer)
+        return 5
+
+    work = {"dense look-up": dense, "slab look-up": merged, "dense edit": dense_edit, "slab edit": merged_edit}
+    return take_turns(work, rounds), {"same_answers": bool((answers[0] == answers[1]).all()), "slabs": len(slabs)}
+
+
+def calls(rounds: int) -> Samples:
+    """What a client pays per call, with 50 players around it in 27 segments; and a turn without Numba."""
+    scene = Scene("plain", size=(3, 3, 3), templates=(Template("player", walk_speed=3.0, jump_speed=8.0),))
+    nine = replace(scene, size=(3, 3, 1))
+    world, plain = crowd(nine, 50, compiled=True), crowd(nine, 50, compiled=False)
+    above = [(i, j, k) for k in (1, 2) for j in range(3) for i in range(3)]
+    world.load_terrain(above)
+    one = crowd(nine, 1, compiled=True)
+    twin = world.copy()
+    wish, wish_one = wishes(world, 1), wishes(one, 1)
+
+    def repeat(times: int, call: Callable[[], object]) -> Callable[[], float]:
+        def task() -> float:
+            for _ in range(times):
+                call()
+            return times
+
+        return task
+
+    def restore() -> None:
+        world.step(wish)
+        twin.restore(world)
+
+    plain.step(wishes(plain, 1))
+    work = {
+        "step, 1 player and its input": repeat(500, lambda: one.step(wish_one)),
+        "step, 50 players": repeat(500, world.step),
+        "step, 50 players and their inputs": repeat(500, lambda: world.step(wish)),
+        "the same, and restore of a copy": repeat(500, restore),
+        "copy, 50 players in 27 segments": repeat(20, world.copy),
+        "one turn without Numba": lambda: _run(plain, 4),
+    }
+    assert len(world.blocks.rows) == 27
+    assert SEGMENT == 32
+    return take_turns(work, rounds)

@@ -1,0 +1,121 @@
+"""The obstacles that the product does not use: blocks merged greedily into xy slabs, one list per layer.
+
+It is what the seed of this project proposed; here it is kept as a measure, so that the choice can be checked.
+"""
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from numba import njit
+
+from shared.blocks import Blocks
+from shared.units import BLOCK, SEGMENT
+from shared.world import World
+
+Boxes = npt.NDArray[np.int64]
+Flags = npt.NDArray[np.bool_]
+
+
+@njit(cache=True)
+def _merge(layer: Any, slabs: Any) -> int:
+    """Fills `slabs` ([n, 4]: x0, y0, x1, y1) with rectangles that cover the solid blocks of a layer [y, x]; how many.
+
+    Greedy: grow east as far as it goes, then north as long as the whole row is solid.
+    """
+    left = layer.copy()
+    n = 0
+    size = len(layer)
+    for y in range(size):
+        for x in range(size):
+            if not left[y, x]:
+                continue
+            x1 = x + 1
+            while x1 < size and left[y, x1]:
+                x1 += 1
+            y1 = y + 1
+            while y1 < size and left[y1, x:x1].all():
+                y1 += 1
+            left[y:y1, x:x1] = False
+            slabs[n] = (x, y, x1, y1)
+            n += 1
+    return n
+
+
+@njit(cache=True)
+def _hits(slabs: Any, starts: Any, origin: Any, sizes: Any, boxes: Any, block: int, out: Any) -> None:
+    for number in range(len(boxes)):
+        b = boxes[number]
+        hit = False
+        for z in range(b[2] // block, (b[5] - 1) // block + 1):
+            for sy in range(b[1] // block // 32, (b[4] - 1) // block // 32 + 1):
+                for sx in range(b[0] // block // 32, (b[3] - 1) // block // 32 + 1):
+                    i, j, k = sx - origin[0], sy - origin[1], z // 32 - origin[2]
+                    layer = ((k * sizes[1] + j) * sizes[0] + i) * 32 + z % 32
+                    for s in range(starts[layer], starts[layer + 1]):
+                        if (
+                            slabs[s, 0] * block < b[3]
+                            and slabs[s, 2] * block > b[0]
+                            and slabs[s, 1] * block < b[4]
+                            and slabs[s, 3] * block > b[1]
+                        ):
+                            hit = True
+                            break
+        out[number] = hit
+
+
+@njit(cache=True)
+def _dense(blocks_in: Any, arrays: Any, boxes: Any, out: Any) -> None:
+    for number in range(len(boxes)):
+        b = boxes[number]
+        out[number] = blocks_in(arrays, b[0], b[1], b[2], b[3], b[4], b[5])
+
+
+class Slabs:
+    """All layers of a box of segments, merged; [n, 4] in blocks, layer after layer."""
+
+    def __init__(self, slabs: Boxes, starts: Boxes, origin: Boxes, sizes: Boxes) -> None:
+        self._slabs, self._starts, self._origin, self._sizes = slabs, starts, origin, sizes
+
+    @classmethod
+    def of(cls, blocks: Blocks) -> "Slabs":
+        indices = np.array(sorted(blocks, key=lambda index: index[::-1]), np.int64)
+        origin = indices.min(axis=0)
+        sizes = indices.max(axis=0) - origin + 1
+        parts, starts = [], [0]
+        scratch = np.zeros((SEGMENT * SEGMENT, 4), np.int64)
+        for i, j, k in indices.tolist():
+            for layer in blocks.segment((i, j, k)) != 0:
+                n = _merge(layer, scratch)
+                parts.append(scratch[:n] + np.array([i, j, i, j]) * SEGMENT)
+                starts.append(starts[-1] + n)
+        return cls(np.concatenate(parts), np.array(starts, np.int64), origin, sizes)
+
+    def __len__(self) -> int:
+        return len(self._slabs)
+
+    def hits(self, boxes: Boxes) -> Flags:
+        """Whether a block overlaps each box, [n]."""
+        out = np.zeros(len(boxes), np.bool_)
+        _hits(self._slabs, self._starts, self._origin, self._sizes, boxes, BLOCK, out)
+        return out
+
+    def merge_layer(self, layer: Flags) -> int:
+        """What an edit costs at least: its layer merged anew (and the rest of the list moved, not counted)."""
+        return int(_merge(layer, np.zeros((SEGMENT * SEGMENT, 4), np.int64)))
+
+
+def boxes_on(world: World, count: int) -> Boxes:
+    """Boxes of players at random places near the ground, [n, 6] in grid steps."""
+    rng = np.random.default_rng(3)
+    sides = np.array([0.6, 0.6, 1.8])
+    high = np.array([world.scene.size[0] * SEGMENT, world.scene.size[1] * SEGMENT, 24.0]) - sides
+    low = rng.uniform([0.0, 0.0, 8.0], high, (count, 3))
+    return np.floor(np.hstack((low, low + sides)) * BLOCK).astype(np.int64)
+
+
+def dense_hits(world: World, boxes: Boxes) -> Flags:
+    """The same by the product's own look-up."""
+    out = np.zeros(len(boxes), np.bool_)
+    _dense(world._kernel.blocks_in, world._arrays, boxes, out)
+    return out

@@ -1,0 +1,36 @@
+"""The step in C: built with gcc when it is asked for, and called on the very arrays of a `World`."""
+
+import ctypes
+import functools
+import shutil
+import subprocess
+import tempfile
+from pathlib import Path
+
+from shared.world import World
+
+SOURCE = Path(__file__).with_name("bench_step.c")
+FLAGS = ("-O2", "-ffp-contract=off", "-shared", "-fPIC")
+
+
+def available() -> bool:
+    """Whether there is a gcc to build it with."""
+    return shutil.which("gcc") is not None
+
+
+@functools.cache
+def library() -> ctypes.CDLL:
+    with tempfile.TemporaryDirectory() as folder:
+        built = Path(folder) / "bench_step.so"
+        subprocess.run(["gcc", *FLAGS, "-o", str(built), str(SOURCE)], check=True)
+        return ctypes.CDLL(str(built))
+
+
+def run(world: World, ticks: int) -> None:
+    """Steps a compiled world in C, without inputs. A benchmark may reach into a world; nobody else may."""
+    step, arrays = library().step, world._arrays
+    addresses = [array.ctypes.data for array in arrays]
+    struct = (ctypes.c_int64 * (len(addresses) + 1))(*addresses, len(arrays.table))
+    for _ in range(ticks):
+        world._tick += 1
+        step(struct, ctypes.c_int64(world._tick))
