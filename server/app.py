@@ -16,11 +16,13 @@ from typing import Any
 
 from server.game import Game
 from server.gateway import CLOSE_S, Gateway
+from server.recorder import RecordedWorld
 from server.settings import Settings, SettingsError, parse
 from server.ticker import Ticker, best_alarm
 from shared.checks import SceneError
 from shared.messages import VERSION, Hello, Inputs, encode
 from shared.scene import Scene, load_scene
+from shared.world import World
 
 WARM_UP_TICKS = 8
 RESTART_WAIT_S = 2.0
@@ -51,7 +53,7 @@ def run(settings: Settings) -> int:
 
     Raises:
         SceneError: the scene cannot be used.
-        SettingsError: nor can the address.
+        SettingsError: nor can the address, or the file to record into.
     """
     logging.basicConfig(
         stream=sys.stderr, level=settings.log_level.upper(), format="%(asctime)s %(levelname)s %(name)s: %(message)s"
@@ -60,9 +62,11 @@ def run(settings: Settings) -> int:
     if settings.tick_rate is not None:
         scene = dataclasses.replace(scene, tick_rate=settings.tick_rate)
     warm_up(scene)
-    game = Game(scene)
     with asyncio.Runner(loop_factory=_loop_factory()) as runner:
-        return runner.run(Server(settings, game).serve())
+        if settings.record is None:
+            return runner.run(Server(settings, Game(scene)).serve())
+        with recorded(scene, settings.record) as world:
+            return runner.run(Server(settings, Game(scene, world=world)).serve())
 
 
 class Server:
@@ -134,6 +138,30 @@ class Server:
         error = context.get("exception")
         self.gateway.internal_errors += 1
         logger.error("%s", context["message"], exc_info=None if isinstance(error, OSError) else error)
+
+
+@contextlib.contextmanager
+def recorded(scene: Scene, path: str) -> Iterator[World]:
+    """A world whose changes go into a new file, which is ended properly in the end.
+
+    Raises:
+        SettingsError: the file exists or cannot be written.
+    """
+    try:
+        file = Path(path).open("xb")  # noqa: SIM115 - closing may fail on a full disk, which has been told by then
+    except FileExistsError:
+        raise SettingsError(f"record = {path!r}: exists already, and a recording is never overwritten") from None
+    except OSError as error:
+        raise SettingsError(f"record = {path!r}: cannot be written ({error.strerror or error})") from error
+    world = RecordedWorld(scene)
+    world.load_terrain()
+    try:
+        world.record(file, lambda error: logger.error("recording into %s has ended: %s", path, error))
+        yield world
+        world.end_recording()
+    finally:
+        with contextlib.suppress(OSError):
+            file.close()
 
 
 def warm_up(scene: Scene) -> None:

@@ -3,7 +3,9 @@
 Theory of operation. Whatever arrives is checked and filed with its session; the world changes in `tick` and
 nowhere else, in the order in which that function reads. A tick never waits for a client: each is sent the newest
 snapshot if its link has room for one, and otherwise nothing (it gets the union of what it missed with the next).
-A peer's mistake closes its connection with a code and a reason; no input of a peer raises.
+A peer's mistake closes its connection with a code and a reason; no input of a peer raises. Links call back: one may
+report itself as lost while it is being sent to or closed, so wherever that can happen a copy of the sessions is gone
+through.
 """
 
 import dataclasses
@@ -16,6 +18,7 @@ import numpy as np
 from server import interest
 from server.limits import Limits
 from server.replication import KEYFRAME, ChangeLog
+from server.rewind import Past, Rewind
 from server.session import Link, Session
 from shared import edits, messages
 from shared.checks import Vec
@@ -73,14 +76,25 @@ class Game:
         scene: the rules; its terrain is generated at once.
         limits: bounds.
         compiled: as for `World`.
+        world: to be played in, with its blocks; by default a new one.
     """
 
-    def __init__(self, scene: Scene, *, limits: Limits | None = None, compiled: bool | None = None) -> None:
+    def __init__(
+        self,
+        scene: Scene,
+        *,
+        limits: Limits | None = None,
+        compiled: bool | None = None,
+        world: World | None = None,
+    ) -> None:
         self.scene = scene
         self.limits = limits or Limits()
-        self.world = World(scene, compiled=compiled)
-        self.world.load_terrain()
+        if world is None:
+            world = World(scene, compiled=compiled)
+            world.load_terrain()
+        self.world = world
         self.log = ChangeLog(self.world)
+        self.rewind = Rewind(self.world)
         self.counters = Counters()
         self.sessions: list[Session] = []
         self._numbers = count(1)
@@ -95,7 +109,7 @@ class Game:
         """A connection is there; its client has to say hello."""
         session = Session(next(self._numbers), link, now)
         self.sessions.append(session)
-        if len(self.sessions) > self.limits.clients_max:
+        if sum(not each.closed for each in self.sessions) > self.limits.clients_max:
             self._refuse(session, messages.FULL, f"the server is full ({self.limits.clients_max} clients)")
         return session
 
@@ -143,10 +157,22 @@ class Game:
 
     def shut_down(self, reason: str, wait: float) -> None:
         """Tells every client, with the seconds after which to come back, and closes the connections."""
-        for session in self.sessions:
+        for session in tuple(self.sessions):
             if not session.closed:
                 session.send(encode(Bye(messages.GOING_AWAY, reason, wait)))
                 session.close(messages.GOING_AWAY, reason)
+
+    def rewound(self, session: Session, seen: float) -> Past:
+        """The world as a client saw it; ask between two ticks, or for a command within one.
+
+        Args:
+            session: who asks; its own entity is left out of what is found.
+            seen: the tick at which that client drew the others, as its commands say; clamped to the last 250 ms.
+
+        Raises:
+            SceneError: `seen` is not a finite number.
+        """
+        return self.rewind.at(seen, session.entity)
 
     # -- the tick acts -------------------------------------------------------------------------------------
 
@@ -160,6 +186,7 @@ class Game:
         inputs = self._take_inputs()
         self.world.step(inputs)
         self.log.record()
+        self.rewind.record()
         self._fell_out()
         self._send(now)
         self._check_clocks(now)
@@ -202,7 +229,7 @@ class Game:
         for session in self.sessions:
             rate = self.limits.edits_per_s
             session.edits_left = min(session.edits_left + rate / self.scene.tick_rate, 2 * rate)
-            while session.commands and session.commands[0].tick <= tick:
+            while session.commands and session.commands[0].tick <= tick and not session.closed:
                 command = session.commands.popleft()
                 session.verdicts.append((command.number, self._carry_out(session, command)))
 
@@ -228,7 +255,7 @@ class Game:
         self.counters.fell_out += len(self._respawn)
 
     def _send(self, now: float) -> None:
-        for session in self.sessions:
+        for session in tuple(self.sessions):
             session.allowance = min(session.allowance + self.limits.messages_per_tick, 0.0)
             if not session.entity or session.closed:
                 continue
@@ -254,10 +281,10 @@ class Game:
         added, dropped = interest.update(session.sees, centre, self.limits.see_radius, self.limits.keep_radius, exists)
         session.sees.difference_update(dropped)
         session.fresh.difference_update(dropped)
-        session.drops += dropped
         session.terrain_due = type(session.terrain_due)(s for s in session.terrain_due if s in session.sees)
         session.sees.update(added)
         session.fresh.update(added)
+        session.drops = sorted(session.knows - session.sees)
         session.terrain_due.extend(segment for segment in added if exists(segment))
         if session.terrain_now and session.terrain_now[0] in dropped:
             session.terrain_now = None
@@ -289,8 +316,10 @@ class Game:
         session.send(message)
         session.tick = tick
         session.snapshot_bytes = len(message)
-        session.fresh.clear()
-        session.drops.clear()
+        if session.fresh or session.drops:
+            session.knows = set(session.sees)
+            session.fresh.clear()
+            session.drops.clear()
         del session.verdicts[: messages.VERDICTS_MAX]
         session.sent_when.put(tick, now)
         inputs.told()
@@ -313,7 +342,7 @@ class Game:
             self.counters.terrain_bytes += len(chunk)
 
     def _check_clocks(self, now: float) -> None:
-        for session in self.sessions:
+        for session in tuple(self.sessions):
             if session.closed:
                 continue
             if not session.entity:

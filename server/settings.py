@@ -53,6 +53,7 @@ class Settings:
     )
     stats: bool = _setting(True, Kind(bool, "answer GET /stats with counters and timings as JSON"))
     log_level: str = _setting("info", Kind(str, "what goes to stderr", choices=LOG_LEVELS))
+    record: str | None = _setting(None, Kind(str, "record every change of the world into a new file", "FILE"))
     origins: Mapping[str, str] = field(default_factory=dict, compare=False)
 
     def to_toml(self) -> str:

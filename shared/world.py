@@ -54,7 +54,8 @@ class World:
         self._free: list[int] = []
         self._limbo: list[int] = []  # freed since the last step: still in the kernel's lists
         self._lengths = np.zeros(layout.LENGTHS, np.int64)
-        self._edits: dict[Cell, int] = {}
+        self.editing: dict[Cell, int] = {}
+        """The blocks changed since the latest step, and their kinds until then."""
         self.edited: dict[Cell, int] = {}
         """The blocks changed between the latest step and the one before it, and their kinds until then."""
         self._inputs = np.zeros((8, 4), np.int64)
@@ -245,7 +246,7 @@ class World:
         changed = [(cell, before) for cell in cells if (before := self.blocks.get(*cell) or blocks.AIR) != kind]
         for (x, y, z), before in changed:
             self.blocks.set(x, y, z, kind)
-            self._edits.setdefault((x, y, z), before)
+            self.editing.setdefault((x, y, z), before)
             if kind == blocks.AIR:
                 face = (x * BLOCK, y * BLOCK, (x + 1) * BLOCK, (y + 1) * BLOCK, (z + 1) * BLOCK)
                 self._kernel.wake_on(self._arrays, -1, *face)
@@ -373,7 +374,7 @@ class World:
                 part * SEGMENT + ((at >> shift) & (SEGMENT - 1))
                 for part, shift in zip(segment, (0, 5, 10), strict=True)
             )
-            self._edits.setdefault((x, y, z), self.blocks.get(x, y, z) or blocks.AIR)
+            self.editing.setdefault((x, y, z), self.blocks.get(x, y, z) or blocks.AIR)
             self.blocks.set(x, y, z, kind)
             self._kernel.wake_on(
                 self._arrays, -1, x * BLOCK, y * BLOCK, (x + 1) * BLOCK, (y + 1) * BLOCK, (z + 1) * BLOCK
@@ -382,7 +383,7 @@ class World:
     def rebase(self, tick: int) -> None:
         """Declares what has been written to be the world at the end of `tick`, without a step."""
         self._tick = tick
-        self._edits, self.edited = {}, {}
+        self.editing, self.edited = {}, {}
         self._entities[: self._rows, layout.CHANGED] = -1  # it may be a tick that has been before
         self._lengths[layout.N_CHANGED] = self._lengths[layout.N_FELL] = 0
         if self._limbo:
@@ -408,7 +409,7 @@ class World:
                 self._inputs = np.zeros((2 * n, 4), np.int64)
             self._inputs[:n] = [(self._row_of[entity], *wish) for entity, wish in inputs.items()]
         self._tick += 1
-        self.edited, self._edits = self._edits, {}
+        self.edited, self.editing = self.editing, {}
         self._kernel.step(self._arrays, self._lent(self._inputs), n, self._tick)
         if self._limbo:
             self._free += self._limbo
@@ -426,7 +427,7 @@ class World:
         self.blocks.heads[cells[cells >= 0]] = -1
         if len(self._entities) != len(other._entities):
             self._allocate(len(other._entities))
-        self._edits, self.edited = dict(other._edits), dict(other.edited)
+        self.editing, self.edited = dict(other.editing), dict(other.edited)
         self._tick, self._next_id, self._rows = other._tick, other._next_id, other._rows
         self._row_of, self._free, self._limbo = dict(other._row_of), list(other._free), list(other._limbo)
         n = self._rows
