@@ -59,6 +59,7 @@ class Body:
     move: tuple[int, int] = (0, 0)
     buttons: int = 0
     near: list[int] = field(default_factory=list)
+    corners: Box = field(default_factory=lambda: ([], []))
 
 
 class Oracle:
@@ -88,8 +89,8 @@ class Oracle:
         self.mean = mean
         self.pairs = pairs
         self.lowest = lowest
-        self.loaded: set[Block] = set()
-        self.solid: set[Block] = set()
+        self.solid: dict[Block, set[Block]] = {}
+        """The solid blocks of every segment that is loaded."""
         self.bodies: dict[int, Body] = {}
         self.fell: list[int] = []
         self._corners = [self._rounded(kind) for kind in kinds]
@@ -97,9 +98,8 @@ class Oracle:
 
     def is_solid(self, block: Block) -> bool:
         """Whether a block stops things: what is not loaded does, the void does not."""
-        if (block[0] // SEGMENT, block[1] // SEGMENT, block[2] // SEGMENT) not in self.loaded:
-            return block[2] >= self.lowest
-        return block in self.solid
+        loaded = self.solid.get((block[0] // SEGMENT, block[1] // SEGMENT, block[2] // SEGMENT))
+        return block[2] >= self.lowest if loaded is None else block in loaded
 
     def box(self, body: Body) -> Box:
         low, high = self._corners[body.kind]
@@ -115,9 +115,10 @@ class Oracle:
         self.fell = []
         for body in self.bodies.values():
             body.near = [math.floor(part) for part in body.position]
+            body.corners = self.box(body)
         for entity in sorted(self.bodies):
             self._turn(self.bodies[entity])
-            if self.box(self.bodies[entity])[0][2] < self.lowest:
+            if self.bodies[entity].corners[0][2] < self.lowest:
                 self.fell.append(entity)
 
     def taken(self, body: Body) -> bool:
@@ -135,7 +136,7 @@ class Oracle:
 
     def _turn(self, body: Body) -> None:
         kind = self.kinds[body.kind]
-        low, high = self.box(body)
+        low, high = body.corners
         v = body.velocity
         if kind.walk > 0:
             v[0], v[1] = (nearest(kind.walk * part / 127, SPEED_STEP) for part in body.move)
@@ -163,7 +164,7 @@ class Oracle:
             low[k] += went
             high[k] += went
             body.position[k] += went
-            if went != wish[k]:
+            if went != wish[k]:  # stopped
                 v[k] = Fraction(0)
                 if k == 2 and wish[k] < 0:
                     body.falling = False
@@ -186,7 +187,7 @@ class Oracle:
         x, y, z = body.near
         reach = 2 * self._reach + math.ceil(wish)
         return [
-            self.box(other)
+            other.corners
             for other in self.bodies.values()
             if abs(other.near[2] - z) <= reach
             and abs(other.near[0] - x) <= reach

@@ -53,8 +53,10 @@ class Twins:
         )
         self.span = r.choice((3, 5, 8))
         self._terrain()
-        for _ in range(r.randint(1, bodies)):
-            self._spawn()
+        wanted = r.randint(1, bodies)
+        for _ in range(3 * wanted):
+            if len(self.oracle.bodies) < wanted:
+                self._spawn()
 
     def run(self) -> None:
         """The whole script; raises at the first difference."""
@@ -119,10 +121,9 @@ class Twins:
     def _load(self, index: tuple[int, int, int], kinds: Kinds) -> None:
         self.world.load_segment(index, kinds)
         x, y, z = (part * SEGMENT for part in index)
-        if index in self.oracle.loaded:
-            self.oracle.solid -= {block for block in self.oracle.solid if segment_of(*block) == index}
-        self.oracle.loaded.add(index)
-        self.oracle.solid |= {(x + at % 32, y + at // 32 % 32, z + at // 1024) for at in np.flatnonzero(kinds).tolist()}
+        self.oracle.solid[index] = {
+            (x + at % 32, y + at // 32 % 32, z + at // 1024) for at in np.flatnonzero(kinds).tolist()
+        }
 
     # -- what may happen between two ticks -----------------------------------------------------------------
 
@@ -221,7 +222,7 @@ class Twins:
         cells = [
             (x, y, z) for x in range(low[0], high[0]) for y in range(low[1], high[1]) for z in range(low[2], high[2])
         ]
-        if any(segment_of(*cell) not in self.oracle.loaded for cell in cells):
+        if any(segment_of(*cell) not in self.oracle.solid for cell in cells):
             return
         met = kind and any(
             self.scene.templates[body.kind].solid and _overlap(self.oracle.box(body), (low, high))
@@ -233,10 +234,12 @@ class Twins:
             assert met, f"edit {low} to {high} refused"
             return
         assert not met, f"edit {low} to {high} accepted"
-        if kind:
-            self.oracle.solid |= set(cells)
-        else:
-            self.oracle.solid -= set(cells)
+        for cell in cells:
+            segment = self.oracle.solid[segment_of(*cell)]
+            if kind:
+                segment.add(cell)
+            else:
+                segment.discard(cell)
 
     def _reload(self) -> None:
         """Loads a segment, perhaps one that was not there, or in place of another."""
@@ -249,7 +252,7 @@ class Twins:
     def _unload(self) -> None:
         """Forgets a segment, which is solid from then on; refused while entities are in it."""
         index = segment_of(*(int(part // 1) for part in self._somewhere()))
-        if index not in self.oracle.loaded:
+        if index not in self.oracle.solid:
             return
         met = any(tuple(part // SEGMENT for part in body.position) == index for body in self.oracle.bodies.values())
         try:
@@ -258,8 +261,7 @@ class Twins:
             assert met, f"unloading {index} refused"
             return
         assert not met, f"unloading {index} accepted"
-        self.oracle.loaded.remove(index)
-        self.oracle.solid -= {block for block in self.oracle.solid if segment_of(*block) == index}
+        del self.oracle.solid[index]
 
     def _put(self) -> None:
         """Writes states as a snapshot does: verbatim, wherever they are, some of them for nothing."""
@@ -315,8 +317,8 @@ class Twins:
 
 
 EVENTS: tuple[Callable[[Twins], None], ...] = (
-    Twins._spawn, Twins._remove, Twins._place, Twins._become, Twins._throw, Twins._edit, Twins._edit, Twins._edit,
-    Twins._reload, Twins._unload, Twins._put, Twins._rewind,
+    Twins._spawn, Twins._spawn, Twins._remove, Twins._place, Twins._become, Twins._throw, Twins._edit, Twins._edit,
+    Twins._edit, Twins._reload, Twins._unload, Twins._put, Twins._rewind,
 )  # fmt: skip
 
 

@@ -1,11 +1,32 @@
-"""The world against the oracle in exact rationals, over random worlds; a failure names its seed."""
+"""The world against the oracle in exact rationals, over random worlds (see `tests.twins`); a failure names its seed."""
 
 import pytest
 
 from tests.twins import Twins
 
+BLOCKS = 10
+"""The seeds are dealt into so many tests, so that a failure and the time it takes are easy to find."""
 
-@pytest.mark.parametrize("block", range(4))
-def test_random_worlds(compiled: bool, block: int) -> None:
-    for seed in range(block * 20, block * 20 + 20):
+
+@pytest.mark.parametrize("block", range(3))
+def test_a_few_random_worlds(compiled: bool, block: int) -> None:
+    for seed in range(block * 25, block * 25 + 25):
         Twins(seed, compiled=compiled).run()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("block", range(BLOCKS))
+def test_thousands_of_small_worlds(compiled: bool, block: int) -> None:
+    count = 160 if compiled else 40
+    start = (10_000 if compiled else 20_000) + block * count
+    for seed in range(start, start + count):
+        Twins(seed, compiled=compiled).run()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("block", range(BLOCKS))
+def test_crowded_worlds(compiled: bool, block: int) -> None:
+    count = 10 if compiled else 3
+    start = (30_000 if compiled else 40_000) + block * count
+    for seed in range(start, start + count):
+        Twins(seed, compiled=compiled, bodies=50, ticks=40).run()
