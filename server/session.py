@@ -123,8 +123,12 @@ class Session:
         self.tick = -1
         self.snapshot_bytes = 0
         self.sees: set[Cell] = set()
-        self.fresh: set[Cell] = set()
+        self.knows: set[Cell] = set()
+        """What it saw when it was sent its latest snapshot;"""
         self.drops: list[Cell] = []
+        """what of that it no longer sees,"""
+        self.fresh: set[Cell] = set()
+        """and what it is to be sent whole."""
         self.terrain_due: deque[Cell] = deque()
         self.terrain_now: tuple[Cell, bytes, int] | None = None
         """The packed segment that is being sent, and how much of it has been."""
