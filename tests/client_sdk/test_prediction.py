@@ -1,0 +1,346 @@
+"""Two worlds of one client, in cases made by hand: what is replayed, what is counted, and what the result is."""
+
+from collections.abc import Iterable
+from typing import Any
+
+import msgpack
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from client_sdk.prediction import NONDETERMINISM, Prediction, check_scene
+from shared.checks import Cell
+from shared.edits import Edit
+from shared.inputs import NEUTRAL, Input
+from shared.messages import ProtocolError, Snapshot
+from shared.scene import Scene
+from shared.snapshot import checksum, encode_part
+from shared.world import World
+from tests.worlds import EAST, NORTH, scene
+
+ME, OTHER = 1, 2
+HERE, BESIDE = (0, 0, 0), (1, 0, 0)
+FLOOR = [0, 0, 0, 64, 32, 1, 1]
+
+
+def ground() -> Scene:
+    return scene([FLOOR], origin=(0, 0, 0), size=(2, 1, 1), spawns=((16.0, 16.0, 1.0),))
+
+
+class Pair:
+    """A server's world, and the prediction of the client whose entity is `ME`."""
+
+    def __init__(self, *others: tuple[float, float, float], **options: Any) -> None:
+        self.server = World(ground(), compiled=False)
+        self.server.load_terrain()
+        self.server.spawn("box", (16, 16, 1))
+        for place in others:
+            self.server.spawn("box", place)
+        self.client = Prediction(ground(), ME, compiled=False, **options)
+        for segment in (HERE, BESIDE):
+            self.client.load_segment(segment, self.server.blocks.segment(segment).reshape(-1))
+        self.settle()
+        self.tell(since=-1)
+        self.client.begin(self.server.tick)
+
+    def settle(self) -> None:
+        for _ in range(4):
+            self.server.step()
+
+    def ahead(self, *wishes: Input) -> None:
+        """The client predicts these."""
+        for wish in wishes:
+            self.client.file(self.client.predicted.tick + 1, wish)
+            self.client.step()
+
+    def act(self, *wishes: Input, others: Input = NEUTRAL) -> None:
+        """The server plays these."""
+        for wish in wishes:
+            self.server.step({e: wish if e == ME else others for e in self.server.entities["id"].tolist()})
+
+    def tell(self, since: int = 0, segments: Iterable[Cell] = (HERE, BESIDE), **fields: Any) -> str:
+        """The client applies all that is there, of these segments."""
+        parts = [
+            msgpack.unpackb(encode_part(segment, since, self.server.in_segment(segment), **fields))
+            for segment in segments
+        ]
+        return self.client.apply(snapshot(self.server.tick, parts))
+
+    def reconcile(self, *, late: bool = False) -> Any:
+        done = self.client.reconcile(late)
+        assert self.client.predicted.tick >= self.client.confirmed.tick
+        return done
+
+    def assert_agreed(self) -> None:
+        """Confirmed is the server's world, to the bit."""
+        assert self.client.confirmed.state_hash() == self.server.state_hash()
+
+
+def snapshot(tick: int, parts: list[Any], drops: Iterable[Cell] = ()) -> Snapshot:
+    return Snapshot(tick, -1, b"", -1, b"", b"", np.array(list(drops), "<i4").tobytes(), tuple(parts))
+
+
+# -- the prediction stands -----------------------------------------------------------------------------------
+
+
+def test_a_right_prediction_is_left_alone() -> None:
+    pair = Pair((20, 20, 1))
+    pair.ahead(EAST, NORTH, EAST, EAST)
+    pair.act(EAST, NORTH)
+    before = pair.client.predicted.state_hash()
+    pair.tell()
+    done = pair.reconcile()
+    assert (done.correction, done.repredicted, done.replayed, done.offsets) == (None, False, 0, {})
+    assert pair.client.predicted.state_hash() == before
+    pair.assert_agreed()
+
+
+def test_a_snapshot_is_compared_once() -> None:
+    pair = Pair()
+    pair.ahead(EAST)
+    pair.act(NORTH)
+    pair.tell()
+    assert pair.reconcile(late=True).correction
+    assert pair.reconcile(late=True).correction is None
+
+
+def test_before_it_has_begun_and_behind_the_server_nothing_is_compared() -> None:
+    pair = Pair()
+    pair.act(EAST, EAST, EAST)
+    pair.tell()
+    done = pair.client.reconcile(late=False)
+    assert (done.correction, done.replayed) == (None, 0)
+
+
+def test_a_rehearsal_changes_nothing() -> None:
+    pair = Pair((17, 16, 1))
+    pair.ahead(*[EAST] * 9)
+    before = pair.client.predicted.state_hash()
+    pair.client.rehearse()
+    assert pair.client.predicted.state_hash() == before
+
+
+# -- it does not ---------------------------------------------------------------------------------------------
+
+
+def test_a_wall_that_the_client_lacks_corrects_it_to_the_bit_and_is_counted() -> None:
+    pair = Pair()
+    pair.server.set_block(17, 16, 1, 4)  # the box ends at 16.625
+    pair.ahead(*[EAST] * 20)
+    pair.act(*[EAST] * 10)
+    pair.tell()
+    done = pair.reconcile()
+    correction = done.correction
+    assert correction is not None
+    assert (correction.tick, correction.ticks) == (pair.server.tick, 10)
+    assert correction.fields == ("x", "vx")
+    assert correction.blocks == 10 * 3 / 64 - 3 / 8
+    assert (done.replayed, done.repredicted) == (10, False)
+    # It knows nothing of the wall yet, so it walks on from there; with the edit it does not.
+    assert pair.client.predicted.position(ME)[0] == 17 - 5 / 8 + 10 * 3 / 64
+    pair.act(EAST)
+    pair.tell(edits=[(1 << 10 | 16 << 5 | 17, 4)], segments=[HERE])
+    assert pair.reconcile().correction.cause == "unknown edit"
+    assert pair.client.predicted.position(ME)[0] == 17 - 5 / 8
+    pair.assert_agreed()
+
+
+def test_after_a_correction_the_replay_is_what_the_server_will_compute() -> None:
+    pair = Pair()
+    wishes = [EAST, EAST, NORTH, EAST, NORTH, NORTH]
+    pair.ahead(*wishes)
+    pair.act(NORTH)  # an input that came too late
+    pair.tell()
+    done = pair.reconcile(late=True)
+    assert done.correction.cause == "late input"
+    assert set(done.offsets) == {ME}
+    pair.act(*wishes[1:])
+    assert pair.client.predicted.state_hash() == pair.server.state_hash()
+
+
+def test_another_ones_new_input_is_predicted_anew_and_no_correction() -> None:
+    pair = Pair((20, 20, 1))
+    pair.ahead(EAST, EAST, EAST)
+    pair.act(EAST, others=NORTH)
+    pair.tell()
+    done = pair.reconcile()
+    assert (done.correction, done.repredicted, done.replayed, set(done.offsets)) == (None, True, 2, {OTHER})
+    pair.act(EAST, EAST, others=NORTH)
+    assert pair.client.predicted.state_hash() == pair.server.state_hash()
+
+
+def test_a_correction_by_another_one_says_so() -> None:
+    pair = Pair((16.75, 16, 1))  # an eighth of a block away
+    pair.ahead(*[EAST] * 8)
+    pair.act(*[EAST] * 8, others=EAST)
+    pair.tell()
+    assert pair.reconcile().correction.cause == "other entity"
+
+
+def test_a_correction_that_nothing_explains_is_an_alarm() -> None:
+    pair = Pair()
+    pair.ahead(EAST, EAST)
+    pair.act(NORTH)
+    pair.tell()
+    assert pair.reconcile().correction.cause == NONDETERMINISM
+
+
+def test_what_the_rules_did_is_named_and_the_picture_may_jump() -> None:
+    pair = Pair()
+    pair.ahead(EAST, EAST)
+    pair.server.place(ME, (5, 5, 1))
+    pair.act(EAST)
+    pair.tell(acted={ME})
+    done = pair.reconcile()
+    assert (done.correction.cause, ME in done.acted) == ("server act", True)
+    pair.ahead(EAST)
+    pair.act(EAST)
+    pair.tell()
+    assert pair.reconcile().acted == frozenset()
+
+
+def test_when_the_own_entity_is_not_there_others_go_on() -> None:
+    pair = Pair((20, 20, 1))
+    pair.ahead(EAST, EAST, EAST)
+    pair.server.remove(ME)
+    pair.act(NEUTRAL, others=NORTH)
+    pair.tell(gone=[ME], segments=[HERE])
+    done = pair.reconcile()
+    assert (done.correction, ME in pair.client.predicted, OTHER in pair.client.predicted) == (None, False, True)
+    pair.ahead(EAST)
+    pair.assert_agreed()
+
+
+# -- interest ------------------------------------------------------------------------------------------------
+
+
+def test_a_keyframe_removes_whom_it_does_not_mention_but_only_there() -> None:
+    pair = Pair((20, 20, 1), (40, 20, 1), (41, 22, 1))
+    for entity in (2, 3):
+        pair.server.remove(entity)
+    pair.act(NEUTRAL)
+    pair.tell(since=-1, segments=[HERE])
+    assert pair.client.confirmed.entities["id"].tolist() == [1, 3, 4]
+    pair.tell(since=-1, segments=[BESIDE])
+    pair.assert_agreed()
+
+
+def test_who_left_for_a_segment_that_is_not_seen_is_gone_and_one_that_came_is_not() -> None:
+    pair = Pair((20, 20, 1), (22, 22, 1))
+    pair.server.place(2, (40, 20, 1))
+    pair.act(NEUTRAL)
+    pair.tell(segments=[HERE], gone=[2])
+    assert pair.client.confirmed.entities["id"].tolist() == [1, 3]
+    pair.act(NEUTRAL)
+    pair.tell(segments=[HERE, BESIDE], gone=[2])  # a word of old: in the segment beside it is there
+    pair.assert_agreed()
+
+
+def test_a_dropped_segment_is_forgotten_with_all_that_is_in_it() -> None:
+    pair = Pair((20, 20, 1), (40, 20, 1))
+    pair.act(NEUTRAL)
+    pair.client.apply(snapshot(pair.server.tick, [], drops=[BESIDE]))
+    assert pair.client.confirmed.entities["id"].tolist() == [1, 2]
+    assert list(pair.client.confirmed.blocks) == [HERE]
+    assert not pair.client.grounded()
+
+
+def test_who_walks_out_of_a_dropped_segment_into_a_seen_one_stays() -> None:
+    pair = Pair((40, 20, 1))
+    pair.server.place(OTHER, (20, 20, 1))
+    pair.act(NEUTRAL)
+    part = msgpack.unpackb(encode_part(HERE, 3, pair.server.in_segment(HERE)))
+    pair.client.apply(snapshot(pair.server.tick, [part], drops=[BESIDE]))
+    assert pair.client.confirmed.states().tolist() == pair.server.states().tolist()
+
+
+def test_terrain_that_comes_is_a_reason_to_replay() -> None:
+    pair = Pair()
+    pair.ahead(EAST, EAST)
+    pair.act(EAST)
+    pair.client.load_segment(BESIDE, np.zeros(32768, np.uint8))
+    pair.tell()
+    done = pair.reconcile()
+    assert (done.correction, done.repredicted, done.replayed) == (None, True, 1)
+    assert pair.client.predicted.blocks.get(40, 16, 0) == 0
+
+
+def test_a_copy_that_is_not_the_servers_is_noticed() -> None:
+    pair = Pair()
+    pair.act(EAST)
+    assert pair.tell(segments=[HERE], check=checksum(pair.server, HERE)) == ""
+    pair.server.set_block(9, 9, 9, 1)  # and nobody says so
+    pair.act(EAST)
+    assert "(0, 0, 0)" in pair.tell(segments=[HERE], check=checksum(pair.server, HERE))
+
+
+# -- edits ---------------------------------------------------------------------------------------------------
+
+
+def test_an_edit_is_there_at_once_and_again_after_a_replay() -> None:
+    pair = Pair()
+    pair.client.edit(1, Edit(17, 16, 1, 4))
+    pair.ahead(*[EAST] * 12)
+    assert pair.client.predicted.position(ME)[0] == 17 - 5 / 8
+    pair.client.rehearse()
+    assert pair.client.predicted.position(ME)[0] == 17 - 5 / 8
+    assert pair.client.confirmed.blocks.get(17, 16, 1) == 0
+
+
+def test_an_edit_that_was_refused_is_undone_with_all_it_did() -> None:
+    pair = Pair()
+    pair.client.edit(1, Edit(17, 16, 1, 4))
+    pair.ahead(*[EAST] * 12)
+    pair.act(EAST)
+    pair.client.settle(1, done=False)
+    pair.tell()
+    assert pair.reconcile().replayed == 11
+    assert pair.client.predicted.blocks.get(17, 16, 1) == 0
+    assert pair.client.predicted.position(ME)[0] == 16 + 12 * 3 / 64
+
+
+# -- without neighbours --------------------------------------------------------------------------------------
+
+
+def test_without_neighbours_only_the_own_entity_is_predicted_and_compared() -> None:
+    pair = Pair((20, 20, 1), neighbours=False)
+    pair.ahead(EAST, EAST)
+    assert pair.client.predicted.entities["id"].tolist() == [ME]
+    pair.act(EAST, others=NORTH)
+    pair.tell()
+    assert pair.reconcile().replayed == 0
+    pair.assert_agreed()
+
+
+# -- malformed -----------------------------------------------------------------------------------------------
+
+
+def test_a_malformed_part_changes_nothing() -> None:
+    pair = Pair((20, 20, 1))
+    before = pair.client.confirmed.state_hash()
+    pair.act(EAST)
+    good = msgpack.unpackb(encode_part(HERE, 0, pair.server.in_segment(HERE)))
+    with pytest.raises(ProtocolError):
+        pair.client.apply(snapshot(pair.server.tick, [good, [*good[:4], bytes(33), *good[5:]]], drops=[BESIDE]))
+    assert pair.client.confirmed.state_hash() == before
+
+
+TABLES = st.dictionaries(
+    st.sampled_from(sorted(ground().to_table())),
+    st.recursive(
+        st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=5) | st.binary(max_size=5),
+        lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=5), inner, max_size=3),
+        max_leaves=6,
+    ),
+    max_size=3,
+)
+
+
+@settings(derandomize=True, deadline=None)
+@given(TABLES)
+def test_any_table_is_a_scene_or_a_protocol_error(changes: dict[str, Any]) -> None:
+    try:
+        assert check_scene(ground().to_table() | changes).fingerprint
+    except ProtocolError as error:
+        assert str(error).startswith("Welcome.scene: ")  # noqa: PT017
