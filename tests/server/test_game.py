@@ -1,4 +1,4 @@
-"""Clients come, play, misbehave and go; the tick goes on."""
+"""The tick: who comes and goes, slow links, any client; it goes on."""
 
 import random
 from typing import Any
@@ -7,258 +7,26 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from server.game import Game
 from server.limits import Limits
 from server.replication import HISTORY
-from server.session import Session
-from shared import edits, messages
-from shared.edits import Edit
+from shared import messages
 from shared.messages import (
     Bye,
     Command,
-    Hello,
     Inputs,
-    Message,
     Ping,
-    Pong,
     Resync,
     Snapshot,
     Terrain,
-    Welcome,
-    decode_from_server,
     encode,
 )
-from tests.worlds import EAST, STEP, scene
-
-HELLO = Hello(messages.VERSION, {}, "")
-FLOOR = [[0, 0, 0, 32, 32, 1, 1]]
-
-
-class FakeLink:
-    """Keeps what it is sent; may call back while it is being closed, as a link is free to do."""
-
-    def __init__(self, table: "Table", *, calls_back: bool = False) -> None:
-        self.table = table
-        self.calls_back = calls_back
-        self.sent: list[Message] = []
-        self.closings: list[tuple[int, str]] = []
-        self.waiting = 0
-        self.session: Session
-
-    def send(self, message: bytes) -> None:
-        assert len(message) <= messages.MESSAGE_MAX
-        self.sent.append(decode_from_server(message))
-
-    def outstanding(self) -> int:
-        return self.waiting
-
-    def close(self, code: int, reason: str) -> None:
-        self.closings.append((code, reason))
-        if self.calls_back:
-            self.table.game.lost(self.session, self.table.now)
-
-    def say(self, *said: Message | bytes) -> None:
-        for message in said:
-            data = message if isinstance(message, bytes) else encode(message)
-            self.table.game.receive(self.session, data, self.table.now)
-
-    def got(self, kind: type[Any]) -> list[Any]:
-        return [message for message in self.sent if isinstance(message, kind)]
-
-    def refusal(self) -> tuple[int, str]:
-        """With what it was closed, having been told the same in a `Bye`."""
-        ((code, reason),) = self.closings
-        assert self.sent[-1] == Bye(code, reason, -1.0)
-        return code, reason
-
-
-class Table:
-    """A game and its time."""
-
-    def __init__(self, limits: Limits | None = None, fill: list[list[int]] = FLOOR, **changes: Any) -> None:
-        values: dict[str, Any] = {"origin": (0, 0, 0), "size": (1, 1, 1), "spawns": ((16.0, 16.0, 1.0),)}
-        self.game = Game(scene(fill, **(values | changes)), limits=limits, compiled=False)
-        self.now = 0.0
-        self.tick_s = 1 / self.game.scene.tick_rate
-
-    def connect(self, *said: Message | bytes, calls_back: bool = False) -> FakeLink:
-        link = FakeLink(self, calls_back=calls_back)
-        link.session = self.game.open(link, self.now)
-        link.say(*said)
-        return link
-
-    def join(self) -> FakeLink:
-        link = self.connect(HELLO)
-        self.tick()
-        assert link.session.entity
-        return link
-
-    def tick(self, n: int = 1) -> None:
-        for _ in range(n):
-            self.now += self.tick_s
-            self.game.tick(self.now, self.now)
-
-    def lose(self, link: FakeLink) -> None:
-        self.game.lost(link.session, self.now)
-
-    @property
-    def tick_number(self) -> int:
-        return self.game.world.tick
+from tests.tables import HELLO, FakeLink, Table, gone, ids, order
+from tests.worlds import EAST, STEP
 
 
 @pytest.fixture
 def table() -> Table:
     return Table()
-
-
-# -- the handshake -------------------------------------------------------------------------------------------
-
-
-def test_who_says_hello_is_welcomed_and_shown_the_world_in_the_next_tick(table: Table) -> None:
-    link = table.connect(HELLO)
-    assert (link.sent, len(table.game.world)) == ([], 0)
-    table.tick()
-    welcome, snapshot, terrain = link.sent[:3]
-    assert welcome == Welcome(1, 0, 1, table.game.scene.to_table())
-    assert isinstance(snapshot, Snapshot)
-    assert isinstance(terrain, Terrain)
-    assert (snapshot.tick, snapshot.newest, len(snapshot.fates), len(snapshot.segments)) == (1, -1, 1, 1)
-    table.tick()
-    assert link.got(Snapshot)[-1].tick == 2
-    assert table.game.counters.joined == 1
-
-
-def test_a_client_of_another_version_is_told_which_one_is_spoken(table: Table) -> None:
-    code, reason = table.connect(Hello(7, {}, "")).refusal()
-    assert (code, reason) == (messages.WRONG_VERSION, "protocol version 7: this server speaks 1")
-
-
-def test_a_client_of_the_same_scene_may_say_so(table: Table) -> None:
-    link = table.connect(Hello(1, table.game.scene.digests, ""))
-    table.tick()
-    assert link.session.entity
-
-
-def test_a_client_of_another_scene_is_told_which_fields_differ(table: Table) -> None:
-    other = scene(gravity=9.0, tick_rate=32, origin=(0, 0, 0), size=(1, 1, 1), spawns=((16.0, 16.0, 1.0),))
-    code, reason = table.connect(Hello(1, other.digests, "")).refusal()
-    assert (code, reason) == (messages.WRONG_SCENE, "another scene: gravity, terrain, tick_rate differ(s)")
-
-
-def test_a_field_that_only_one_side_has_differs_too(table: Table) -> None:
-    mine = table.game.scene.digests
-    code, reason = table.connect(Hello(1, mine | {"wind": b"1"}, "")).refusal()
-    assert (code, reason) == (messages.WRONG_SCENE, "another scene: wind differ(s)")
-    long = {f"{i:02}" + "x" * 200: b"" for i in range(32)}
-    assert len(table.connect(Hello(1, long, "")).refusal()[1]) <= messages.REASON_MAX
-
-
-@pytest.mark.parametrize(
-    "said",
-    [
-        (HELLO, HELLO), (Inputs(1, -1, bytes(3)),), (Command(1, 1, 0.0, "edit", b""),), (Resync(),),
-        (HELLO, Inputs(1, -1, bytes(3))), (b"",), (b"\xff" * 40,), (bytes(9000),), (encode(Pong(1.0, 1.0)),),
-    ],
-    ids=lambda said: f"{said}"[:40],
-)  # fmt: skip
-def test_what_is_out_of_place_or_malformed_ends_the_connection(table: Table, said: tuple[Message | bytes, ...]) -> None:
-    link = table.connect(*said)
-    code, reason = link.refusal()
-    assert code == messages.MALFORMED
-    assert reason
-    link.say(HELLO, b"and more")
-    table.tick(2)
-    assert len(link.closings) == 1
-    assert table.game.counters.kicked == 1
-
-
-def test_hello_in_the_middle_of_the_game_ends_it(table: Table) -> None:
-    link = table.join()
-    link.say(HELLO)
-    assert link.refusal() == (messages.MALFORMED, "Hello at this point")
-
-
-def test_goodbye_is_answered_by_closing(table: Table) -> None:
-    link = table.join()
-    link.say(Bye(1000, "", -1.0), Ping(1.0))
-    assert link.closings == [(messages.GOING_AWAY, "goodbye")]
-    assert link.got(Pong) == []
-
-
-def test_a_ping_is_answered_with_the_time_before_and_after_joining(table: Table) -> None:
-    table.tick(3)
-    link = table.connect(Ping(0.5))
-    table.now += table.tick_s / 4
-    link.say(Ping(-7))
-    assert link.sent == [Pong(0.5, 3.0), Pong(-7, 3.25)]
-
-
-# -- limits --------------------------------------------------------------------------------------------------
-
-
-def test_a_full_server_refuses_and_is_not_full_any_more_when_someone_leaves() -> None:
-    table = Table(Limits(clients_max=2))
-    first, _ = table.connect(), table.connect()
-    assert table.connect().refusal() == (messages.FULL, "the server is full (2 clients)")
-    table.lose(first)
-    assert table.connect().closings == []  # who was refused and has not hung up yet takes no place
-
-
-def test_with_no_room_to_spawn_one_is_refused() -> None:
-    table = Table(fill=[[0, 0, 0, 32, 32, 32, 1]], spawns=((16.0, 16.0, 16.0),))
-    link = table.connect(HELLO)
-    table.tick()
-    assert link.refusal() == (messages.FULL, "no room to spawn")
-    assert len(table.game.world) == 0
-
-
-def test_no_two_players_share_a_place(table: Table) -> None:
-    links = [table.connect(HELLO) for _ in range(12)]
-    table.tick(12)
-    places = {table.game.world.position(link.session.entity) for link in links}
-    assert len(places) == 12
-
-
-def test_who_does_not_say_hello_is_closed_even_while_pinging() -> None:
-    table = Table(Limits(hello_s=1.0))
-    link = table.connect()
-    for _ in range(64):
-        link.say(Ping(0.0))
-        table.tick()
-        assert not link.closings
-    table.tick()
-    assert link.refusal() == (messages.NO_HELLO, "no hello within 1 s")
-
-
-def test_who_says_nothing_any_more_is_closed_and_who_pings_is_not() -> None:
-    table = Table(Limits(silence_s=1.0))
-    silent, alive = table.join(), table.join()
-    for _ in range(70):
-        alive.say(Ping(0.0))
-        table.tick()
-    assert silent.refusal() == (messages.TOO_SLOW, "nothing heard for 1 s")
-    assert alive.closings == []
-
-
-def test_who_reads_nothing_is_closed() -> None:
-    table = Table(Limits(stalled_s=1.0))
-    link = table.join()
-    link.waiting = 1 << 20
-    for _ in range(66):
-        link.say(Ping(0.0))
-        table.tick()
-    assert link.refusal() == (messages.TOO_SLOW, "nothing read for 1 s")
-
-
-def test_a_flood_of_messages_is_closed_and_a_burst_is_not() -> None:
-    table = Table(Limits(messages_per_tick=4))
-    link = table.join()
-    for _ in range(3):
-        link.say(*[Ping(0.0)] * 128)
-        assert link.closings == []
-        table.tick(32)  # the allowance is back
-    link.say(*[Ping(0.0)] * 129)
-    assert link.refusal() == (messages.MALFORMED, "too many messages")
 
 
 # -- the tick ------------------------------------------------------------------------------------------------
@@ -411,85 +179,6 @@ def test_an_endless_plea_for_everything_anew_is_granted_rarely(table: Table) -> 
     assert table.game.counters.terrain_bytes - before < 3 * len(table.game.log.packed((0, 0, 0)))
 
 
-# -- commands ------------------------------------------------------------------------------------------------
-
-
-def edit(number: int, tick: int, *block: int) -> Command:
-    return Command(number, tick, 0.0, edits.NAME, edits.pack(Edit(*block)))
-
-
-def builder(table: Table) -> FakeLink:
-    """A client that has been there long enough to have some edits free."""
-    link = table.join()
-    table.tick(64)
-    return link
-
-
-def verdicts(link: FakeLink) -> dict[int, int]:
-    told: dict[int, int] = {}
-    for snapshot in link.got(Snapshot):
-        for at in range(0, len(snapshot.verdicts), 5):
-            number = int.from_bytes(snapshot.verdicts[at : at + 4], "little")
-            assert number not in told
-            told[number] = snapshot.verdicts[at + 4]
-    return told
-
-
-def test_an_edit_is_carried_out_in_its_tick_and_answered(table: Table) -> None:
-    link = builder(table)
-    tick = table.tick_number
-    link.say(edit(1, tick + 2, 18, 16, 1, 5), edit(2, tick, 14, 16, 1, 6))
-    table.tick()
-    assert table.game.world.blocks.get(18, 16, 1) == 0
-    table.tick()
-    assert [table.game.world.blocks.get(*at) for at in ((18, 16, 1), (14, 16, 1))] == [5, 6]
-    assert verdicts(link) == {1: messages.DONE, 2: messages.DONE}
-
-
-def test_each_edit_that_cannot_be_done_says_why(table: Table) -> None:
-    link = builder(table)
-    link.say(
-        edit(1, 0, 16, 16, 1, 5),
-        edit(2, 0, 30, 16, 1, 5),
-        edit(3, 0, 16, 16, -3, 5),
-        Command(4, 0, 0.0, edits.NAME, b"\xff"),
-        Command(5, 0, 0.0, "fly", b""),
-        edit(6, table.tick_number + 100, 18, 16, 1, 5),
-    )
-    table.tick(2)
-    told = verdicts(link)
-    assert told[1] in (messages.OVERLAPS, messages.DONE)
-    assert told[2] == messages.OUT_OF_REACH
-    assert {told[number] for number in (3, 4, 5)} == {messages.INVALID}
-    assert told[6] == messages.TOO_MANY
-
-
-def test_a_command_counts_once(table: Table) -> None:
-    link = builder(table)
-    link.say(edit(5, 0, 18, 16, 1, 5), edit(5, 0, 18, 16, 1, 0), edit(4, 0, 18, 16, 1, 0))
-    table.tick(2)
-    assert (verdicts(link), table.game.world.blocks.get(18, 16, 1)) == ({5: messages.DONE}, 5)
-
-
-def test_commands_are_bounded_in_number_and_rate() -> None:
-    table = Table(Limits(commands_waiting_max=4, edits_per_s=1.0))
-    link = table.join()
-    tick = table.tick_number
-    link.say(*[edit(n, tick + 2, 18, 16, 1 + n, 5) for n in range(1, 9)])
-    assert len(link.session.commands) == 4
-    table.tick(3)
-    assert sorted(verdicts(link)) == list(range(1, 9))
-    assert [verdicts(link)[n] for n in range(5, 9)] == [messages.TOO_MANY] * 4
-    assert sum(verdict == messages.DONE for verdict in verdicts(link).values()) <= 1
-
-
-def test_what_a_client_ordered_before_it_was_closed_is_not_carried_out(table: Table) -> None:
-    link = table.join()
-    link.say(edit(1, table.tick_number + 1, 18, 16, 1, 5), b"\xff")
-    table.tick(2)
-    assert table.game.world.blocks.get(18, 16, 1) == 0
-
-
 # -- any client ----------------------------------------------------------------------------------------------
 
 spoken = st.one_of(
@@ -500,7 +189,7 @@ spoken = st.one_of(
     ),
     st.builds(Ping, st.floats(allow_nan=False, allow_infinity=False)).map(encode),
     st.builds(
-        lambda number, tick, *block: encode(edit(number, tick, *block)),
+        lambda number, tick, *block: encode(order(number, tick, *block)),
         st.integers(0, 50), st.integers(-1, 200), *[st.integers(-40, 40)] * 3, st.integers(0, 255),
     ),
     st.builds(Command, st.integers(0, 50), st.integers(-1, 90), st.floats(0, 99), st.text(max_size=9), st.binary()).map(
@@ -563,7 +252,7 @@ def play(seed: int) -> list[bytes]:
             x, y, z = (int(part) for part in table.game.world.position(link.session.entity))
             rows = bytes(rng.randrange(256) for _ in range(3 * rng.randrange(5)))
             block = (x + rng.randint(-3, 3), y + rng.randint(-3, 3), z + rng.randint(-2, 2))
-            link.say(Inputs(tick + rng.randrange(6), -1, rows), edit(tick, tick + 1, *block, rng.randrange(3)))
+            link.say(Inputs(tick + rng.randrange(6), -1, rows), order(tick, tick + 1, *block, rng.randrange(3)))
             if rng.random() < 0.05:
                 table.lose(link)
                 links.remove(link)
@@ -575,14 +264,3 @@ def play(seed: int) -> list[bytes]:
 def test_the_same_seed_gives_the_same_game() -> None:
     assert play(3) == play(3)
     assert play(3)[-1] != play(4)[-1]
-
-
-def ids(snapshot: Snapshot) -> list[int]:
-    """Who is told of, without regard to segments."""
-    rows = b"".join(part[4] for part in snapshot.segments)
-    return [int.from_bytes(rows[at : at + 4], "little") for at in range(0, len(rows), 33)]
-
-
-def gone(snapshot: Snapshot) -> list[int]:
-    packed = b"".join(part[5] for part in snapshot.segments)
-    return [int.from_bytes(packed[at : at + 4], "little") for at in range(0, len(packed), 4)]

@@ -1,0 +1,91 @@
+"""What clients order: carried out in its tick, bounded, answered."""
+
+import pytest
+
+from server.limits import Limits
+from shared import edits, messages
+from shared.messages import (
+    Command,
+    Snapshot,
+)
+from tests.tables import FakeLink, Table, order
+
+
+@pytest.fixture
+def table() -> Table:
+    return Table()
+
+
+# -- commands ------------------------------------------------------------------------------------------------
+
+
+def builder(table: Table) -> FakeLink:
+    """A client that has been there long enough to have some edits free."""
+    link = table.join()
+    table.tick(64)
+    return link
+
+
+def verdicts(link: FakeLink) -> dict[int, int]:
+    told: dict[int, int] = {}
+    for snapshot in link.got(Snapshot):
+        for at in range(0, len(snapshot.verdicts), 5):
+            number = int.from_bytes(snapshot.verdicts[at : at + 4], "little")
+            assert number not in told
+            told[number] = snapshot.verdicts[at + 4]
+    return told
+
+
+def test_an_edit_is_carried_out_in_its_tick_and_answered(table: Table) -> None:
+    link = builder(table)
+    tick = table.tick_number
+    link.say(order(1, tick + 2, 18, 16, 1, 5), order(2, tick, 14, 16, 1, 6))
+    table.tick()
+    assert table.game.world.blocks.get(18, 16, 1) == 0
+    table.tick()
+    assert [table.game.world.blocks.get(*at) for at in ((18, 16, 1), (14, 16, 1))] == [5, 6]
+    assert verdicts(link) == {1: messages.DONE, 2: messages.DONE}
+
+
+def test_each_edit_that_cannot_be_done_says_why(table: Table) -> None:
+    link = builder(table)
+    link.say(
+        order(1, 0, 16, 16, 1, 5),
+        order(2, 0, 30, 16, 1, 5),
+        order(3, 0, 16, 16, -3, 5),
+        Command(4, 0, 0.0, edits.NAME, b"\xff"),
+        Command(5, 0, 0.0, "fly", b""),
+        order(6, table.tick_number + 100, 18, 16, 1, 5),
+    )
+    table.tick(2)
+    told = verdicts(link)
+    assert told[1] in (messages.OVERLAPS, messages.DONE)
+    assert told[2] == messages.OUT_OF_REACH
+    assert {told[number] for number in (3, 4, 5)} == {messages.INVALID}
+    assert told[6] == messages.TOO_MANY
+
+
+def test_a_command_counts_once(table: Table) -> None:
+    link = builder(table)
+    link.say(order(5, 0, 18, 16, 1, 5), order(5, 0, 18, 16, 1, 0), order(4, 0, 18, 16, 1, 0))
+    table.tick(2)
+    assert (verdicts(link), table.game.world.blocks.get(18, 16, 1)) == ({5: messages.DONE}, 5)
+
+
+def test_commands_are_bounded_in_number_and_rate() -> None:
+    table = Table(Limits(commands_waiting_max=4, edits_per_s=1.0))
+    link = table.join()
+    tick = table.tick_number
+    link.say(*[order(n, tick + 2, 18, 16, 1 + n, 5) for n in range(1, 9)])
+    assert len(link.session.commands) == 4
+    table.tick(3)
+    assert sorted(verdicts(link)) == list(range(1, 9))
+    assert [verdicts(link)[n] for n in range(5, 9)] == [messages.TOO_MANY] * 4
+    assert sum(verdict == messages.DONE for verdict in verdicts(link).values()) <= 1
+
+
+def test_what_a_client_ordered_before_it_was_closed_is_not_carried_out(table: Table) -> None:
+    link = table.join()
+    link.say(order(1, table.tick_number + 1, 18, 16, 1, 5), b"\xff")
+    table.tick(2)
+    assert table.game.world.blocks.get(18, 16, 1) == 0

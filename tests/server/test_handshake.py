@@ -1,0 +1,177 @@
+"""How clients come in, and the limits that end them."""
+
+import pytest
+
+from server.limits import Limits
+from shared import messages
+from shared.messages import (
+    Bye,
+    Command,
+    Hello,
+    Inputs,
+    Message,
+    Ping,
+    Pong,
+    Resync,
+    Snapshot,
+    Terrain,
+    Welcome,
+    encode,
+)
+from tests.tables import HELLO, Table
+from tests.worlds import scene
+
+
+@pytest.fixture
+def table() -> Table:
+    return Table()
+
+
+# -- the handshake -------------------------------------------------------------------------------------------
+
+
+def test_who_says_hello_is_welcomed_and_shown_the_world_in_the_next_tick(table: Table) -> None:
+    link = table.connect(HELLO)
+    assert (link.sent, len(table.game.world)) == ([], 0)
+    table.tick()
+    welcome, snapshot, terrain = link.sent[:3]
+    assert welcome == Welcome(1, 0, 1, table.game.scene.to_table())
+    assert isinstance(snapshot, Snapshot)
+    assert isinstance(terrain, Terrain)
+    assert (snapshot.tick, snapshot.newest, len(snapshot.fates), len(snapshot.segments)) == (1, -1, 1, 1)
+    table.tick()
+    assert link.got(Snapshot)[-1].tick == 2
+    assert table.game.counters.joined == 1
+
+
+def test_a_client_of_another_version_is_told_which_one_is_spoken(table: Table) -> None:
+    code, reason = table.connect(Hello(7, {}, "")).refusal()
+    assert (code, reason) == (messages.WRONG_VERSION, "protocol version 7: this server speaks 1")
+
+
+def test_a_client_of_the_same_scene_may_say_so(table: Table) -> None:
+    link = table.connect(Hello(1, table.game.scene.digests, ""))
+    table.tick()
+    assert link.session.entity
+
+
+def test_a_client_of_another_scene_is_told_which_fields_differ(table: Table) -> None:
+    other = scene(gravity=9.0, tick_rate=32, origin=(0, 0, 0), size=(1, 1, 1), spawns=((16.0, 16.0, 1.0),))
+    code, reason = table.connect(Hello(1, other.digests, "")).refusal()
+    assert (code, reason) == (messages.WRONG_SCENE, "another scene: gravity, terrain, tick_rate differ(s)")
+
+
+def test_a_field_that_only_one_side_has_differs_too(table: Table) -> None:
+    mine = table.game.scene.digests
+    code, reason = table.connect(Hello(1, mine | {"wind": b"1"}, "")).refusal()
+    assert (code, reason) == (messages.WRONG_SCENE, "another scene: wind differ(s)")
+    long = {f"{i:02}" + "x" * 200: b"" for i in range(32)}
+    assert len(table.connect(Hello(1, long, "")).refusal()[1]) <= messages.REASON_MAX
+
+
+@pytest.mark.parametrize(
+    "said",
+    [
+        (HELLO, HELLO), (Inputs(1, -1, bytes(3)),), (Command(1, 1, 0.0, "edit", b""),), (Resync(),),
+        (HELLO, Inputs(1, -1, bytes(3))), (b"",), (b"\xff" * 40,), (bytes(9000),), (encode(Pong(1.0, 1.0)),),
+    ],
+    ids=lambda said: f"{said}"[:40],
+)  # fmt: skip
+def test_what_is_out_of_place_or_malformed_ends_the_connection(table: Table, said: tuple[Message | bytes, ...]) -> None:
+    link = table.connect(*said)
+    code, reason = link.refusal()
+    assert code == messages.MALFORMED
+    assert reason
+    link.say(HELLO, b"and more")
+    table.tick(2)
+    assert len(link.closings) == 1
+    assert table.game.counters.kicked == 1
+
+
+def test_hello_in_the_middle_of_the_game_ends_it(table: Table) -> None:
+    link = table.join()
+    link.say(HELLO)
+    assert link.refusal() == (messages.MALFORMED, "Hello at this point")
+
+
+def test_goodbye_is_answered_by_closing(table: Table) -> None:
+    link = table.join()
+    link.say(Bye(1000, "", -1.0), Ping(1.0))
+    assert link.closings == [(messages.GOING_AWAY, "goodbye")]
+    assert link.got(Pong) == []
+
+
+def test_a_ping_is_answered_with_the_time_before_and_after_joining(table: Table) -> None:
+    table.tick(3)
+    link = table.connect(Ping(0.5))
+    table.now += table.tick_s / 4
+    link.say(Ping(-7))
+    assert link.sent == [Pong(0.5, 3.0), Pong(-7, 3.25)]
+
+
+# -- limits --------------------------------------------------------------------------------------------------
+
+
+def test_a_full_server_refuses_and_is_not_full_any_more_when_someone_leaves() -> None:
+    table = Table(Limits(clients_max=2))
+    first, _ = table.connect(), table.connect()
+    assert table.connect().refusal() == (messages.FULL, "the server is full (2 clients)")
+    table.lose(first)
+    assert table.connect().closings == []  # who was refused and has not hung up yet takes no place
+
+
+def test_with_no_room_to_spawn_one_is_refused() -> None:
+    table = Table(fill=[[0, 0, 0, 32, 32, 32, 1]], spawns=((16.0, 16.0, 16.0),))
+    link = table.connect(HELLO)
+    table.tick()
+    assert link.refusal() == (messages.FULL, "no room to spawn")
+    assert len(table.game.world) == 0
+
+
+def test_no_two_players_share_a_place(table: Table) -> None:
+    links = [table.connect(HELLO) for _ in range(12)]
+    table.tick(12)
+    places = {table.game.world.position(link.session.entity) for link in links}
+    assert len(places) == 12
+
+
+def test_who_does_not_say_hello_is_closed_even_while_pinging() -> None:
+    table = Table(Limits(hello_s=1.0))
+    link = table.connect()
+    for _ in range(64):
+        link.say(Ping(0.0))
+        table.tick()
+        assert not link.closings
+    table.tick()
+    assert link.refusal() == (messages.NO_HELLO, "no hello within 1 s")
+
+
+def test_who_says_nothing_any_more_is_closed_and_who_pings_is_not() -> None:
+    table = Table(Limits(silence_s=1.0))
+    silent, alive = table.join(), table.join()
+    for _ in range(70):
+        alive.say(Ping(0.0))
+        table.tick()
+    assert silent.refusal() == (messages.TOO_SLOW, "nothing heard for 1 s")
+    assert alive.closings == []
+
+
+def test_who_reads_nothing_is_closed() -> None:
+    table = Table(Limits(stalled_s=1.0))
+    link = table.join()
+    link.waiting = 1 << 20
+    for _ in range(66):
+        link.say(Ping(0.0))
+        table.tick()
+    assert link.refusal() == (messages.TOO_SLOW, "nothing read for 1 s")
+
+
+def test_a_flood_of_messages_is_closed_and_a_burst_is_not() -> None:
+    table = Table(Limits(messages_per_tick=4))
+    link = table.join()
+    for _ in range(3):
+        link.say(*[Ping(0.0)] * 128)
+        assert link.closings == []
+        table.tick(32)  # the allowance is back
+    link.say(*[Ping(0.0)] * 129)
+    assert link.refusal() == (messages.MALFORMED, "too many messages")

@@ -1,0 +1,110 @@
+"""A game at a table: fake links that keep what they are sent, and a time that is told."""
+
+from typing import Any
+
+from server.game import Game
+from server.limits import Limits
+from server.session import Session
+from shared import edits, messages
+from shared.edits import Edit
+from shared.messages import (
+    Bye,
+    Command,
+    Hello,
+    Message,
+    Snapshot,
+    decode_from_server,
+    encode,
+)
+from tests.worlds import scene
+
+HELLO = Hello(messages.VERSION, {}, "")
+FLOOR = [[0, 0, 0, 32, 32, 1, 1]]
+
+
+class FakeLink:
+    """Keeps what it is sent; may call back while it is being closed, as a link is free to do."""
+
+    def __init__(self, table: "Table", *, calls_back: bool = False) -> None:
+        self.table = table
+        self.calls_back = calls_back
+        self.sent: list[Message] = []
+        self.closings: list[tuple[int, str]] = []
+        self.waiting = 0
+        self.session: Session
+
+    def send(self, message: bytes) -> None:
+        assert len(message) <= messages.MESSAGE_MAX
+        self.sent.append(decode_from_server(message))
+
+    def outstanding(self) -> int:
+        return self.waiting
+
+    def close(self, code: int, reason: str) -> None:
+        self.closings.append((code, reason))
+        if self.calls_back:
+            self.table.game.lost(self.session, self.table.now)
+
+    def say(self, *said: Message | bytes) -> None:
+        for message in said:
+            data = message if isinstance(message, bytes) else encode(message)
+            self.table.game.receive(self.session, data, self.table.now)
+
+    def got(self, kind: type[Any]) -> list[Any]:
+        return [message for message in self.sent if isinstance(message, kind)]
+
+    def refusal(self) -> tuple[int, str]:
+        """With what it was closed, having been told the same in a `Bye`."""
+        ((code, reason),) = self.closings
+        assert self.sent[-1] == Bye(code, reason, -1.0)
+        return code, reason
+
+
+class Table:
+    """A game and its time."""
+
+    def __init__(self, limits: Limits | None = None, fill: list[list[int]] = FLOOR, **changes: Any) -> None:
+        values: dict[str, Any] = {"origin": (0, 0, 0), "size": (1, 1, 1), "spawns": ((16.0, 16.0, 1.0),)}
+        self.game = Game(scene(fill, **(values | changes)), limits=limits, compiled=False)
+        self.now = 0.0
+        self.tick_s = 1 / self.game.scene.tick_rate
+
+    def connect(self, *said: Message | bytes, calls_back: bool = False) -> FakeLink:
+        link = FakeLink(self, calls_back=calls_back)
+        link.session = self.game.open(link, self.now)
+        link.say(*said)
+        return link
+
+    def join(self) -> FakeLink:
+        link = self.connect(HELLO)
+        self.tick()
+        assert link.session.entity
+        return link
+
+    def tick(self, n: int = 1) -> None:
+        for _ in range(n):
+            self.now += self.tick_s
+            self.game.tick(self.now, self.now)
+
+    def lose(self, link: FakeLink) -> None:
+        self.game.lost(link.session, self.now)
+
+    @property
+    def tick_number(self) -> int:
+        return self.game.world.tick
+
+
+def ids(snapshot: Snapshot) -> list[int]:
+    """Who is told of, without regard to segments."""
+    rows = b"".join(part[4] for part in snapshot.segments)
+    return [int.from_bytes(rows[at : at + 4], "little") for at in range(0, len(rows), 33)]
+
+
+def gone(snapshot: Snapshot) -> list[int]:
+    packed = b"".join(part[5] for part in snapshot.segments)
+    return [int.from_bytes(packed[at : at + 4], "little") for at in range(0, len(packed), 4)]
+
+
+def order(number: int, tick: int, *block: int) -> Command:
+    """The command to edit a block: x, y, z, kind."""
+    return Command(number, tick, 0.0, edits.NAME, edits.pack(Edit(*block)))
