@@ -8,8 +8,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from server import app
 from server.journal import FILL, MAGIC, PUT, REMOVE, DivergedError, JournalError, Moment, Recording, replay
 from server.recorder import RecordedWorld
+from server.settings import SettingsError
 from shared.inputs import Input
 from shared.world import OverlapError, World
 from tests import worlds
@@ -259,3 +261,19 @@ def test_a_replay_that_comes_out_otherwise_names_the_tick(tmp_path: Path, monkey
     with pytest.raises(DivergedError, match="entities that changed") as error:
         list(replay(path, compiled=False))
     assert error.value.tick == 12
+
+
+def test_the_server_records_into_a_new_file_only(tmp_path: Path) -> None:
+    scene, path = worlds.scene(FLOOR), tmp_path / "run"
+    with app.recorded(scene, str(path)) as world:
+        world.spawn("box", (0, 0, 3))
+        worlds.steps(world, 40)
+    moments = list(replay(path))
+    assert moments[-1].ended
+    assert moments[-1].world.state_hash() == world.state_hash()
+    before = path.read_bytes()
+    with pytest.raises(SettingsError, match="never overwritten"), app.recorded(scene, str(path)):
+        raise AssertionError
+    assert path.read_bytes() == before
+    with pytest.raises(SettingsError, match="cannot be written"), app.recorded(scene, str(tmp_path / "no" / "run")):
+        raise AssertionError

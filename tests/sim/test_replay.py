@@ -1,0 +1,208 @@
+"""A whole match is recorded and replayed to the same hashes: joins, leaves, falls into the void and edits included."""
+
+import importlib.util
+import io
+import random
+from pathlib import Path as File
+from types import ModuleType
+
+import pytest
+
+from client_sdk.core import Core
+from server.game import Game
+from server.journal import FILL, JournalError, Recording
+from server.recorder import RecordedWorld
+from shared.inputs import Input
+from shared.scene import load_scene
+from shared.world import World
+from tests.match import Match, Path, wander
+
+ROOT = File(__file__).resolve().parents[2]
+
+
+def to_the_pit(core: Core, rng: random.Random) -> Input:
+    """Walks to the pit that opens into the void, and on, again and again."""
+    assert core.prediction is not None
+    predicted = core.prediction.predicted
+    if core.entity not in predicted:
+        return Input()
+    x, y, _ = predicted.position(core.entity)
+    way = (55.5 - x, 55.5 - y)
+    length = max(abs(way[0]), abs(way[1]), 0.1)
+    return Input(int(90 * way[0] / length), int(90 * way[1] / length), int(rng.random() < 0.1))
+
+
+def build_and_dig(core: Core, rng: random.Random) -> Input:
+    """Wanders, and now and then sets or takes a block beside itself."""
+    assert core.prediction is not None
+    if core.entity in core.prediction.predicted and rng.random() < 0.1:
+        x, y, z = (int(part) for part in core.prediction.predicted.position(core.entity))
+        core.edit(x + rng.randint(-2, 2), y + rng.randint(-2, 2), z + rng.randint(-1, 2), rng.choice((0, 0, 3)))
+    return wander(core, rng)
+
+
+class Played:
+    """A recorded match of ten players and two more who come and go."""
+
+    def __init__(self, seconds: float = 40) -> None:
+        scene = load_scene("arena")
+        world = RecordedWorld(scene)
+        world.load_terrain()
+        self.file = io.BytesIO()
+        world.record(self.file)
+        match = Match(scene, 11)
+        match.game = Game(scene, world=world)
+        self.hashes: dict[int, bytes] = {}
+        self.ends: list[int] = []
+        match.on_tick.append(lambda: self.hashes.update({world.tick: world.state_hash()}))
+        match.on_tick.append(lambda: self.ends.append(len(self.file.getvalue())))
+        path = Path(0.03, 0.02)
+        players = [match.join(wander, path) for _ in range(8)]
+        players += [match.join(to_the_pit, path), match.join(build_and_dig, path)]
+        match.run(seconds / 4)
+        players[0].disconnect()
+        late = match.join(wander, path)
+        match.run(seconds / 4)
+        late.disconnect()
+        players[1].disconnect()
+        match.join(build_and_dig, path)
+        match.run(seconds / 2)
+        world.end_recording()
+        self.data = self.file.getvalue()
+        self.counters = match.game.counters
+
+
+@pytest.fixture(scope="module")
+def played() -> Played:
+    return Played()
+
+
+@pytest.mark.parametrize("compiled", [None, False], ids=["compiled", "plain"])
+def test_a_match_is_replayed_to_the_same_hash_at_every_tick(played: Played, compiled: bool | None) -> None:
+    found = {}
+    recording = Recording(io.BytesIO(played.data), compiled=compiled)
+    hashed = fills = 0
+    for moment in recording:
+        found[moment.world.tick] = moment.world.state_hash()
+        hashed += moment.hashed
+        fills += sum(call[0] == FILL for call in moment.calls)
+    assert found == played.hashes
+    assert hashed == len(found) // 32 + 2
+    assert fills > 20
+    assert (played.counters.joined, played.counters.left) == (12, 3)
+    assert played.counters.fell_out >= 2
+
+
+def test_the_last_records_broken_off_at_every_byte_leave_the_ticks_before(played: Played) -> None:
+    data, ends = played.data, played.ends
+    for size in range(ends[2], ends[4] + 1):  # early, where reading is quick: every byte
+        recording = Recording(io.BytesIO(data[:size]))
+        ticks = [moment.world.state_hash() for moment in recording]
+        whole = sum(end <= size for end in ends)
+        assert ticks == [played.hashes[tick] for tick in range(1, whole + 1)]
+        assert recording.torn == size - ends[whole - 1]
+    for size in range(ends[-2], len(data)):
+        recording = Recording(io.BytesIO(data[:size]))
+        assert sum(not moment.ended for moment in recording) == len(ends) - (size < ends[-1])
+
+
+def test_a_flipped_bit_anywhere_is_found(played: Played) -> None:
+    rng = random.Random(1)
+    for _ in range(30):
+        data = bytearray(played.data)
+        at = rng.randrange(8 * len(data))
+        data[at // 8] ^= 1 << at % 8
+        with pytest.raises(JournalError):
+            for _ in Recording(io.BytesIO(data)):
+                pass
+
+
+# -- the script ----------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def script() -> ModuleType:
+    spec = importlib.util.spec_from_file_location("replay_script", ROOT / "scripts" / "replay.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_the_script_says_that_all_is_as_recorded(
+    played: Played, script: ModuleType, tmp_path: File, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "match"
+    path.write_bytes(played.data)
+    assert script.main([str(path)]) == 0
+    said = capsys.readouterr().out
+    last = max(played.hashes)
+    assert f"{last:,} ticks as recorded, to tick {last}" in said
+    assert played.hashes[last].hex() in said
+    path.write_bytes(played.data[: played.ends[-1] - 1])
+    assert script.main([str(path)]) == 0
+    assert f"breaks off after tick {last - 1}" in capsys.readouterr().out
+
+
+def test_the_script_shows_a_neighbourhood(
+    played: Played, script: ModuleType, tmp_path: File, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "match"
+    path.write_bytes(played.data)
+    recording = Recording(io.BytesIO(played.data))
+    met = next(
+        (moment.world.tick, entity, moment.world.position(entity))
+        for moment in recording
+        if moment.world.tick > 100
+        for entity in moment.world.entities["id"].tolist()
+        if any("#" in text for text in script.contacts(moment.world, entity))
+    )
+    assert script.main([str(path), "--tick", str(met[0]), "--entity", str(met[1]), "--around", "2"]) == 0
+    said = capsys.readouterr().out
+    for text in (
+        f"around entity {met[1]}",
+        f"{met[2][0]:.6f}",
+        "#",
+        "below: block",
+        *map(str, range(met[0] - 2, met[0] + 3)),
+    ):
+        assert text in said
+    assert script.main([str(path), "--tick", str(met[0]), "--around", "0"]) == 0
+    assert "around entity" in capsys.readouterr().out
+    assert script.main([str(path), "--tick", "999999"]) == 2
+    assert "tick 999999 is not in this recording" in capsys.readouterr().err
+
+
+def test_the_script_names_the_tick_that_differs(
+    played: Played,
+    script: ModuleType,
+    tmp_path: File,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    path = tmp_path / "match"
+    path.write_bytes(played.data)
+    step = World.step
+
+    def slip(world: World, inputs: dict[int, Input]) -> None:
+        step(world, inputs)
+        if world.tick == 333:
+            state = list(world.state(2))
+            state[3] += 1
+            world.put([tuple(state)])
+
+    monkeypatch.setattr(World, "step", slip)
+    assert script.main([str(path)]) == 1
+    assert "differs at tick 33" in capsys.readouterr().out
+
+
+def test_the_script_refuses_what_is_no_recording(
+    script: ModuleType, tmp_path: File, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "text").write_text("hello", "utf-8")
+    assert script.main([str(tmp_path / "text")]) == 2
+    assert script.main([str(tmp_path / "nowhere")]) == 2
+    said = capsys.readouterr().err.splitlines()
+    assert "not a recording" in said[0]
+    assert "No such file" in said[1]
