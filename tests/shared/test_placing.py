@@ -174,3 +174,41 @@ def test_nobody_there(compiled: bool) -> None:
     ):
         with pytest.raises(KeyError):
             call()
+
+
+def test_many_at_once_are_as_one_by_one(compiled: bool) -> None:
+    spots = [(x / 2, y, 0.0) for x in range(-8, 8, 2) for y in range(-5, 5)]
+    worlds = [build([floor()], compiled=compiled) for _ in range(2)]
+    ids = worlds[0].spawn_many("cube", spots)
+    assert list(ids) == [worlds[1].spawn("cube", spot) for spot in spots]
+    for world in worlds:
+        world.spawn("box", (0, 0, 3))
+    for _ in range(60):
+        assert worlds[0].state_hash() == worlds[1].state_hash()
+        for world in worlds:
+            world.step()
+
+
+@pytest.mark.parametrize(
+    ("spots", "error"),
+    [
+        ([(0, 0, 0), (3, 0, 0), (0.5, 0, 0)], r"positions\[2\] = .*no room for a 'cube'"),  # in the first one
+        ([(0, 0, 0), (6, 0, 0)], r"positions\[1\] = .*no room"),  # in one that was there
+        ([(0, 0, 0), (0, 0, -0.5)], r"positions\[1\] = .*no room"),  # in a block
+        ([(0, 0, 0), (0, float("nan"), 3)], "positions"),
+        ([(0, 0, 0), (0, 0, 1e300)], "positions"),
+    ],
+)
+def test_many_at_once_or_none(compiled: bool, spots: list[tuple[float, float, float]], error: str) -> None:
+    world = build([floor()], compiled=compiled)
+    world.spawn("cube", (6.5, 0.5, 0))
+    settle(world)
+    before = world.state_hash()
+    with pytest.raises(SceneError, match=error):
+        world.spawn_many("cube", spots)
+    assert world.state_hash() == before
+    world.step()
+    assert world.awake_count == 0
+    assert list(world.spawn_many("cube", [(0, 0, 0), (1, 0, 0)])) == [2, 3]
+    world.step()
+    assert world.awake_count == 0

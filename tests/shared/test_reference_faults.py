@@ -9,7 +9,7 @@ from shared.inputs import NEUTRAL, Input, clamp, make_input
 from shared.terrain import generate
 from shared.units import BLOCK
 from shared.world import World
-from tests.worlds import EAST, JUMP, NORTH, TEMPLATES, WEST, around, build, floor, high, low, scene, settle, steps
+from tests.worlds import EAST, JUMP, NORTH, STEP, TEMPLATES, WEST, around, build, floor, high, low, scene, settle, steps
 
 RUN_AND_JUMP = Input(127, 0, 1)
 
@@ -43,16 +43,22 @@ def test_2_no_ghost_walls_at_seams(compiled: bool) -> None:
         assert world.position(entity)[2] == 0
 
 
-@pytest.mark.parametrize("spot", [(1, 0, 0), (-5 / 8, 0, 0), (0, 1, 0), (1, 1, 0), (-5 / 8, -5 / 8, 0)])
+@pytest.mark.parametrize("spot", [(1, 0, 0), (-5 / 8, 0, 0), (0, 1, 0), (0, -5 / 8, 0), (1, 1, 0), (-5 / 8, -5 / 8, 0)])
 def test_3_edges_and_corners_do_not_support(compiled: bool, spot: tuple[float, float, float]) -> None:
-    world = build([[0, 0, -1, 1, 1, 0, 1]], compiled=compiled)
-    entity = world.spawn("box", spot)
-    beside = world.spawn("box", (5, 5, 0))
-    on_entity = world.spawn("box", (5 + 5 / 8, 5, 7 / 4))
-    steps(world, 2)
-    assert world.falling(entity)
-    assert world.falling(beside)
-    assert world.falling(on_entity)
+    """Neither those of a block (0 to 1) nor those of an entity as wide; one grid step further in, both do."""
+    x, y, z = spot
+    inward = [(STEP if part < 0 else -STEP) if part else 0 for part in (x, y)]
+    world = build([[0, 0, -1, 1, 1, 0, 1], [5, 5, -1, 6, 6, 0, 1]], compiled=compiled)
+    cube = world.spawn("cube", (5, 5, 0))
+    beside = [world.spawn("box", at) for at in ((x, y, z), (5 + x, 5 + y, 1))]
+    for at, entity in zip(((0, 0, 0), (5, 5, 1)), beside, strict=True):
+        other = world.copy()
+        other.place(entity, (at[0] + x + inward[0], at[1] + y + inward[1], at[2]))
+        other.step()
+        assert not other.falling(entity)
+    world.step()
+    assert all(world.falling(entity) for entity in beside)
+    assert not world.falling(cube)
 
 
 def test_4_an_embedded_entity_is_not_thrown(compiled: bool) -> None:

@@ -201,3 +201,21 @@ def test_no_gravity_nothing_to_keep_awake(compiled: bool) -> None:
     world.place(entity, (0, 0, 4 - 7 / 4 - STEP))
     settle(world, 2)
     assert world.position(entity)[2] == 4 - 7 / 4 - STEP
+
+
+@pytest.mark.parametrize("spot", [(1 - STEP, 0), (STEP - 5 / 8, 0), (0, 1 - STEP), (0, STEP - 5 / 8)])
+@pytest.mark.parametrize("how", ["block", "removed", "walked away"])
+def test_held_by_a_single_grid_step(compiled: bool, spot: tuple[float, float], how: str) -> None:
+    world = build([floor(-1), [0, 0, -1, 1, 1, 0, 1]], compiled=compiled)
+    below = world.spawn("stone" if how == "block" else "cube", (0, 9, -1) if how == "block" else (0, 0, 0))
+    rider = world.spawn("box", (*spot, 0 if how == "block" else 1))
+    settle(world)
+    assert world.position(rider)[2] == (0 if how == "block" else 1)
+    if how == "block":
+        world.set_block(0, 0, -1, 0)
+    elif how == "removed":
+        world.remove(below)
+    else:
+        world.set_velocity(below, (-64 if spot[0] > 0 else 64, -64 if spot[1] > 0 else 64, 0))
+    world.step()
+    assert world.falling(rider)
