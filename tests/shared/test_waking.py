@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from shared import layout
+from shared.inputs import Input
 from shared.scene import Template
 from shared.world import World
 from tests.worlds import EAST, STEP, TEMPLATES, around, build, floor, high, scene, settle, steps
@@ -215,7 +216,6 @@ def test_held_by_a_single_grid_step(compiled: bool, spot: tuple[float, float], h
         world.set_block(0, 0, -1, 0)
     elif how == "removed":
         world.remove(below)
-    else:
-        world.set_velocity(below, (-64 if spot[0] > 0 else 64, -64 if spot[1] > 0 else 64, 0))
-    world.step()
+    x, y = ((part < 0) - (part > 0) for part in spot)
+    world.step({below: Input(127 * x, 127 * y)} if how == "walked away" else None)
     assert world.falling(rider)
