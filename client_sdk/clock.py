@@ -1,19 +1,31 @@
-"""When is it on the server, and how far ahead of it to live.
+r"""When is it on the server, and how far ahead of it to live.
 
 Theory of operation. Let a clock's phase be its tick minus `rate` times the local time: constant, but for drift.
 `ServerClock` estimates the server's phase from pings; of those, the third with the least round trip are the ones
 that stood in no queue, and their median is the estimate.
 
 An input for tick t is sent when the client's own *timeline* reaches t, and the server tells by how many ticks it
-was early: its margin. Margin minus the timeline's phase at that moment does not depend on where the timeline was,
-only on the path; so the client's own corrections cancel out of the measurement, exactly and at once, and the loop
-cannot oscillate however long the round trip is. `QuantileLead` keeps these and asks for the least phase at which
-(all but outliers of) them would have been on time; the timeline goes there: up at once, at most 10 % faster than
-real time, down slowly, and with a jump only where the way is longer than 10 ticks.
+was early: its margin. The timeline's phase at that moment minus the margin is the phase that would just have done:
+the input's *need*. It does not depend on where the timeline was, only on the path; so the client's own corrections
+cancel out of the measurement, exactly and at once, and the loop cannot oscillate however long the round trip is.
+
+`QuantileLead` splits a need into the *base*, which is the path as it is now, and the *excess* of this one input:
+
+    need    |\      |\     ____                 base     morphological opening: raised only by what holds for longer
+            | \     | \   |    |    |\                  than a retransmission takes, i.e. a spike, a queue, a new route
+    base  __|  \____|  \__|    |____| \____     excess   loss (a retransmission, then a burst) and jitter
+             loss    loss  spike   loss
+
+The base is followed, up and down alike, at up to 10 % faster or slower than real time. No lead chosen in advance
+should pay for a rare second of it, and it lasts long enough to be followed. A retransmission is over before anybody
+knows of it: it can only be covered in advance, and whether that is worth it is a matter of how often. So the excesses
+of the last minute are kept, and covered but for a stated share of them: the least lead with which no more than that
+share of the minute's inputs would have come late. That is the *oracle* of the last minute; one stall within it, of
+however many inputs, is ignored as long as they are fewer than the share allows. Cover rises at once and falls by 1 %.
 """
 
-import heapq
 import math
+from bisect import bisect_left, insort
 from collections import deque
 from typing import Protocol
 
@@ -84,54 +96,94 @@ class LeadController(Protocol):
         ...
 
 
-FASTER, SLOWER, JUMP = 0.10, 0.01, 10.0
-"""The timeline runs at most so much faster or slower than real time; it jumps where the way is this many ticks."""
+FASTER, HURRY, JUMP = 0.10, 0.50, 10.0
+"""The timeline runs at most `FASTER` off real time, and by up to `HURRY` ahead while every input comes late; where
+the path is more than `JUMP` ticks from where the timeline is, it jumps."""
+SLOWER_S = 3.0
+"""Cover that is not needed any more is given up with this time constant."""
+LATELY = 3
+"""So many inputs in a row that came late are no stall: the last ones of a stall come in its burst, and early."""
+STALL_S = 0.25
+"""With two round trips on top: the longest stall that a loss makes, and the shortest change of the path."""
+CALM_S = 5.0
+SHIFT = 0.5
+"""The base is the least need of so many seconds, unless that of a stall's length is so many ticks higher."""
+MEMORY_S = 120.0
+FIRST_S = 20.0
+"""Until there have been inputs for so long, the share is taken of this."""
+FIRST_INPUTS = 16
 
 
 class QuantileLead:
-    """The least lead at which the inputs of the last seconds would have been on time, outliers left out.
+    """The least lead with which all but a share of the last minute's inputs would have been on time.
 
     Args:
-        window: how many of the newest inputs count.
-        outliers: how many of the worst of these may be ignored, if they stand out by more than `gap` ticks.
+        late_share: share of the inputs that may come late.
         safety: ticks added on top.
+        stall_s: see `STALL_S`.
     """
 
-    def __init__(self, window: int = 320, outliers: int = 3, gap: float = 2.0, safety: float = 0.5) -> None:
-        self._paths: deque[float] = deque(maxlen=window)
-        self._target: float | None = None
-        self._outliers = outliers
-        self._gap = gap
+    def __init__(self, late_share: float = 0.0075, safety: float = 0.15, stall_s: float = STALL_S) -> None:
+        self._late_share = late_share
         self._safety = safety
+        self._stall_s = stall_s
+        self._rate = 0.0
+        self._stall = 1  # inputs in the longest stall
+        self._needs: list[float] = []  # the newest ones, as phases
+        self._least: list[float] = []  # of each of these and the stall before it
+        self._excess: deque[float] = deque()
+        self._ordered: list[float] = []
+        self._base = 0.0
+        self._cover: float | None = None
 
     def start(self, clock: ServerClock, now: float) -> float:
         """Half the round trip, all the jitter there was, and two ticks."""
+        self._rate = clock.rate
+        self._measure(clock)
         return clock.phase + (clock.rtt_s / 2 + clock.spread_s) * clock.rate + 2.0
 
     def observe(self, tick: int, margin: float, phase: float, now: float) -> None:
         """See `LeadController`."""
-        self._paths.append(margin - phase)
-        self._target = None
+        needs, stall = self._needs, self._stall
+        needs.append(phase - margin)
+        self._least.append(min(needs[-stall:]))
+        calm = min(needs[-max(int(CALM_S * self._rate), stall) :])
+        self._base = self._least[-1] if self._least[-1] > calm + SHIFT else calm
+        if len(needs) >= 2 * stall:  # all stalls that could contain the input of `stall` ago are known
+            base = max(self._least[-stall:])
+            self._remember(needs[-stall] - (base if base > calm + SHIFT else calm))
+        if len(needs) > 1024:
+            del needs[:512], self._least[:512]
 
     def steer(self, phase: float, elapsed: float, clock: ServerClock, now: float) -> float:
         """See `LeadController`."""
-        if self._target is None and len(self._paths) >= 16:
-            self._target = self._safety - self._level()
-        if self._target is None:
+        self._measure(clock)
+        if len(self._excess) < FIRST_INPUTS:
             return phase
-        way = self._target - phase
-        if abs(way) > JUMP:
-            return self._target
-        return phase + max(-SLOWER * elapsed, min(way, FASTER * elapsed))
+        if self._cover is None:
+            self._cover = phase - self._base - self._safety
+        level = self._level()
+        self._cover = max(level, level + (self._cover - level) * (1 - elapsed / (SLOWER_S * self._rate)))
+        now_needed = min(self._needs[-LATELY:])
+        target = self._safety + max(self._base + self._cover, now_needed)
+        way = target - phase
+        if self._base + self._safety - phase > JUMP or way < -JUMP:
+            return target
+        fastest = HURRY if now_needed > phase else FASTER
+        return phase + max(-FASTER * elapsed, min(way, fastest * elapsed))
+
+    def _measure(self, clock: ServerClock) -> None:
+        self._stall = math.ceil((self._stall_s + 2 * clock.rtt_s) * clock.rate)
+
+    def _remember(self, excess: float) -> None:
+        self._excess.append(excess)
+        insort(self._ordered, excess)
+        if len(self._excess) > MEMORY_S * self._rate:
+            del self._ordered[bisect_left(self._ordered, self._excess.popleft())]
 
     def _level(self) -> float:
-        worst = heapq.nsmallest(self._outliers + 1, self._paths)
-        level = worst[-1]
-        for path in reversed(worst):
-            if level - path > self._gap:
-                break
-            level = path
-        return level
+        allowed = int(self._late_share * max(len(self._ordered), FIRST_S * self._rate))
+        return self._ordered[max(len(self._ordered) - 1 - allowed, 0)]
 
 
 class Timeline:

@@ -1,0 +1,334 @@
+#!/usr/bin/env python3
+"""The league of lead controllers: late inputs against added latency, per link, in simulated time.
+
+A trial has no physics: a server that ticks, a client whose clock drifts and starts anywhere, pings, one input per
+tick up the link, one snapshot per tick down it that tells the margins, and the controller. Its *oracle* is the least
+constant lead that would have met the same share of late inputs, from the run's own arrival times.
+
+    added latency   mean lead of an input over the server's true time when it was made, minus half the round trip
+    fair            without what no controller can know beforehand: spikes and the 250 ms after, a dip's first second
+    equal           what ours adds at the other's late share: a point on the curve of ours at various settings
+"""
+
+import argparse
+import heapq
+import json
+import math
+import random
+import sys
+from collections import deque
+from collections.abc import Callable, Iterable
+from concurrent.futures import ProcessPoolExecutor
+from itertools import count
+from pathlib import Path as File
+from typing import Any
+
+sys.path.insert(0, str(File(__file__).resolve().parent.parent))
+
+from rich.console import Console
+from rich.table import Table
+
+from client_sdk.clock import STALL_S, LeadController, QuantileLead, ServerClock, Timeline
+from controllers import RIVALS, Rival
+from tests.links import PRESETS, Weather, Wire
+
+RATE = 32
+TICK_MS = 1000 / RATE
+INPUT_BYTES, PING_BYTES, SNAPSHOT_BYTES = 16, 12, 400
+GATE_BYTES = 1448
+DRIFT = 200e-6
+AFTER_SPIKE_S = 0.25
+AFTER_DIP_S = 1.0
+TIE_MS = 0.1 * TICK_MS
+OURS = "ours"
+BOUNDS = {"lan": 0.005, "regional": 0.005, "typical": 0.01, "far": 0.02, "wifi": 0.02, "dip": 0.01}
+"""Share of late inputs that a preset allows, of the fair ones."""
+SHARE_MAX = 0.5
+"""Who is late more often does not steer for his inputs to be on time, and is left out of the comparison."""
+LONG_S = 4.0
+"""A longest stall that takes the presets' spikes for stalls, and covers them."""
+
+Row = dict[str, Any]
+
+
+class Trial:
+    """One controller on one link.
+
+    Args:
+        preset: see `tests.links.PRESETS`.
+        lead: the controller; a `Rival` hears of pings and snapshots, too.
+        seed: everything random comes from it, and nothing of it from what the controller does.
+    """
+
+    def __init__(self, preset: str, lead: LeadController, seed: int) -> None:
+        rng = random.Random(seed)
+        self.now = 0.0
+        self.lead = lead
+        self.weather = Weather(PRESETS[preset], rng.getrandbits(32))
+        self.leads: dict[int, float] = {}
+        """By tick: how far ahead of the server's true time the input was made."""
+        self.margins: dict[int, float] = {}
+        """By tick: by how much it arrived before its deadline."""
+        self.made: dict[int, float] = {}
+        """By tick: when it was made."""
+        self._rival = lead if isinstance(lead, Rival) else None
+        self._drift = rng.uniform(-DRIFT, DRIFT)
+        self._clock_start = rng.uniform(0, 1e5)
+        self._queue: list[tuple[float, int, Callable[[], None]]] = []
+        self._number = count()
+        self._up = Wire(self, self.weather, rng.getrandbits(32), self._at_server)
+        self._down = Wire(self, self.weather, rng.getrandbits(32), self._at_client)
+        self._going_up: deque[tuple[int, float]] = deque()  # first tick or -1, sent
+        self._going_down: deque[tuple[int, Any]] = deque()  # tick or -1, margins or the ping's answer
+        self._told: list[tuple[int, float]] = []
+        self._tick = -1
+        self._clock = ServerClock()
+        self._clock.rate = float(RATE)
+        self._timeline: Timeline | None = None
+        self._newest = -1
+        self._phases: dict[int, float] = {}
+        self._pings = 0
+        self._next_ping = 0.0
+
+    def at(self, when: float, act: Callable[[], None]) -> None:
+        """See `tests.links.Scheduler`."""
+        heapq.heappush(self._queue, (when, next(self._number), act))
+
+    def run(self, seconds: float) -> None:
+        """From connecting on."""
+        self._server()
+        self._client()
+        queue = self._queue
+        while queue[0][0] <= seconds:
+            self.now, _, act = heapq.heappop(queue)
+            act()
+
+    @property
+    def _local(self) -> float:
+        return self._clock_start + self.now * (1 + self._drift)
+
+    # -- the server ----------------------------------------------------------------------------------------
+
+    def _server(self) -> None:
+        self._tick += 1
+        self.at((self._tick + 1) / RATE, self._server)
+        if self._down.outstanding() <= GATE_BYTES:
+            self._going_down.append((self._tick, self._told))
+            self._down.send(bytes(SNAPSHOT_BYTES + 2 * len(self._told)))
+            self._told = []
+
+    def _at_server(self, message: bytes) -> None:
+        tick, sent = self._going_up.popleft()
+        if tick < 0:
+            self._going_down.append((-1, (sent, self.now * RATE)))
+            self._down.send(bytes(PING_BYTES))
+            return
+        margin = tick - self.now * RATE
+        self.margins[tick] = margin
+        self._told.append((tick, margin))
+
+    # -- the client ----------------------------------------------------------------------------------------
+
+    def _at_client(self, message: bytes) -> None:
+        tick, content = self._going_down.popleft()
+        now = self._local
+        if tick < 0:
+            sent, answer = content
+            self._clock.answered(sent, answer, now)
+            if self._rival:
+                self._rival.answered(now - sent, answer - RATE * (sent + now) / 2, now)
+            return
+        for at, margin in content:
+            self.lead.observe(at, margin, self._phases.pop(at), now)
+        if self._rival:
+            self._rival.heard(tick, now)
+
+    def _client(self) -> None:
+        now, timeline = self._local, self._timeline
+        if now >= self._next_ping:
+            self._pings += 1
+            self._next_ping = now + (0.1 if self._pings < 5 else self._rival.ping_s if self._rival else 1.0)
+            self._going_up.append((-1, now))
+            self._up.send(bytes(PING_BYTES))
+        due = self._next_ping
+        if timeline is None and self._clock.ready:
+            timeline = self._timeline = Timeline(RATE, self.lead.start(self._clock, now), now)
+            self._newest = math.floor(timeline.tick(now))
+        if timeline is not None:
+            if timeline.steer(self.lead, self._clock, now):
+                self._newest = max(self._newest, math.floor(timeline.tick(now)) - 1)
+            to = math.floor(timeline.tick(now))
+            while self._newest < to:
+                self._newest += 1
+                self._make(self._newest, timeline.phase)
+            due = min(due, timeline.when(self._newest + 1))
+        else:
+            due = min(due, now + 0.01)
+        self.at(self.now + max(due - now, 1e-4) / (1 + self._drift), self._client)
+
+    def _make(self, tick: int, phase: float) -> None:
+        self._phases[tick] = phase
+        self.made[tick] = self.now
+        self.leads[tick] = tick - self.now * RATE
+        self._going_up.append((tick, 0.0))
+        self._up.send(bytes(INPUT_BYTES))
+
+    # -- what came of it -----------------------------------------------------------------------------------
+
+    def fair(self, tick: int) -> bool:
+        """Whether the input was made when the weather was as before."""
+        made, weather = self.made[tick], self.weather
+        if 0 <= weather.dipped(made) < AFTER_DIP_S:
+            return False
+        return not any(begin - 2 * weather.path.rtt_s <= made < end + AFTER_SPIKE_S for begin, end, _ in weather.spikes)
+
+    def figures(self, ticks: Iterable[int]) -> tuple[float, float, float, float]:
+        """Of these inputs: late share; mean and 99th percentile of the added latency, and the oracle's, in ticks."""
+        leads, needs, late = [], [], 0
+        for tick in ticks:
+            leads.append(self.leads[tick])
+            needs.append(self.leads[tick] - self.margins[tick])
+            late += self.margins[tick] < 0
+        if not leads:
+            return 0.0, 0.0, 0.0, 0.0
+        leads.sort()
+        needs.sort()
+        half = self.weather.path.rtt_s / 2 * RATE
+        oracle = needs[max(len(needs) - 1 - late, 0)]
+        mean, p99 = sum(leads) / len(leads), leads[int(0.99 * len(leads))]
+        return late / len(leads), mean - half, p99 - half, oracle - half
+
+    def row(self, preset: str, controller: str, seed: int) -> Row:
+        """The trial's line in the table; latencies in ms."""
+        known = sorted(self.margins)
+        share, mean, p99, oracle = self.figures(known)
+        fair_share, fair_mean, _, fair_oracle = self.figures(filter(self.fair, known))
+        skipped = known[-1] - known[0] + 1 - len(known)
+        return {
+            "preset": preset,
+            "controller": controller,
+            "seed": seed,
+            "inputs": len(known),
+            "skipped": skipped,
+            "late_inputs_share": (share * len(known) + skipped) / (len(known) + skipped),
+            "added_latency_ms": mean * TICK_MS,
+            "added_latency_p99_ms": p99 * TICK_MS,
+            "oracle_latency_ms": oracle * TICK_MS,
+            "fair_late_share": fair_share,
+            "fair_latency_ms": fair_mean * TICK_MS,
+            "fair_oracle_ms": fair_oracle * TICK_MS,
+        }
+
+
+def trial(preset: str, controller: str, minutes: float, seed: int, setting: tuple[float, ...] = ()) -> Row:
+    """One controller by name; ours with a setting, if one is given."""
+    lead: LeadController = QuantileLead(*setting) if controller == OURS else RIVALS[controller](RATE)
+    run = Trial(preset, lead, seed)
+    run.run(60 * minutes)
+    return run.row(preset, controller, seed)
+
+
+def run(preset: str, minutes: float, seed: int) -> list[Row]:
+    """Every controller on one link, ours first: rows as of `Trial.row`, and for each
+
+    equal_latency_ms    what ours adds at this one's late share, from the curve; None beyond the curve
+    beaten              ours adds less at that share, or the same within `TIE_MS`
+    on_front            no other controller is both less late and less ahead
+    """
+    rows = [trial(preset, name, minutes, seed) for name in (OURS, *RIVALS)]
+    points = [_point(rows[0])]
+    points += [_point(trial(preset, OURS, minutes, seed, setting)) for setting in settings(rows[1:])]
+    for row in rows:
+        late, added = _point(row)
+        equal = curve(points, late)
+        row["equal_latency_ms"] = equal
+        row["beaten"] = equal is not None and equal <= added + TIE_MS
+        row["on_front"] = not any(
+            other is not row and all(a <= b for a, b in zip(_point(other), (late, added), strict=True))
+            for other in rows
+        )
+    return rows
+
+
+def settings(rivals: list[Row]) -> list[tuple[float, float, float]]:
+    """Late share, safety in ticks, longest stall in seconds: with these, ours should be as late as the rivals are."""
+    shares = {round(row["late_inputs_share"], 4) for row in rivals if row["late_inputs_share"] < SHARE_MAX}
+    aimed = [(share, safety) for share in sorted(shares) for safety in (0.0, 0.15)]
+    return [
+        (*one, stall_s)
+        for one in [*aimed, (0.0075, 0.5), (0.0075, 1.0), (0.0075, 2.0)]
+        for stall_s in (STALL_S, LONG_S)
+    ]
+
+
+def curve(points: list[tuple[float, float]], late: float) -> float | None:
+    """The least latency at a late share, for one who may switch between the points."""
+    under = [point for point in points if point[0] <= late]
+    over = [point for point in points if point[0] > late]
+    between = [a + (b - a) * (late - x) / (y - x) for x, a in under for y, b in over]
+    if not under or late >= SHARE_MAX:
+        return None
+    return min([*between, *(added for _, added in under)])
+
+
+def _point(row: Row) -> tuple[float, float]:
+    return row["late_inputs_share"], row["added_latency_ms"]
+
+
+def table(rows: list[Row]) -> Table:
+    """What `run` found, for people."""
+    result = Table(title="lead controllers: late inputs against added latency")
+    for column in ("preset", "controller"):
+        result.add_column(column)
+    for column in (
+        "late %",
+        "added ms",
+        "p99",
+        "oracle",
+        "ours at equal late %",
+        "fair late %",
+        "fair added",
+        "oracle",
+    ):
+        result.add_column(column, justify="right")
+    result.add_column("front")
+    preset = ""
+    for row in rows:
+        if preset and row["preset"] != preset:
+            result.add_section()
+        preset = row["preset"]
+        equal = row["equal_latency_ms"]
+        ours = row["controller"] == OURS
+        result.add_row(
+            preset,
+            row["controller"],
+            f"{100 * row['late_inputs_share']:.2f}",
+            *(f"{row[name]:.1f}" for name in ("added_latency_ms", "added_latency_p99_ms", "oracle_latency_ms")),
+            "" if ours else "-" if equal is None else f"{equal:.1f} {'<' if row['beaten'] else '>'}",
+            f"{100 * row['fair_late_share']:.2f}",
+            *(f"{row[name]:.1f}" for name in ("fair_latency_ms", "fair_oracle_ms")),
+            "*" if row["on_front"] else "",
+            style="bold" if ours else "",
+        )
+    return result
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--preset", choices=PRESETS, action="append", help="one or more; without, all")
+    parser.add_argument("--minutes", type=float, default=10, help="of simulated play (default: %(default)g)")
+    parser.add_argument("--seed", type=int, default=1, help="everything random comes from it (default: %(default)d)")
+    parser.add_argument("--json", type=File, metavar="OUT", help="writes the rows")
+    chosen = parser.parse_args()
+    names = chosen.preset or list(PRESETS)
+    with ProcessPoolExecutor() as pool:
+        done = [pool.submit(run, name, chosen.minutes, chosen.seed) for name in names]
+        rows = [row for job in done for row in job.result()]
+    Console().print(table(rows), f"seed {chosen.seed}, {chosen.minutes:g} minutes each")
+    if chosen.json:
+        chosen.json.write_text(json.dumps({"seed": chosen.seed, "league": rows}, indent=1) + "\n")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
