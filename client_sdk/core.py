@@ -30,7 +30,6 @@ from shared import edits, messages
 from shared.blocks import unpack
 from shared.checks import Cell
 from shared.inputs import NEUTRAL, Input, clamp
-from shared.layout import X
 from shared.messages import (
     MARGIN_ONE,
     MARGIN_REFUSED,
@@ -52,7 +51,6 @@ from shared.messages import (
 )
 from shared.ring import Ring
 from shared.scene import Scene
-from shared.units import BLOCK_SHIFT, SEGMENT_SHIFT
 
 VERDICT = np.dtype([("number", "<u4"), ("verdict", "u1")])
 TICKS_PER_UPDATE_MAX = 16
@@ -100,6 +98,7 @@ class Core:
         self._events: deque[Event] = deque(maxlen=EVENTS_MAX)
         self._phases: Ring[float] = Ring(256)
         self._pieces: tuple[Cell, bytearray] = ((0, 0, 0), bytearray())
+        self._pings: deque[float] = deque(maxlen=16)
         self._number = 0
         self._seen = 0.0
         self._newest = -1
@@ -166,6 +165,7 @@ class Core:
             return
         if self.clock.due(now):
             self._send(Ping(now))
+            self._pings.append(now)
         if self.state == "joining":
             self._try_to_join(now)
         if self.state != "playing":
@@ -181,7 +181,8 @@ class Core:
     def next_update(self, now: float) -> float:
         """The local time at which `update` has something to do."""
         due = self.clock.next_ping
-        if self.timeline is not None and self.prediction is not None:
+        prediction = self.prediction
+        if self.timeline and prediction and self._newest < prediction.confirmed.tick + UNCONFIRMED_MAX:
             due = min(due, self.timeline.when(self._newest + 1))
         return max(due, now)  # inf: only once something has come in
 
@@ -212,7 +213,8 @@ class Core:
             case Snapshot():
                 self._snapshot(message, now)
             case Pong():
-                if self.clock.rate:
+                if message.sent in self._pings:  # anything else is no answer to a ping of ours
+                    self._pings.remove(message.sent)
                     self.clock.answered(message.sent, message.tick, now)
             case Terrain():
                 self._terrain(message)
@@ -242,6 +244,7 @@ class Core:
         segment = (terrain.x, terrain.y, terrain.z)
         if terrain.offset == 0:
             self._pieces = (segment, bytearray())
+            self.prediction.expect_segment(segment)
         if self._pieces[0] != segment or len(self._pieces[1]) != terrain.offset:
             raise ProtocolError("Terrain: a piece is missing")
         self._pieces[1].extend(terrain.chunk)
@@ -297,9 +300,11 @@ class Core:
         for i, margin in enumerate(margins):
             tick = snapshot.newest - len(margins) + 1 + i
             phase = self._phases.get(tick)
+            if phase is None:
+                continue  # a tick that was left out
             self.stats.inputs_refused += margin == MARGIN_REFUSED
             self.stats.inputs_late += MARGIN_REFUSED < margin < 0
-            if phase is not None and margin != MARGIN_REFUSED:
+            if margin != MARGIN_REFUSED:
                 self._lead.observe(tick, margin / MARGIN_ONE, phase, now)
         missing = sum(fate in (REPEATED, NEUTRALISED) for fate in snapshot.fates)
         self.stats.inputs_substituted += missing
@@ -318,29 +323,13 @@ class Core:
         prediction = self.prediction
         if prediction is None or self.scene is None or not self.clock.ready:
             return
-        if self.entity not in prediction.confirmed or not self._grounded():
+        if self.entity not in prediction.confirmed or not prediction.grounded():
             return
         clock = self.clock
         self.timeline = Timeline(clock.rate, self._lead.start(clock, now), now)
         self._restart(now)
         self.state = "playing"
         self._events.append(Joined(self.entity, self.scene, prediction.predicted.tick))
-
-    def _grounded(self) -> bool:
-        """Whether every segment that exists around the own entity has been loaded."""
-        assert self.prediction is not None
-        assert self.scene is not None
-        x, y, z = self._segment()
-        near = ((x + i, y + j, z + k) for i in (-1, 0, 1) for j in (-1, 0, 1) for k in (-1, 0, 1))
-        exist = set(self.scene.segments())
-        return all(segment in self.prediction.confirmed.blocks for segment in near if segment in exist)
-
-    def _segment(self) -> Cell:
-        assert self.prediction is not None
-        x, y, z = (
-            part >> (BLOCK_SHIFT + SEGMENT_SHIFT) for part in self.prediction.confirmed.state(self.entity)[X : X + 3]
-        )
-        return x, y, z
 
     def set_input_delay(self, ticks: int) -> None:
         """Shows the effect of inputs so many ticks (0 to 3) later than they are sent: fewer and shorter replays.
@@ -376,6 +365,7 @@ class Core:
                 self._restart(now)
             return
         to = min(to, prediction.confirmed.tick + UNCONFIRMED_MAX)
+        self._newest = max(self._newest, prediction.confirmed.tick)  # an input for the past would only be late
         if to > self._newest:
             first = self._newest + 1
             for tick in range(first, to + 1):

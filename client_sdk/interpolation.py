@@ -4,6 +4,7 @@ The delay rises at once by what was missing when a snapshot came late, and falls
 beyond the newest snapshot motion goes on for at most 100 ms, then it holds.
 """
 
+import math
 from collections import deque
 
 import numpy as np
@@ -16,6 +17,8 @@ KEPT = 96
 EXTRAPOLATE_S = 0.1
 FALL_S_PER_S = 0.01
 CALM_S = 3.0
+TELEPORT_BLOCKS = 2.0
+"""What goes further than this in one tick is not drawn on its way."""
 
 Positions = npt.NDArray[np.float64]
 
@@ -27,8 +30,7 @@ class Interpolation:
         self._rate = rate
         self._states: deque[tuple[int, Int64s]] = deque(maxlen=KEPT)
         self.delay_ticks = 2.0
-        self._calm_since = 0.0
-        self._at = 0.0
+        self._calm_since = self._at = -math.inf
 
     def push(self, tick: int, states: Int64s) -> None:
         """The confirmed states ([n, 12], ascending by id) at the end of a tick."""
@@ -38,6 +40,8 @@ class Interpolation:
         """Adapts the delay to how old the newest snapshot is now."""
         if not self._states:
             return
+        if self._at == -math.inf:
+            self._calm_since = self._at = now
         short = (server_tick - self.delay_ticks) - self._states[-1][0]
         if short > 0:
             self.delay_ticks += short
@@ -75,5 +79,7 @@ def _between(before: tuple[int, Int64s], after: tuple[int, Int64s], at: float) -
     known = old[place, ID] == states[:, ID] if len(old) else np.zeros(len(states), bool)
     moved = new.copy()
     was = old[place[known], X : X + 3] / BLOCK
-    moved[known] = was + (new[known] - was) * share
+    way = new[known] - was
+    near = np.abs(way).max(axis=1) <= TELEPORT_BLOCKS * (after[0] - before[0])
+    moved[known] = np.where(near[:, None], was + way * share, new[known])
     return states, moved

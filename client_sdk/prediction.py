@@ -25,7 +25,7 @@ from shared.checks import Cell
 from shared.edits import Edit
 from shared.inputs import NEUTRAL, Input
 from shared.layout import COLUMNS, FALLING, FLAGS, ID, Int64s, X
-from shared.messages import ProtocolError, Snapshot
+from shared.messages import REPEATS_MAX, ProtocolError, Snapshot
 from shared.ring import Ring
 from shared.scene import Scene
 from shared.snapshot import ACTED, SegmentPart, checksum, decode_parts
@@ -79,6 +79,7 @@ class Prediction:
         self._inputs: Ring[Input] = Ring(HISTORY)
         self._states: Ring[Int64s] = Ring(HISTORY)
         self._templates = len(scene.templates)
+        self._exist = frozenset(scene.segments())
         self._terrain_changed = self._edited_near = False
         self._acted: set[int] = set()
         self._edits: dict[int, tuple[int, Edit]] = {}  # by number, with its tick; until there is a verdict
@@ -86,6 +87,10 @@ class Prediction:
         self._early: dict[Cell, list[tuple[list[int], list[int]]]] = {}
 
     # -- the server's word ---------------------------------------------------------------------------------
+
+    def expect_segment(self, segment: Cell) -> None:
+        """The first piece of a segment has come: it was packed before any edit that comes from here on."""
+        self._early[segment] = []
 
     def load_segment(self, segment: Cell, kinds: np.ndarray[tuple[int, ...], np.dtype[np.uint8]]) -> None:
         """The blocks of a segment have come."""
@@ -110,9 +115,11 @@ class Prediction:
         here = set(states[:, ID].tolist())
         self._acted.update(states[states[:, FLAGS] & ACTED != 0, ID].tolist())
         states[:, FLAGS] &= FALLING
-        if snapshot.drops:
-            self._drop(np.frombuffer(snapshot.drops, "<i4").reshape(-1, 3), here)
-        homes = self._homes() if any(part.gone or part.since == KEYFRAME for part in parts) else {}
+        drops = {(x, y, z) for x, y, z in np.frombuffer(snapshot.drops, "<i4").reshape(-1, 3).tolist()}
+        homes = self._homes() if drops or any(part.gone or part.since == KEYFRAME for part in parts) else {}
+        for entity, home in homes.items():
+            if home in drops and entity not in here:
+                world.remove(entity)
         for part in parts:
             for entity in self._gone(part, homes):
                 if entity in world and entity not in here:
@@ -123,10 +130,15 @@ class Prediction:
                     world.write_blocks(part.segment, *changes)
                     self._terrain_changed = True
                     self._edited_near |= self._near(part.segment, part.edits["block"].astype(np.int64))
-                else:  # its terrain is on the way, and was perhaps packed before this
-                    self._early.setdefault(part.segment, []).append(changes)
+                if part.segment in self._early:
+                    self._early[part.segment].append(changes)
         if here:
             world.put(states)
+        for segment in drops:
+            self._early.pop(segment, None)
+            if segment in world.blocks and not len(world.in_segment(segment)):
+                world.unload_segment(segment)
+                self._terrain_changed = True
         world.rebase(snapshot.tick)
         for part in parts:
             if part.check and part.segment in world.blocks and checksum(world, part.segment) != part.check:
@@ -144,6 +156,13 @@ class Prediction:
         ways = np.abs(blocks - np.array(self.confirmed.position(self.entity)))
         return bool((ways.max(axis=1) < NEAR_BLOCKS).any())
 
+    def grounded(self) -> bool:
+        """Whether the blocks of every segment that exists around the own entity are there."""
+        place = self.confirmed.state(self.entity)[X : X + 3]
+        x, y, z = (part >> (BLOCK_SHIFT + SEGMENT_SHIFT) for part in place)
+        around = {(x + i, y + j, z + k) for i in (-1, 0, 1) for j in (-1, 0, 1) for k in (-1, 0, 1)}
+        return all(segment in self.confirmed.blocks for segment in around & self._exist)
+
     def _gone(self, part: SegmentPart, homes: dict[int, Cell]) -> list[int]:
         if part.since == KEYFRAME:
             return [entity for entity, home in homes.items() if home == part.segment]
@@ -154,22 +173,10 @@ class Prediction:
         segments = (states[:, X : X + 3] >> (BLOCK_SHIFT + SEGMENT_SHIFT)).tolist()
         return {entity: (x, y, z) for entity, (x, y, z) in zip(states[:, ID].tolist(), segments, strict=True)}
 
-    def _drop(self, drops: np.ndarray[tuple[int, ...], np.dtype[np.int32]], here: set[int]) -> None:
-        gone = {(x, y, z) for x, y, z in drops.tolist()}
-        for entity, home in self._homes().items():
-            if home in gone and entity not in here:
-                self.confirmed.remove(entity)
-        for segment in gone:
-            self._early.pop(segment, None)
-            if segment in self.confirmed.blocks and not len(self.confirmed.in_segment(segment)):
-                self.confirmed.unload_segment(segment)
-                self._terrain_changed = True
-
     # -- the guess -----------------------------------------------------------------------------------------
 
     def begin(self, tick: int) -> None:
-        """(Re)starts the prediction at `tick` from the confirmed world, as if nothing had been pressed since."""
-        self._inputs.clear()
+        """(Re)starts the prediction at `tick` from the confirmed world, with the inputs that have been sent."""
         self._replay(tick)
         self.begun = True
 
@@ -185,8 +192,13 @@ class Prediction:
             if due == tick or (due < tick and tick == self.confirmed.tick + 1):
                 edits.apply(self.predicted, self.entity, edit)
         known = self.entity in self.predicted
-        self.predicted.step({self.entity: self._inputs.get(tick) or NEUTRAL} if known else None)
+        self.predicted.step({self.entity: self._wish(tick)} if known else None)
         self._states.put(tick, self.predicted.states())
+
+    def _wish(self, tick: int) -> Input:
+        """The own input of a tick; where none was sent, what the server puts in its place."""
+        wishes = (self._inputs.get(before) for before in range(tick, tick - REPEATS_MAX - 1, -1))
+        return next((wish for wish in wishes if wish is not None), NEUTRAL)
 
     def edit(self, number: int, edit: Edit) -> int:
         """Files an edit for the next tick that has no input yet; that tick."""
@@ -205,7 +217,10 @@ class Prediction:
         skipped = tick - self._compared > 1
         self._compared = tick
         acted, self._acted = frozenset(self._acted), set()
-        if not self.begun or tick > self.predicted.tick:
+        if not self.begun:
+            return NOTHING
+        if tick > self.predicted.tick:  # overtaken: nothing was predicted for this tick
+            self._replay(tick)
             return NOTHING
         guess, truth = self._states.get(tick), self._truth()
         if guess is not None and not self._terrain_changed and np.array_equal(guess, truth):
@@ -217,6 +232,7 @@ class Prediction:
                 (late, "late input"),
                 (self.entity in acted, "server act"),
                 (self._edited_near, "unknown edit"),
+                (not self.grounded(), "missing terrain"),
                 (others and (skipped or not self.neighbours), "other entity"),
                 (others and self._others_differ(guess, truth), "other entity"),
             )
@@ -280,6 +296,8 @@ def check_scene(table: object) -> Scene:
         ProtocolError: it is not a scene.
     """
     try:
-        return Scene.from_table(table)  # type: ignore[arg-type]
-    except (ValueError, TypeError) as error:
+        scene = Scene.from_table(table)  # type: ignore[arg-type]
+        assert scene.digests  # computed here, where a table that cannot be is refused
+        return scene
+    except (ValueError, TypeError, RecursionError) as error:
         raise ProtocolError(f"Welcome.scene: {error}") from error

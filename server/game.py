@@ -135,7 +135,7 @@ class Game:
             tick = self.world.tick + 1 - self._ticks_left(now)
             session.send(encode(Pong(message.sent, tick)))
         elif isinstance(message, Hello) and not session.entity and not session.joining:
-            self._hello(session, message)
+            self._hello(session, message, now)
         elif isinstance(message, Command) and session.entity:
             self._file_command(session, message)
         elif isinstance(message, Resync) and session.entity:
@@ -378,7 +378,7 @@ class Game:
         else:
             session.commands.append(command)
 
-    def _hello(self, session: Session, hello: Hello) -> None:
+    def _hello(self, session: Session, hello: Hello, now: float) -> None:
         if hello.version != messages.VERSION:
             reason = f"protocol version {hello.version}: this server speaks {messages.VERSION}"
             self._refuse(session, messages.WRONG_VERSION, reason)
@@ -390,6 +390,7 @@ class Game:
             self._refuse(session, messages.WRONG_SCENE, reason)
             return
         session.name = hello.name
+        session.pacing.answered(now - session.opened, now)  # of a path that was empty
         session.joining = True
 
     def _refuse(self, session: Session, code: int, reason: str) -> None:

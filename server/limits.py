@@ -18,7 +18,7 @@ class Limits:
     """A client that could not be sent a snapshot for so long is closed."""
     messages_per_tick: float = 8.0
     """A client's messages beyond this rate (with a burst of 32 ticks' worth) close it."""
-    first_bytes: int = 8 * 1024
+    first_bytes: int = 4 * 1024
     """So much may be on its way to a client of which nothing is known yet."""
     terrain_chunk_bytes: int = 1024
     """Terrain goes behind snapshots in pieces of this size,"""

@@ -3,10 +3,12 @@
 Theory of operation. What a TCP connection has not acknowledged yet stands in a queue somewhere, and the newest
 snapshot goes behind it. So a snapshot is sent only while the bytes on the way (unsent and unacknowledged) fit into
 
-    max(two snapshots, one packet, rate x (least round trip + one tick))
+    max(two snapshots, 512 bytes, rate x min(3 x least round trip + one tick, 0.6 s))
 
 where `rate` is the fastest the path has acknowledged bytes lately and the least round trip is that of an empty
-path. A client that lost some ticks that way gets their union in its next snapshot: latest wins.
+path. Three of them, because a lost packet holds up the acknowledgements of all behind it for two or more, although
+no queue has grown: with one, a path of 200 ms that loses 2 % of its packets gets 28 snapshots/s instead of 32.
+A client that lost some ticks that way gets their union in its next snapshot: latest wins.
 """
 
 from collections import deque
@@ -15,8 +17,10 @@ RATE_WINDOW_S = 1.0
 """The rate is the best of the last second,"""
 RATE_SPAN_S = 0.25
 """each measured over at least a quarter of one."""
-RTT_WINDOW_S = 10.0
-PACKET_BYTES = 1448
+RTT_WINDOW_S = 60.0
+STALL_RTTS = 3.0
+HOLD_S_MAX = 0.6
+LEAST_BYTES = 512
 
 
 class Pacing:
@@ -64,4 +68,6 @@ class Pacing:
             self._rates.append((now, rate))
         while self._rates and self._rates[0][0] < now - RATE_WINDOW_S:
             self._rates.popleft()
-        return max(2 * snapshot_bytes, PACKET_BYTES, int(self.rate * (self.least_rtt_s + tick_s)))
+        return max(
+            2 * snapshot_bytes, LEAST_BYTES, int(self.rate * min(STALL_RTTS * self.least_rtt_s + tick_s, HOLD_S_MAX))
+        )

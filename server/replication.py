@@ -33,6 +33,9 @@ class _Tick:
         self.edited: dict[Cell, set[int]] = defaultdict(set)  # block offsets by segment
         self.acted: set[int] = set()  # ids that the rules placed or threw
 
+    def segments(self) -> set[Cell]:
+        return self.changed.keys() | self.gone.keys() | self.edited.keys()
+
 
 class ChangeLog:
     """The changes of one world. Record each tick once, after its step; then ask for parts."""
@@ -42,6 +45,7 @@ class ChangeLog:
         self._ticks: Ring[_Tick] = Ring(HISTORY)
         self._now = _Tick()
         self._home: dict[int, Cell] = {}
+        self._changed: dict[int, set[Cell] | None] = {}
         self._parts: dict[tuple[Cell, int], bytes] = {}
         self._packed: dict[Cell, tuple[int, bytes]] = {}
 
@@ -78,13 +82,14 @@ class ChangeLog:
         self._ticks.put(self._world.tick, now)
         self._now = _Tick()
         self._parts.clear()
+        self._changed.clear()
 
     def changed_segments(self, since: int) -> set[Cell] | None:
         """The segments in which anything changed after tick `since`; None: too long ago to tell."""
-        ticks = self._since(since)
-        if ticks is None:
-            return None
-        return {segment for tick in ticks for part in (tick.changed, tick.gone, tick.edited) for segment in part}
+        if since not in self._changed:
+            ticks = self._since(since)
+            self._changed[since] = None if ticks is None else set().union(*(tick.segments() for tick in ticks))
+        return self._changed[since]
 
     def part(self, segment: Cell, since: int) -> bytes:
         """The encoded changes of a segment after tick `since`, which is `KEYFRAME` or at most `HISTORY` ago."""

@@ -137,7 +137,7 @@ class Session:
         """The highest number of a command so far."""
         self.resynced_at = now
         self.verdicts: list[tuple[int, int]] = []
-        self.edits_left = 0.0
+        self.edits_left = math.inf
         self.pacing = Pacing()
         self.sent_when: Ring[float] = Ring(FATES_MAX)
         self.centre: Cell | None = None

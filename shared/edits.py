@@ -33,7 +33,7 @@ def pack(edit: Edit) -> bytes:
 def unpack(payload: bytes) -> Edit | None:
     """The reverse of `pack`; None for any other bytes."""
     try:
-        parts = msgpack.unpackb(payload)
+        parts = msgpack.unpackb(payload, max_array_len=4)
     except Exception:  # msgpack raises some ten kinds for bytes that are not MessagePack
         return None
     if type(parts) is not list or len(parts) != 4 or any(type(part) is not int for part in parts):

@@ -1,6 +1,7 @@
 """Where others are drawn, to the bit: times and places here are sums of powers of two, and 100 ms are 4 ticks."""
 
 import numpy as np
+import pytest
 
 from client_sdk.interpolation import CALM_S, EXTRAPOLATE_S, FALL_S_PER_S, KEPT, Interpolation
 from shared.layout import Int64s
@@ -46,9 +47,9 @@ def test_between_two_snapshots_motion_is_even() -> None:
 
 
 def test_the_two_snapshots_around_the_moment_are_the_ones_that_count() -> None:
-    interpolation = fed(*[(tick, states(a=tick * tick)) for tick in range(1, 9)])
+    interpolation = fed(*[(tick, states(a=tick * tick / 8)) for tick in range(1, 9)])
     for tick in range(1, 8):
-        assert shown(interpolation, tick + 0.5) == {"a": (tick**2 + (tick + 1) ** 2) / 2}
+        assert shown(interpolation, tick + 0.5) == {"a": (tick**2 + (tick + 1) ** 2) / 16}
 
 
 def test_a_moment_before_the_oldest_snapshot_shows_the_oldest() -> None:
@@ -100,7 +101,7 @@ def test_the_delay_falls_no_lower_than_one_tick_nor_than_what_there_is_to_show()
     interpolation = fed((10, states(a=0)))
     for second in range(4, 900):
         interpolation.advance(11.5, float(second))
-    assert interpolation.delay_ticks == 1.5
+    assert interpolation.delay_ticks == pytest.approx(1.5)
     interpolation.push(20, states(a=0))
     for second in range(900, 990):
         interpolation.advance(20.0, float(second))
