@@ -58,6 +58,7 @@ def take_turns(
             if between is not None:
                 between(number)
             for name, task in work.items():
+                task()  # warms the caches: the others have used them since
                 start = time.perf_counter()
                 units = task()
                 samples[name].append((time.perf_counter() - start) / units)

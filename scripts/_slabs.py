@@ -47,17 +47,18 @@ def _hits(slabs: Any, starts: Any, origin: Any, sizes: Any, boxes: Any, block: i
     for number in range(len(boxes)):
         b = boxes[number]
         hit = False
-        for z in range(b[2] // block, (b[5] - 1) // block + 1):
-            for sy in range(b[1] // block // 32, (b[4] - 1) // block // 32 + 1):
-                for sx in range(b[0] // block // 32, (b[3] - 1) // block // 32 + 1):
-                    i, j, k = sx - origin[0], sy - origin[1], z // 32 - origin[2]
-                    layer = ((k * sizes[1] + j) * sizes[0] + i) * 32 + z % 32
+        x0, y0, z0 = b[0] - origin[0] * 32 * block, b[1] - origin[1] * 32 * block, b[2] - origin[2] * 32 * block
+        x1, y1, z1 = b[3] - origin[0] * 32 * block, b[4] - origin[1] * 32 * block, b[5] - origin[2] * 32 * block
+        for z in range(z0 // block, (z1 - 1) // block + 1):
+            for sy in range(y0 // block // 32, (y1 - 1) // block // 32 + 1):
+                for sx in range(x0 // block // 32, (x1 - 1) // block // 32 + 1):
+                    layer = (sy * sizes[0] + sx) * sizes[2] * 32 + z
                     for s in range(starts[layer], starts[layer + 1]):
                         if (
-                            slabs[s, 0] * block < b[3]
-                            and slabs[s, 2] * block > b[0]
-                            and slabs[s, 1] * block < b[4]
-                            and slabs[s, 3] * block > b[1]
+                            slabs[s, 0] * block < x1
+                            and slabs[s, 2] * block > x0
+                            and slabs[s, 1] * block < y1
+                            and slabs[s, 3] * block > y0
                         ):
                             hit = True
                             break
@@ -79,17 +80,28 @@ class Slabs:
 
     @classmethod
     def of(cls, blocks: Blocks) -> "Slabs":
-        indices = np.array(sorted(blocks, key=lambda index: index[::-1]), np.int64)
+        indices = np.array(list(blocks), np.int64)
         origin = indices.min(axis=0)
         sizes = indices.max(axis=0) - origin + 1
-        parts, starts = [], [0]
+        solid = np.ones((sizes[2] * SEGMENT, sizes[1] * SEGMENT, sizes[0] * SEGMENT), np.bool_)
+        for index in blocks:
+            x, y, z = (np.array(index) - origin) * SEGMENT
+            solid[z : z + SEGMENT, y : y + SEGMENT, x : x + SEGMENT] = blocks.segment(index) != 0
+        return cls(*cls.merged(solid), origin, sizes)
+
+    @staticmethod
+    def merged(solid: Flags) -> tuple[Boxes, Boxes]:
+        """A map [z, y, x] layer by layer: [n, 4] in cells, and where each layer of each segment column begins."""
+        height, depth, width = solid.shape
         scratch = np.zeros((SEGMENT * SEGMENT, 4), np.int64)
-        for i, j, k in indices.tolist():
-            for layer in blocks.segment((i, j, k)) != 0:
-                n = _merge(layer, scratch)
-                parts.append(scratch[:n] + np.array([i, j, i, j]) * SEGMENT)
-                starts.append(starts[-1] + n)
-        return cls(np.concatenate(parts), np.array(starts, np.int64), origin, sizes)
+        parts, starts = [], [0]
+        for y in range(0, depth, SEGMENT):
+            for x in range(0, width, SEGMENT):
+                for z in range(height):
+                    n = _merge(np.ascontiguousarray(solid[z, y : y + SEGMENT, x : x + SEGMENT]), scratch)
+                    parts.append(scratch[:n] + np.array([x, y, x, y]))
+                    starts.append(starts[-1] + n)
+        return np.concatenate(parts), np.array(starts, np.int64)
 
     def __len__(self) -> int:
         return len(self._slabs)
@@ -111,7 +123,8 @@ def boxes_on(world: World, count: int) -> Boxes:
     sides = np.array([0.6, 0.6, 1.8])
     high = np.array([world.scene.size[0] * SEGMENT, world.scene.size[1] * SEGMENT, 24.0]) - sides
     low = rng.uniform([0.0, 0.0, 8.0], high, (count, 3))
-    return np.floor(np.hstack((low, low + sides)) * BLOCK).astype(np.int64)
+    boxes: Boxes = np.floor(np.hstack((low, low + sides)) * BLOCK).astype(np.int64)
+    return boxes
 
 
 def dense_hits(world: World, boxes: Boxes) -> Flags:

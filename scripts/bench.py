@@ -17,6 +17,7 @@ from rich.table import Table
 
 import _bench_physics as physics
 import _step_c
+from _crowds import Samples
 from shared import kernels
 
 
@@ -37,7 +38,7 @@ def in_unit(samples: list[float], unit: float) -> list[float]:
     return [sample / unit for sample in samples]
 
 
-def ratios(samples: physics.Samples) -> list[float]:
+def ratios(samples: Samples) -> list[float]:
     """Ours over theirs, round by round."""
     return [ours / theirs for ours, theirs in zip(samples["ours"], samples["c"], strict=True)]
 
@@ -46,7 +47,7 @@ def run_physics(args: argparse.Namespace, console: Console) -> int:
     if not kernels.available():
         console.print("error: Numba is not installed; the benchmark times the compiled step")
         return 2
-    rounds = 7 if args.quick else 25
+    rounds = 10 if args.quick else 60
     rows: list[Row] = []
     report: dict[str, Any] = {"quick": args.quick, "rounds": rounds}
     with Progress(console=console, transient=True) as progress:

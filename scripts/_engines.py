@@ -1,0 +1,207 @@
+"""The rows of the accuracy report as things that step: the product's world, and the variants, behind one face."""
+
+import importlib.util
+import sys
+from dataclasses import dataclass
+from functools import cache
+from types import ModuleType
+from typing import Any, Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+import _variants
+from _slabs import Slabs
+from shared.inputs import JUMP, MOVE_MAX, Input
+from shared.layout import FLAGS, MOVE_X, VX, X
+from shared.scene import Scene
+from shared.units import BLOCK, SEGMENT, SPEED, rounded
+from shared.world import World
+
+Floats = npt.NDArray[np.float64]
+Kinds = npt.NDArray[np.uint8]
+Moves = npt.NDArray[np.int64]
+
+GRAVITY, TERMINAL, JUMP_SPEED, WALK = 18.0, 16.0, 8.0, 3.0
+LOW = np.array([-0.3, -0.3, 0.0])
+SIDES = np.array([0.6, 0.6, 1.8])
+
+FORMATS = {"float32": (np.float32, 0), "float64": (np.float64, 0)} | {
+    f"grid 2^-{bits}": (np.float64, bits) for bits in (16, 20, 24)
+}
+INTEGRATORS = {"semi": _variants.SEMI, "explicit": _variants.EXPLICIT, "mean": _variants.MEAN}
+MOVERS = {"clamp": _variants.CLAMP, "rewind": _variants.REWIND, "impact": _variants.IMPACT}
+OBSTACLES = {"cells": _variants.CELLS, "slabs": _variants.SLABS}
+
+
+@dataclass(frozen=True)
+class Choice:
+    """One row: what is chosen. The defaults are the product's."""
+
+    format: str = "grid 2^-24"
+    integrator: str = "mean"
+    tick_rate: int = 32
+    mover: str = "clamp"
+    obstacles: str = "cells"
+    executor: str = "compiled"
+    product: bool = False
+
+
+class Engine(Protocol):
+    """Some players, each alone among the blocks."""
+
+    def wish(self, moves: Moves, jumps: npt.NDArray[np.bool_]) -> None:
+        """What all wish from now on: [n, 2] intents of -127..127, and [n] whether to jump."""
+
+    def step(self) -> None: ...
+
+    def places(self) -> Floats:
+        """[n, 3] in blocks from the corner of the map."""
+
+    def boxes(self) -> tuple[Floats, Floats]:
+        """Low and high corners as the engine itself sees them, [n, 3] in blocks."""
+
+    def state(self) -> npt.NDArray[Any]:
+        """[n, m]: what another machine would have to agree about, bit for bit."""
+
+    def correct(self, rows: npt.NDArray[np.bool_], other: "Engine") -> None:
+        """Takes over these rows of another engine of the same kind."""
+
+
+class Variant:
+    """An engine from `_variants`; `fast` is the other machine."""
+
+    def __init__(self, choice: Choice, kinds: Kinds, spots: Floats, shift: int = 0, *, fast: bool = False) -> None:
+        self._module = _fast() if fast else _variants
+        self._type, bits = FORMATS[choice.format]
+        grid = SPEED if bits else 0
+        self._shift = np.array([shift, 0, 0])
+        origin = self._shift.astype(np.int64)
+        rectangles, starts = slabs_of(kinds)
+        self.terrain = (kinds, rectangles, starts, origin)
+        f = np.zeros(_variants.NUMBERS)
+        f[_variants.GRAVITY] = _on(GRAVITY / choice.tick_rate, grid)
+        f[_variants.TERMINAL], f[_variants.JUMP] = TERMINAL, JUMP_SPEED
+        f[_variants.STEP], f[_variants.HALF], f[_variants.SCALE] = 1 / choice.tick_rate, 0.5, 2.0**bits if bits else 0
+        f[_variants.LO : _variants.LO + 3] = [_on(part, 2.0**bits if bits else 0) for part in LOW]
+        f[_variants.SIZE : _variants.SIZE + 3] = [_on(part, 2.0**bits if bits else 0) for part in SIDES]
+        self._f = f.astype(self._type)
+        self._walk = np.array([_on(WALK * move / MOVE_MAX, grid) for move in range(-MOVE_MAX, MOVE_MAX + 1)])
+        self._switches = np.array(
+            [INTEGRATORS[choice.integrator], MOVERS[choice.mover], OBSTACLES[choice.obstacles]], np.int64
+        )
+        quantised = np.round(spots * 2.0**bits) / 2.0**bits if bits else spots
+        self._places = (quantised + self._shift).astype(self._type)
+        self._speeds = np.zeros_like(self._places)
+        self._falling = np.ones(len(spots), np.bool_)
+        self._hit, self._scratch = np.zeros(3, np.bool_), np.zeros((6, 3), self._type)
+        self.wish(np.zeros((len(spots), 2), np.int64), np.zeros(len(spots), np.bool_))
+
+    def wish(self, moves: Moves, jumps: npt.NDArray[np.bool_]) -> None:
+        self._wishes = self._walk[moves + MOVE_MAX].astype(self._type)
+        self._jumps = jumps
+
+    def step(self) -> None:
+        self._module.step(
+            self.terrain, self._f, self._switches, self._places, self._speeds, self._falling, self._wishes, self._jumps,
+            self._hit, self._scratch,
+        )  # fmt: skip
+
+    def places(self) -> Floats:
+        places: Floats = self._places.astype(np.float64) - self._shift
+        return places
+
+    def boxes(self) -> tuple[Floats, Floats]:
+        low = self._places + self._f[_variants.LO : _variants.LO + 3]
+        high = low + self._f[_variants.SIZE : _variants.SIZE + 3]
+        return low.astype(np.float64), high.astype(np.float64)
+
+    def state(self) -> npt.NDArray[Any]:
+        return np.hstack((self._places, self._speeds))
+
+    def correct(self, rows: npt.NDArray[np.bool_], other: Engine) -> None:
+        assert isinstance(other, Variant)
+        self._places[rows], self._speeds[rows] = other._places[rows], other._speeds[rows]
+        self._falling[rows] = other._falling[rows]
+
+
+class Product:
+    """The real world of the product."""
+
+    def __init__(self, choice: Choice, kinds: Kinds, spots: Floats, shift: int = 0, *, fast: bool = False) -> None:
+        compiled = (choice.executor == "compiled") != fast  # the other machine has the other executor
+        nz, ny, nx = (side // SEGMENT for side in kinds.shape)
+        at = shift // SEGMENT
+        scene = Scene(
+            "report",
+            tick_rate=choice.tick_rate,
+            integrator=choice.integrator,
+            entity_collision=False,
+            origin=(at, 0, 0),
+            size=(nx, ny, nz),
+            gravity=GRAVITY,
+            terminal_speed=TERMINAL,
+        )
+        self.world = World(scene, compiled=compiled)
+        for i, j, k in np.ndindex(nx, ny, nz):
+            part = kinds[k * 32 : k * 32 + 32, j * 32 : j * 32 + 32, i * 32 : i * 32 + 32]
+            self.world.load_segment((at + i, j, k), np.ascontiguousarray(part).reshape(-1))
+        self._shift = np.array([shift * BLOCK, 0, 0])
+        self._ids = list(self.world.spawn_many("player", spots + np.array([shift, 0, 0])))
+        self._inputs: dict[int, Input] = {}
+
+    def wish(self, moves: Moves, jumps: npt.NDArray[np.bool_]) -> None:
+        buttons = np.where(jumps, JUMP, 0).tolist()
+        self._inputs = {
+            entity: Input(x, y, button)
+            for entity, (x, y), button in zip(self._ids, moves.tolist(), buttons, strict=True)
+        }
+
+    def step(self) -> None:
+        self.world.step(self._inputs)
+        self._inputs = {}
+
+    def places(self) -> Floats:
+        places: Floats = (self.world.states()[:, X : X + 3] - self._shift) / BLOCK
+        return places
+
+    def boxes(self) -> tuple[Floats, Floats]:
+        template = self.world.scene.templates[0].row()
+        low = self.world.states()[:, X : X + 3] + np.array(template[:3])
+        return low / BLOCK, (low + np.array(template[3:6])) / BLOCK
+
+    def state(self) -> npt.NDArray[Any]:
+        states = self.world.states()
+        states[:, MOVE_X:] = 0  # inputs are told, not computed
+        return states[:, FLAGS : VX + 3]
+
+    def correct(self, rows: npt.NDArray[np.bool_], other: Engine) -> None:
+        assert isinstance(other, Product)
+        self.world.put(other.world.states()[rows])
+
+
+def engine(choice: Choice, kinds: Kinds, spots: Floats, shift: int = 0, *, fast: bool = False) -> Engine:
+    kind = Product if choice.product else Variant
+    return kind(choice, kinds, spots, shift, fast=fast)
+
+
+def slabs_of(kinds: Kinds) -> tuple[Moves, Moves]:
+    """The map [z, y, x] merged layer by layer: [n, 4] in cells, and where each layer of each segment begins."""
+    return Slabs.merged(kinds != 0)
+
+
+def _on(value: float, scale: float) -> float:
+    """`value` in whole steps of 1 / scale; itself for 0."""
+    return rounded(value * scale) / scale if scale else value
+
+
+@cache
+def _fast() -> ModuleType:
+    name = "_variants_fast"
+    spec = importlib.util.spec_from_file_location(name, _variants.__file__)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[name] = module
+    spec.loader.exec_module(module)
+    return module

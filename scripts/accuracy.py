@@ -1,0 +1,141 @@
+"""Speed against error: what each choice in the physics buys and costs, measured in one run.
+
+Number formats, integrators, tick rates, movers, obstacles and executors, one changed at a time around the product's
+choice, and a few combinations that others use. Rows of the product run its real world; the others run variants of
+the step that exist only for this report. Lengths in blocks; an error of 0 is exactly 0.
+"""
+
+import argparse
+import json
+import sys
+from dataclasses import asdict
+from pathlib import Path
+
+from rich.console import Console
+from rich.progress import Progress
+from rich.table import Table
+
+from _conclusion import Row, conclusion
+from _engines import Choice
+from shared import kernels
+
+PRODUCT = Choice(product=True)
+PLAIN = Choice(product=True, executor="plain")
+RATES = (20, 30, 60, 64, 128)
+
+GROUPS: dict[str, list[Choice]] = {
+    "the product": [PRODUCT],
+    "number format": [Choice(name) for name in ("float32", "float64", "grid 2^-16", "grid 2^-20", "grid 2^-24")]
+    + [Choice(name, tick_rate=128) for name in ("grid 2^-16", "grid 2^-20")],
+    "integrator": [
+        Choice(integrator=integrator, tick_rate=rate, product=integrator == "semi")
+        for integrator in ("semi", "explicit")
+        for rate in (20, 32, 64, 128)
+    ],
+    "tick rate": [Choice(tick_rate=rate, product=True) for rate in RATES],
+    "mover": [Choice(mover="rewind"), Choice(mover="impact")],
+    "obstacles": [Choice(obstacles="slabs")],
+    "executor": [PLAIN],
+    "what others do": [
+        Choice("float64", "semi", mover="rewind", obstacles="slabs"),
+        Choice("float64", "semi", 60),
+        Choice("float32", "semi", 60),
+        Choice("float32", "semi", 60, "impact"),
+    ],
+}
+"""The rows, by what is varied. The first of the last group is the seed's proposal, taken at its word."""
+
+COLUMNS = {
+    "ns": "ns per step",
+    "apex_error": "apex",
+    "landing_error_ms": "landing, ms",
+    "minute_error": "after 1 min",
+    "inside_share": "inside",
+    "inside_depth": "depth",
+    "tangential_lost": "wall loss",
+    "error_1e6": "at 10^6",
+    "error_1e7": "at 10^7",
+    "corrections_per_minute": "corr./min",
+}
+SHARES = ("inside_share", "tangential_lost")
+
+
+def run(progress: Progress, *, quick: bool) -> list[Row]:
+    import _errors  # compiles the variants
+
+    choices = [(group, choice) for group, members in GROUPS.items() for choice in members]
+    task = progress.add_task("speed", total=len(choices) + 1)
+    times = _errors.ns([choice for _, choice in choices], *((300, 9) if quick else (2000, 61)))
+    progress.advance(task)
+    rows = []
+    for (group, choice), samples in zip(choices, times, strict=True):
+        progress.update(task, description=label(asdict(choice)))
+        figures = _errors.measure(choice, quick=quick)
+        scatter = {"ns": _errors.middle(samples), "ns_low": min(samples), "ns_high": max(samples)}
+        rows.append({"group": group, **asdict(choice), **scatter, **figures})
+        progress.advance(task)
+    return rows
+
+
+def label(row: Row) -> str:
+    """What a row changes, in words."""
+    usual = asdict(Choice())
+    words = [row["format"]] if row["format"] != usual["format"] else []
+    words += [row[key] for key in ("integrator", "mover", "obstacles", "executor") if row[key] != usual[key]]
+    words += [f"{row['tick_rate']} Hz"] if row["tick_rate"] != usual["tick_rate"] else []
+    return ", ".join(words) or ("the product" if row["product"] else "the same, as a variant")
+
+
+def shown(column: str, value: float) -> str:
+    """A number as short as it can be read; tiny shares below what a double can tell are 0."""
+    if value == 0 or (column == "tangential_lost" and abs(value) < 1e-4):
+        return "0"
+    if column in SHARES:
+        return f"{value:.1%}" if abs(value) >= 0.001 else f"{value:.0e}"
+    if column == "ns":
+        return f"{value:,.0f}"
+    return f"{value:.3g}" if abs(value) >= 1e-3 else f"{value:.0e}"
+
+
+def table(rows: list[Row]) -> Table:
+    made = Table("choice", title="speed against error (lengths in blocks)", padding=(0, 1), collapse_padding=True)
+    for heading in COLUMNS.values():
+        made.add_column(heading, justify="right", no_wrap=True)
+    group = ""
+    for row in rows:
+        if row["group"] != group:
+            made.add_section()
+            group = row["group"]
+        style = "bold green" if row["group"] == "the product" else ""
+        made.add_row(label(row), *(shown(column, row[column]) for column in COLUMNS), style=style)
+    return made
+
+
+def main(argv: list[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--json", type=Path, metavar="OUT", help="write all rows to this file")
+    parser.add_argument("--plot", type=Path, metavar="OUT.png", help="draw the picture of the README")
+    parser.add_argument("--quick", action="store_true", help="fewer players, for less time")
+    args = parser.parse_args(argv)
+    console = Console()
+    if not kernels.available():
+        console.print("error: Numba is not installed; the variants are compiled by it")
+        return 2
+    with Progress(console=console, transient=True) as progress:
+        rows = run(progress, quick=args.quick)
+    (console if console.width >= 130 else Console(width=130)).print(table(rows))
+    text = conclusion(rows)
+    console.print(text, highlight=False)
+    if args.json:
+        args.json.write_text(
+            json.dumps({"quick": args.quick, "rows": rows, "conclusion": text}, indent=1) + "\n", "utf-8"
+        )
+    if args.plot:
+        from _picture import draw
+
+        draw(rows, args.plot)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
