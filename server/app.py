@@ -19,12 +19,11 @@ from server.gateway import CLOSE_S, Gateway
 from server.recorder import RecordedWorld
 from server.settings import Settings, SettingsError, parse
 from server.ticker import Ticker, best_alarm
+from server.warmup import warm_up
 from shared.checks import SceneError
-from shared.messages import VERSION, Hello, Inputs, encode
 from shared.scene import Scene, load_scene
 from shared.world import World
 
-WARM_UP_TICKS = 8
 RESTART_WAIT_S = 2.0
 """After so long clients are asked to come back when the server goes down."""
 STOP_S = CLOSE_S + 0.25
@@ -162,28 +161,6 @@ def recorded(scene: Scene, path: str) -> Iterator[World]:
     finally:
         with contextlib.suppress(OSError):
             file.close()
-
-
-def warm_up(scene: Scene) -> None:
-    """Compiles, and takes every way a message goes once, in a game of its own: so the first real tick is not late."""
-
-    class NoLink:
-        def send(self, message: bytes) -> None: ...
-
-        def outstanding(self) -> int:
-            return 0
-
-        def close(self, code: int, reason: str) -> None: ...
-
-    game = Game(scene)
-    session = game.open(NoLink(), 0.0)
-    game.receive(session, encode(Hello(VERSION, {}, "warm-up")), 0.0)
-    for tick in range(1, WARM_UP_TICKS + 1):
-        now = tick / scene.tick_rate
-        game.receive(session, encode(Inputs(tick + 1, tick - 1, bytes((127, 0, 1)))), now)
-        game.tick(now, now)
-    game.lost(session, 1.0)
-    game.tick(1.0, 1.0)
 
 
 def freeze() -> None:
