@@ -5,12 +5,13 @@ server. Each is seeded by the random source it is given.
 """
 
 from collections.abc import Callable
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 from client_sdk.core import Core
+from shared.edits import Edit
 from shared.inputs import NEUTRAL, Input, make_input
 from shared.layout import ID, TEMPLATE, VX, X
-from shared.units import BLOCK
+from shared.units import BLOCK, SEGMENT
 from shared.world import World
 
 
@@ -30,6 +31,15 @@ class Policy(Protocol):
         ...
 
 
+@runtime_checkable
+class Builder(Policy, Protocol):
+    """A policy that also changes blocks."""
+
+    def edit(self, world: World, me: int) -> Edit | None:
+        """What to change with the tick that comes, if anything; asked once per tick, after the wish."""
+        ...
+
+
 class Bot:
     """A policy at the wheel of a client: `AsyncClient.connect(..., before_update=Bot(Wander(Random(1))))`."""
 
@@ -38,13 +48,17 @@ class Bot:
         self._tick = -1
 
     def __call__(self, core: Core) -> None:
-        """Sets the input for the tick that comes, once per tick."""
+        """Sets the input for the tick that comes, and changes blocks with it, once per tick."""
         if core.prediction is None:
             return
         world = core.prediction.predicted
         if world.tick != self._tick and core.entity in world:
             self._tick = world.tick
             core.set_input(self._policy(world, core.entity))
+            if isinstance(self._policy, Builder) and core.state == "playing":
+                edit = self._policy.edit(world, core.entity)
+                if edit is not None:
+                    core.edit(*edit)
 
 
 class Stand:
@@ -124,11 +138,41 @@ class Follow:
         return int(nearest[int(self._random.random() * len(nearest))])
 
 
+class DigAndPlace:
+    """Wanders, and twice a second or so turns a block near itself over: digs it out, or places one where there is none.
+
+    The lowest layer of the scene stays, so that nobody digs a hole through the world.
+    """
+
+    def __init__(self, random: Random) -> None:
+        self._random = random
+        self._wander = Wander(random)
+        self._next = 0
+
+    def __call__(self, world: World, me: int) -> Input:
+        return self._wander(world, me)
+
+    def edit(self, world: World, me: int) -> Edit | None:
+        if world.tick < self._next:
+            return None
+        self._next = world.tick + _ticks(world, 0.2 + 0.6 * self._random.random())
+        x, y, z = (int(part // 1) + self._pick(low) for part, low in zip(world.position(me), (-2, -2, -1), strict=True))
+        kind = world.blocks.get(x, y, z)
+        if kind is None or z <= world.scene.origin[2] * SEGMENT:
+            return None
+        return Edit(x, y, z, 0 if kind else 1 + int(self._random.random() * 4))
+
+    def _pick(self, low: int) -> int:
+        """One of the whole numbers from `low` to 2."""
+        return low + int(self._random.random() * (3 - low))
+
+
 POLICIES: dict[str, Callable[[Random], Policy]] = {
     "stand": Stand,
     "wander": Wander,
     "run-and-jump": RunAndJump,
     "follow": Follow,
+    "dig-and-place": DigAndPlace,
 }
 
 

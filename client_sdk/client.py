@@ -104,6 +104,28 @@ class Client:
         """
         self.core.set_input(make_input(x, y, jump=jump))
 
+    def edit(self, x: int, y: int, z: int, kind: int) -> int:
+        """Places (`kind` 1 to 255) or removes (0) the block (x, y, z) with the next tick, at once in the own picture.
+
+        The server's word comes as an `Answered` event with the number that is returned here; where it says no (out of
+        reach, somebody is in the way, too many), the picture goes back by itself.
+
+        Raises:
+            RuntimeError: the client is not playing.
+        """
+        return self.core.edit(x, y, z, kind)
+
+    def set_input_delay(self, ticks: int) -> None:
+        """Shows the effect of inputs so many ticks (0 to 3) after `set_input`; may change at any time.
+
+        The more, the fewer and smaller the corrections caused by others on a slow connection, and the slower the
+        controls feel: 2 ticks at 32 a second are 63 ms.
+
+        Raises:
+            ValueError: not 0 to 3.
+        """
+        self.core.set_input_delay(ticks)
+
     def update(self, now: float | None = None) -> None:
         """Predicts up to now and sends the inputs of the ticks that have come."""
         now = time.monotonic() if now is None else now

@@ -100,6 +100,24 @@ class AsyncClient:
         """What the player wishes from now on (see `shared.inputs.make_input`)."""
         self.core.set_input(wish)
 
+    def edit(self, x: int, y: int, z: int, kind: int) -> int:
+        """Places (`kind` 1 to 255) or removes (0) a block, as `Client.edit`; the number by which it is `Answered`.
+
+        Raises:
+            RuntimeError: the client is not playing.
+        """
+        number = self.core.edit(x, y, z, kind)
+        self._pump(time.monotonic())
+        return number
+
+    def set_input_delay(self, ticks: int) -> None:
+        """Shows the effect of inputs so many ticks (0 to 3) later, as `Client.set_input_delay`.
+
+        Raises:
+            ValueError: not 0 to 3.
+        """
+        self.core.set_input_delay(ticks)
+
     def view(self) -> View:
         """What to draw now; positions in blocks."""
         return self.core.view(time.monotonic())

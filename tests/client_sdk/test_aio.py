@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from client_sdk.bots import Bot, Wander
-from client_sdk.events import Event, Joined, Left
+from client_sdk.events import Answered, Event, Joined, Left
 from client_sdk.transports.aio import AsyncClient
 from client_sdk.transports.connection import ConnectError
 from shared import messages
@@ -71,6 +71,28 @@ def test_a_player_joins_walks_and_leaves(url: str, run: Run) -> None:
             await client.close()
             events = [event async for event in client]
             assert events[-1] == Left(1000, "closed by this client")
+
+    run(scene())
+
+
+def test_a_block_is_placed_and_the_input_delay_changed(url: str, run: Run) -> None:
+    async def scene() -> None:
+        async with await AsyncClient.connect(url) as client:
+            await first(client, Joined)
+            client.set_input_delay(2)
+            me = client.view().me
+            assert me is not None
+            x, y, z = (int(part // 1) for part in me.position)
+            assert client.edit(x + 2, y, z + 2, 3) == 1
+            assert await first(client, Answered) == Answered(1, True, "done")
+            assert client.edit(x + 20, y, z, 3) == 2
+            assert await first(client, Answered) == Answered(2, False, "out of reach")
+            prediction = client.core.prediction
+            assert prediction is not None
+            await until(lambda: prediction.confirmed.blocks.get(x + 2, y, z + 2) == 3)
+            assert prediction.ahead == 2
+            client.edit(x + 2, y, z + 2, 0)
+            await first(client, Answered)
 
     run(scene())
 

@@ -9,7 +9,7 @@ import pytest
 
 from client_sdk.client import Client
 from client_sdk.core import Core
-from client_sdk.events import Event, Joined, Left
+from client_sdk.events import Answered, Event, Joined, Left
 from client_sdk.transports.connection import UNSENT_MAX, ConnectError, Connection
 from client_sdk.transports.polling import PollingTransport
 from shared import messages
@@ -63,6 +63,24 @@ def test_a_player_joins_walks_and_leaves(url: str) -> None:
     assert client.closed
     assert [event for event in client.poll() if isinstance(event, Left)] == [Left(1000, "closed by this client")]
     client.close()
+
+
+def test_a_block_is_placed_and_removed_again(url: str) -> None:
+    with Client.connect(url) as client:
+        with pytest.raises(RuntimeError, match="has not joined"):
+            client.edit(1, 1, 5, 1)
+        play(client, lambda: client.playing)
+        client.set_input_delay(1)
+        with pytest.raises(ValueError, match="ticks = -1"):
+            client.set_input_delay(-1)
+        me = client.view().me
+        assert me is not None
+        x, y, z = (int(part // 1) for part in me.position)
+        blocks = client.core.prediction.confirmed.blocks  # type: ignore[union-attr]
+        for kind in (7, 0):
+            number = client.edit(x, y + 2, z + 3, kind)
+            events = play(client, lambda kind=kind: blocks.get(x, y + 2, z + 3) == kind)  # type: ignore[misc]
+            assert [event for event in events if isinstance(event, Answered)] == [Answered(number, True, "done")]
 
 
 def test_the_own_scene_is_checked_by_the_server(url: str) -> None:

@@ -1,0 +1,68 @@
+"""Players that dig and place next to each other: nothing diverges, and every edit gets its verdict."""
+
+import random
+
+import pytest
+
+from client_sdk.bots import Bot, DigAndPlace
+from client_sdk.core import Core
+from client_sdk.events import Answered, Diverged
+from shared import edits
+from shared.inputs import Input
+from shared.messages import Command, decode_from_client
+from shared.scene import load_scene
+from tests.match import Match, Path, Player
+
+
+class Building:
+    """A bot as a policy of a match, until it is told to stop."""
+
+    def __init__(self, seed: int) -> None:
+        self._bot = Bot(DigAndPlace(random.Random(seed)))
+        self.stopped = False
+
+    def __call__(self, core: Core, rng: random.Random) -> Input:
+        if not self.stopped:
+            self._bot(core)
+        return core.wish
+
+
+def ordered(player: Player) -> list[int]:
+    """The numbers of the edits that the server has heard of; they are counted where the messages come in."""
+    numbers: list[int] = []
+    receive = player.up._deliver
+
+    def deliver(message: bytes) -> None:
+        command = decode_from_client(message)
+        if isinstance(command, Command) and command.name == edits.NAME:
+            numbers.append(command.number)
+        receive(message)
+
+    player.up._deliver = deliver
+    return numbers
+
+
+@pytest.mark.parametrize("scene", ["flat", "hills"])
+@pytest.mark.parametrize("path", [Path(0.001), Path(0.05, 0.01, 0.01)], ids=["lan", "typical"])
+def test_builders_do_not_diverge_and_hear_of_every_edit(scene: str, path: Path) -> None:
+    match = Match(load_scene(scene), 12)
+    policies = [Building(seed) for seed in range(5)]
+    players = [match.join(policy, path) for policy in policies]
+    asked = [ordered(player) for player in players]
+    match.run(20)
+    for policy in policies:
+        policy.stopped = True
+    match.run(2)
+    verdicts = []
+    for player, numbers in zip(players, asked, strict=True):
+        answers = [event for event in player.events if isinstance(event, Answered)]
+        assert [event.number for event in answers] == numbers == list(range(1, len(numbers) + 1))
+        assert len(numbers) > 15
+        verdicts += [event.verdict for event in answers]
+        assert not [event for event in player.events if isinstance(event, Diverged)]
+        assert player.core.stats.divergences == 0
+        assert set(player.core.stats.corrections_by_cause) <= {"unknown edit", "other entity", "late input"}
+        assert player.core.prediction is not None
+        assert not player.core.prediction._edits, "nothing is left that has not been decided"
+    assert verdicts.count("done") > len(verdicts) / 2
+    assert set(verdicts) <= {"done", "an entity is in the way", "out of reach", "not possible there"}
