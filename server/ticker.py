@@ -193,12 +193,14 @@ class Ticker:
         self.work.reset()
 
     def stats(self) -> dict[str, Any]:
+        """What it has counted. Times are since the start; for those of a window, see `histogram.between`."""
         return {
             "ticks": self.ticks,
             "ticks_late": self.ticks_late,
             "ticks_failed": self.failures,
             "skipped_s": round(self._schedule.skipped_s, 6),
             "tick_lateness_ms": self.lateness.summary(),
+            "tick_lateness_counts": self.lateness.counts(),
             "tick_work_ms": self.work.summary(),
         }
 

@@ -44,9 +44,12 @@ def test_all_clients_play_and_the_figures_are_there(tmp_path: Path) -> None:
 def test_it_takes_a_server_that_runs_already(tmp_path: Path) -> None:
     out = tmp_path / "out.json"
     with real_server("--scene", "topdown", "--tick-rate", "20") as url:
-        done = loadtest("--url", url, "--clients", "4", "--seconds", "1", "--policy", "follow", "--json", str(out))
+        flags = ("--clients", "4", "--seconds", "1", "--policy", "dig-and-place", "--json", str(out))
+        done = loadtest("--url", url, *flags)
     assert done.returncode == 0, done.stdout + done.stderr
-    assert json.loads(out.read_text())["tick_rate"] == 20
+    figures = json.loads(out.read_text())
+    assert figures["tick_rate"] == 20
+    assert figures["resyncs"] == 0
 
 
 def test_no_server_is_one_clear_line() -> None:

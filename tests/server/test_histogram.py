@@ -1,10 +1,11 @@
 """Quantiles from buckets, against the exact ones."""
 
+import json
 import random
 
 import pytest
 
-from server.histogram import BUCKETS, Histogram, _bucket, _upper_us
+from server.histogram import BUCKETS, Histogram, _bucket, _upper_us, between
 
 
 def test_buckets_are_contiguous_and_narrow() -> None:
@@ -43,3 +44,27 @@ def test_nothing_recorded_and_reset() -> None:
     assert histogram.summary() == {"p50": 250, "p99": 250, "max": 250}
     histogram.reset()
     assert histogram == Histogram()
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_window_has_the_figures_of_what_was_recorded_in_it(seed: int) -> None:
+    rng = random.Random(seed)
+    whole, window = Histogram(), Histogram()
+    for _ in range(rng.randrange(2000)):
+        whole.record(rng.expovariate(10))
+    before = json.loads(json.dumps(whole.counts()))
+    for _ in range(rng.randrange(1, 2000)):
+        value = rng.expovariate(1000)
+        whole.record(value)
+        window.record(value)
+    found = between(before, json.loads(json.dumps(whole.counts())))
+    exact = window.summary()
+    assert (found["p50"], found["p99"]) == (exact["p50"], exact["p99"])
+    assert exact["max"] <= found["max"] <= exact["max"] * 1.0626 + 0.002
+
+
+def test_a_window_in_which_nothing_happened() -> None:
+    histogram = Histogram()
+    assert histogram.counts() == []
+    histogram.record(5.0)
+    assert between(histogram.counts(), histogram.counts()) == {"p50": 0, "p99": 0, "max": 0}
