@@ -58,7 +58,7 @@ class World:
         """The blocks changed since the latest step, and their kinds until then."""
         self.edited: dict[Cell, int] = {}
         """The blocks changed between the latest step and the one before it, and their kinds until then."""
-        self._inputs = np.zeros((8, 4), np.int64)
+        self._inputs = np.zeros(32, np.int64)
         self._entities = np.zeros((0, len(layout.COLUMNS)), np.int64)
         self._awake = self._next_awake = self._woken = self._later = np.zeros(0, np.int64)
         self._changed = self._fell = np.zeros(0, np.int64)
@@ -405,9 +405,12 @@ class World:
         """
         n = len(inputs) if inputs else 0
         if inputs:
-            if n > len(self._inputs):
-                self._inputs = np.zeros((2 * n, 4), np.int64)
-            self._inputs[:n] = [(self._row_of[entity], *wish) for entity, wish in inputs.items()]
+            told: list[int] = []
+            for entity, wish in inputs.items():
+                told += (self._row_of[entity], *wish)
+            if len(told) > len(self._inputs):
+                self._inputs = np.zeros(2 * len(told), np.int64)
+            self._inputs[: len(told)] = told
         self._tick += 1
         self.edited, self.editing = self.editing, {}
         self._kernel.step(self._arrays, self._lent(self._inputs), n, self._tick)
