@@ -308,6 +308,7 @@ class Core:
                 self._lead.observe(tick, margin / MARGIN_ONE, phase, now)
         missing = sum(fate in (REPEATED, NEUTRALISED) for fate in snapshot.fates)
         self.stats.inputs_substituted += missing
+        self.stats.inputs_neutralised += snapshot.fates.count(NEUTRALISED)
         return missing > 0
 
     def _corrected(self, correction: Corrected) -> None:

@@ -88,6 +88,7 @@ class Stats:
     inputs_sent: int = 0
     inputs_late: int = 0
     inputs_substituted: int = 0
+    inputs_neutralised: int = 0
     corrections: int = 0
     corrections_by_cause: dict[str, int] = field(default_factory=dict)
     correction_blocks: list[float] = field(default_factory=list)

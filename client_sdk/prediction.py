@@ -232,9 +232,9 @@ class Prediction:
                 (late, "late input"),
                 (self.entity in acted, "server act"),
                 (self._edited_near, "unknown edit"),
-                (not self.grounded(), "missing terrain"),
                 (others and (skipped or not self.neighbours), "other entity"),
                 (others and self._others_differ(guess, truth), "other entity"),
+                (not self.grounded(), "missing terrain"),
             )
             cause = next((cause for holds, cause in causes if holds), NONDETERMINISM)
             correction = Corrected(tick, *mine, self.predicted.tick - tick, cause)

@@ -44,7 +44,7 @@ class InputQueue:
     def __init__(self) -> None:
         self._ring: Ring[Input] = Ring(AHEAD_MAX + 1)
         self._held = NEUTRAL  # the latest to arrive whose tick has come
-        self._missing = 0
+        self._missing = 0  # ticks since anything has arrived
         self.first = self.newest = -1
         self.margins: deque[int] = deque(maxlen=FATES_MAX)
         self.fates: deque[int] = deque(maxlen=FATES_MAX)
@@ -65,7 +65,7 @@ class InputQueue:
             margin = math.floor((at - tick - 1 + ahead) * MARGIN_ONE)
             if at <= tick:
                 self.late += 1
-                self._held = wish
+                self._held, self._missing = wish, 0
                 margin = min(margin, -1)
             else:
                 self._ring.put(at, wish)

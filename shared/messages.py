@@ -61,7 +61,7 @@ USED, REPEATED, NEUTRALISED, IDLE = range(4)
 """USED: the client's own input of that tick. REPEATED: it was missing, the latest to arrive was used again.
 NEUTRALISED: missing for so long that the entity stood still. IDLE: the client had not begun."""
 REPEATS_MAX = 10
-"""A missing input is repeated at most so many ticks."""
+"""The latest input to arrive, be it late, stands in for missing ones for at most so many ticks."""
 AHEAD_MAX = 64
 """An input for more than so many ticks from now is refused."""
 MARGIN_ONE = 256

@@ -1,0 +1,107 @@
+"""What a player feels under every preset: why there are corrections, what survives a stall, how old snapshots are."""
+
+import pytest
+
+from client_sdk.events import Corrected
+from server.pacing import Pacing
+from shared.inputs import JUMP, Input
+from shared.scene import load_scene
+from tests.links import PRESETS
+from tests.match import Match, Player, wander
+
+TICK_MS = 1000 / 32
+
+
+def settled(match: Match, *players: Player) -> None:
+    match.run_until(lambda: all(player.core.state == "playing" for player in players), 60)
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_a_lone_player_is_only_ever_corrected_after_a_late_input(preset: str) -> None:
+    match = Match(load_scene("hills"), 11)
+    player = match.join(wander, PRESETS[preset])
+    settled(match, player)
+    match.run(240)
+    stats = player.core.stats
+    assert set(stats.corrections_by_cause) <= {"late input"}
+    assert stats.corrections <= stats.inputs_substituted
+    assert stats.divergences == 0
+    assert preset != "lan" or (stats.corrections == stats.inputs_late == 0)
+    assert player.closed is None
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_held_keys_survive_every_stall(preset: str) -> None:
+    match = Match(load_scene("arena"), 12)
+    player = match.join(lambda core, rng: Input(100, 60, JUMP), PRESETS[preset])
+    settled(match, player)
+    match.run(120)
+    stats = player.core.stats
+    assert stats.corrections <= stats.inputs_neutralised  # the stall was longer than the server repeats an input
+    assert preset == "far" or stats.corrections == 0
+    assert preset not in ("typical", "far", "outage") or stats.inputs_substituted > 0
+
+
+def ages(preset: str, seconds: float) -> list[float]:
+    """How old (ms) the newest snapshot is at every tick, for three players who see each other."""
+    match = Match(load_scene("hills"), 13)
+    players = [match.join(wander, PRESETS[preset]) for _ in range(3)]
+    settled(match, *players)
+    match.run(5)
+    found: list[float] = []
+
+    def look() -> None:
+        for player in players:
+            assert player.core.prediction is not None
+            found.append((match.game.world.tick - player.core.prediction.confirmed.tick) * TICK_MS)
+
+    match.on_tick.append(look)
+    match.run(seconds)
+    assert all(player.closed is None for player in players)
+    return found
+
+
+@pytest.mark.parametrize("preset", ["lan", "regional", "typical", "far", "wifi", "outage"])
+def test_snapshots_are_as_fresh_as_the_link_delivers(preset: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    held = sorted(ages(preset, 120))
+    monkeypatch.setattr(Pacing, "window", lambda *_: 1 << 40)  # whatever is there is sent at once
+    sent = sorted(ages(preset, 120))
+    p99 = int(0.99 * len(held))
+    assert held[p99] <= sent[p99] + TICK_MS
+    if preset in ("lan", "regional"):
+        assert held[p99] <= PRESETS[preset].rtt_s * 500 + 2 * TICK_MS
+
+
+def test_in_a_dip_snapshots_stay_fresh_and_are_normal_again_at_once() -> None:
+    found = ages("dip", 80)
+    assert max(found) <= 500
+
+
+def test_a_thin_link_stays_connected_and_sees_fresh_snapshots() -> None:
+    found = sorted(ages("thin", 120))
+    assert found[len(found) // 2] <= 600
+    assert found[-1] <= 1500
+
+
+def test_corrections_tell_their_story() -> None:
+    match = Match(load_scene("hills"), 14)
+    player = match.join(wander, PRESETS["far"])
+    settled(match, player)
+    match.run(300)
+    corrections = [event for event in player.events if isinstance(event, Corrected)]
+    assert corrections
+    for event in corrections:
+        assert event.fields
+        assert event.cause == "late input"
+        assert 0 < event.ticks < 96
+        assert event.blocks < 5
+
+
+def test_the_same_seed_tells_the_same_story() -> None:
+    def story() -> list[object]:
+        match = Match(load_scene("hills"), 15)
+        players = [match.join(wander, PRESETS[preset]) for preset in ("wifi", "far")]
+        match.run(30)
+        return [player.events for player in players] + [match.game.world.state_hash()]
+
+    assert story() == story()
