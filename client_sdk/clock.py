@@ -99,10 +99,12 @@ class LeadController(Protocol):
 FASTER, HURRY, JUMP = 0.10, 0.50, 10.0
 """The timeline runs at most `FASTER` off real time, and by up to `HURRY` ahead while every input comes late; where
 the path is more than `JUMP` ticks from where the timeline is, it jumps."""
-SLOWER_S = 3.0
+SLOWER_S = 2.0
 """Cover that is not needed any more is given up with this time constant."""
 LATELY = 3
 """So many inputs in a row that came late are no stall: the last ones of a stall come in its burst, and early."""
+SAFETY = 0.15
+"""Ticks on top of what was needed."""
 STALL_S = 0.25
 """With two round trips on top: the longest stall that a loss makes, and the shortest change of the path."""
 CALM_S = 5.0
@@ -119,11 +121,11 @@ class QuantileLead:
 
     Args:
         late_share: share of the inputs that may come late.
-        safety: ticks added on top.
+        safety: ticks on top of the cover.
         stall_s: see `STALL_S`.
     """
 
-    def __init__(self, late_share: float = 0.0075, safety: float = 0.15, stall_s: float = STALL_S) -> None:
+    def __init__(self, late_share: float = 0.005, safety: float = SAFETY, stall_s: float = STALL_S) -> None:
         self._late_share = late_share
         self._safety = safety
         self._stall_s = stall_s
@@ -165,7 +167,7 @@ class QuantileLead:
         level = self._level()
         self._cover = max(level, level + (self._cover - level) * (1 - elapsed / (SLOWER_S * self._rate)))
         now_needed = min(self._needs[-LATELY:])
-        target = self._safety + max(self._base + self._cover, now_needed)
+        target = max(self._base + self._cover + self._safety, now_needed + min(self._safety, SAFETY))
         way = target - phase
         if self._base + self._safety - phase > JUMP or way < -JUMP:
             return target

@@ -1,0 +1,275 @@
+"""The server's clock, the timeline and the lead, to the number."""
+
+import random
+from collections.abc import Callable, Iterator
+from itertools import pairwise
+
+import pytest
+
+from client_sdk.clock import (
+    CALM_S,
+    FASTER,
+    FIRST_INPUTS,
+    HURRY,
+    JUMP,
+    MEMORY_S,
+    PING_FIRST_S,
+    PING_LATER_S,
+    PINGS,
+    QuantileLead,
+    ServerClock,
+    Timeline,
+)
+
+RATE = 32.0
+SAFETY = 0.15
+
+
+def clock_at(phase: float = 100.0, rtt_s: float = 0.0, spread_s: float = 0.0) -> ServerClock:
+    """A clock that has heard enough."""
+    clock = ServerClock()
+    clock.rate = RATE
+    for i in range(PINGS):
+        sent, took = float(i), rtt_s + (spread_s if i == 0 else 0.0)
+        clock.answered(sent, RATE * (sent + took / 2) + phase, sent + took)
+    return clock
+
+
+class Loop:
+    """A lead controller and a path, without a network in between: need(i) is the phase that input i needs."""
+
+    def __init__(self, need: Callable[[int], float], lead: QuantileLead | None = None, delay: int = 0) -> None:
+        self.clock = clock_at()
+        self.lead = lead or QuantileLead()
+        self.timeline = Timeline(RATE, self.lead.start(self.clock, 0.0), 0.0)
+        self.phases: list[float] = []
+        self.late: list[int] = []
+        self.jumps = 0
+        self._need, self._delay, self._reported = need, delay, 0
+
+    def run(self, inputs: int) -> "Loop":
+        """Lives for so many ticks; what came in one burst is told at once, `delay` ticks later."""
+        for i in range(len(self.phases), len(self.phases) + inputs):
+            self.jumps += self.timeline.steer(self.lead, self.clock, i / RATE)
+            self.phases.append(self.timeline.phase)
+            if self.timeline.phase < self._need(i):
+                self.late.append(i)
+            while self._reported <= i and self._reported + self._need(self._reported) - 101 + self._delay <= i:
+                told, phase = self._reported, self.phases[self._reported]
+                self.lead.observe(told, phase - self._need(told), phase, i / RATE)
+                self._reported += 1
+        return self
+
+    def speeds(self) -> Iterator[float]:
+        """By how much the timeline was off real time, tick by tick."""
+        return (after - before for before, after in pairwise(self.phases))
+
+
+# -- the server's clock ------------------------------------------------------------------------------------
+
+
+def test_no_ping_is_due_before_the_rate_is_known() -> None:
+    clock = ServerClock()
+    assert not clock.due(5.0)
+    assert clock.next_ping == float("inf")
+    assert not clock.ready
+
+
+def test_pings_come_quickly_first_and_slowly_later() -> None:
+    clock = ServerClock()
+    clock.rate = RATE
+    sent, now = [], 0.0
+    while now < 4:
+        if clock.due(now):
+            sent.append(now)
+        now += 0.01
+    gaps = [after - before for before, after in pairwise(sent)]
+    assert gaps[: PINGS - 1] == pytest.approx([PING_FIRST_S] * (PINGS - 1), abs=0.011)
+    assert gaps[PINGS - 1 :] == pytest.approx([PING_LATER_S] * len(gaps[PINGS - 1 :]), abs=0.011)
+
+
+def test_the_phase_is_exact_where_both_ways_take_the_same() -> None:
+    clock = clock_at(phase=123.25, rtt_s=0.25)
+    assert clock.ready
+    assert clock.phase == 123.25
+    assert clock.tick(10.0) == 123.25 + 320
+    assert (clock.rtt_s, clock.spread_s) == (0.25, 0.0)
+
+
+def test_pings_that_stood_in_a_queue_do_not_count() -> None:
+    clock = clock_at(phase=50.0, rtt_s=0.0625)
+    for i in range(8):  # half a second, all of it on one way
+        clock.answered(10.0 + i, RATE * (10.0 + i + 0.03125) + 50.0, 10.5 + i)
+    assert clock.phase == pytest.approx(50.0)
+    assert clock.rtt_s == 0.0625
+    assert clock.spread_s == 0.4375
+
+
+def test_a_pong_from_the_future_is_ignored() -> None:
+    clock = clock_at(phase=7.0)
+    clock.answered(99.0, 0.0, 98.0)
+    clock.answered(float("nan"), 0.0, 98.0)
+    assert clock.phase == 7.0
+
+
+def test_the_phase_follows_a_drift_of_200_ppm() -> None:
+    clock, rng = ServerClock(), random.Random(1)
+    clock.rate = RATE
+    for i in range(600):
+        sent, there, back = float(i), rng.uniform(0.01, 0.02), rng.uniform(0.01, 0.02)
+        clock.answered(sent, RATE * (sent + there) * 1.0002, sent + there + back)
+    assert clock.tick(600.0) == pytest.approx(RATE * 600 * 1.0002, abs=0.2)
+
+
+# -- the timeline ------------------------------------------------------------------------------------------
+
+
+def test_a_timeline_is_a_phase() -> None:
+    timeline = Timeline(RATE, 5.5, 0.0)
+    assert timeline.tick(2.0) == 69.5
+    assert timeline.when(69.5) == 2.0
+
+
+def test_a_timeline_tells_of_jumps_only() -> None:
+    class To:
+        phase = 0.0
+
+        def start(self, clock: ServerClock, now: float) -> float:
+            return 0.0
+
+        def observe(self, tick: int, margin: float, phase: float, now: float) -> None: ...
+
+        def steer(self, phase: float, elapsed: float, clock: ServerClock, now: float) -> float:
+            assert elapsed >= 0
+            return self.phase
+
+    to, timeline, clock = To(), Timeline(RATE, 0.0, 0.0), clock_at()
+    to.phase = JUMP
+    assert not timeline.steer(to, clock, 1.0)
+    to.phase = 2.5 * JUMP
+    assert timeline.steer(to, clock, 0.5)  # a clock that goes back is no time at all
+    assert timeline.phase == 2.5 * JUMP
+
+
+# -- the lead ----------------------------------------------------------------------------------------------
+
+
+def test_it_starts_on_the_safe_side() -> None:
+    lead = QuantileLead()
+    assert lead.start(clock_at(phase=100.0, rtt_s=0.25), 9.0) == 100 + 0.125 * RATE + 2
+    assert lead.start(clock_at(phase=100.0, rtt_s=0.25, spread_s=0.5), 9.0) == 100 + 0.625 * RATE + 2
+
+
+def test_a_steady_path_gets_what_it_needs_and_the_safety() -> None:
+    loop = Loop(lambda i: 101.0).run(2000)
+    assert loop.phases[-1] == pytest.approx(101 + SAFETY, abs=0.01)
+    assert not loop.late
+
+
+def test_it_holds_still_until_it_has_seen_enough() -> None:
+    loop = Loop(lambda i: 101.0).run(FIRST_INPUTS)
+    assert set(loop.phases) == {102.0}
+
+
+def test_its_own_corrections_cancel_however_late_it_hears_of_them() -> None:
+    """The way is gone once, at full speed: no overshoot and no ringing behind a round trip of two seconds."""
+    for delay in (0, 8, 64):
+        loop = Loop(lambda i: 101.0 if i < 1000 else 105.0, delay=delay).run(2000)
+        rise = loop.phases[1000:]
+        assert min(after - before for before, after in pairwise(rise)) > -1e-4
+        assert max(rise) == pytest.approx(105 + SAFETY, abs=0.01)
+
+
+def test_one_stall_is_ignored_however_long_its_burst() -> None:
+    loop = Loop(lambda i: 101.0 + max(0, 5 - (i - 5000)) * (5000 <= i < 5005)).run(8000)
+    assert loop.late == [5000, 5001, 5002, 5003, 5004]
+    assert max(loop.phases[4000:]) == pytest.approx(101 + SAFETY, abs=0.01)
+
+
+def test_stalls_that_come_often_are_covered() -> None:
+    """Five inputs late in a hundred: 1 % late by 5, 1 % by 4, ...; all are covered, as the share is less than 1 %."""
+    loop = Loop(lambda i: 101.0 + max(0, 5 - i % 100)).run(8000)
+    assert loop.phases[-1] == pytest.approx(106 + SAFETY, abs=0.01)
+    assert max(loop.late) < 600
+
+
+def test_of_rarer_and_longer_stalls_only_the_share_is_left_out() -> None:
+    """A stall of 7 inputs in five hundred: 0.2 % need each of 1 to 7 ticks, and two of these may be late."""
+    loop = Loop(lambda i: 101.0 + max(0, 7 - i % 500)).run(16_000)
+    assert {i % 500 for i in loop.late if i >= 4000} == {0, 1}
+    assert loop.phases[-1] == pytest.approx(106 + SAFETY, abs=0.02)
+
+
+def test_a_spike_is_followed_and_left_behind_at_once() -> None:
+    """A second in which all needs are 3 ticks higher: up within half a second, down again as fast, nothing learnt."""
+    loop = Loop(lambda i: 101.0 + 3 * (4000 <= i < 4032)).run(6000)
+    assert 4000 <= min(loop.late) <= max(loop.late) <= 4012
+    assert max(loop.phases[4000:4032]) == pytest.approx(104 + SAFETY, abs=0.02)
+    assert loop.phases[4032 + 40] == pytest.approx(101 + SAFETY, abs=0.1)
+    assert loop.phases[-1] == pytest.approx(101 + SAFETY, abs=0.02)
+
+
+def test_it_hurries_only_while_every_input_is_late() -> None:
+    loop = Loop(lambda i: 101.0 + 4 * (i >= 4000)).run(5000)
+    speeds = list(loop.speeds())
+    assert max(speeds) == pytest.approx(HURRY)
+    assert min(speeds) >= -FASTER - 1e-9
+    caught_up = max(loop.late)
+    assert max(speeds[caught_up + 2 :]) <= FASTER + 1e-9
+
+
+def test_it_rises_at_once_and_falls_slowly() -> None:
+    rough = Loop(lambda i: 101.0 + (i * 7919 % 100) / 50 * (i < 4000)).run(4000)
+    assert rough.phases[-1] == pytest.approx(103 + SAFETY, abs=0.1)
+    high = rough.phases[-1]
+    rough.run(int(MEMORY_S * RATE / 2))
+    assert rough.phases[-1] == pytest.approx(high, abs=0.1)
+    rough.run(int(MEMORY_S * RATE))
+    assert rough.phases[-1] == pytest.approx(101 + SAFETY, abs=0.1)
+    assert min(rough.speeds()) > -0.04
+
+
+def test_beyond_ten_ticks_it_jumps_both_ways() -> None:
+    loop = Loop(lambda i: 101.0 + 40 * (3000 <= i < 4000)).run(5000)
+    assert loop.jumps == 2
+    assert loop.phases[3999] == pytest.approx(141 + SAFETY, abs=0.02)
+    assert loop.phases[-1] == pytest.approx(101 + SAFETY, abs=0.02)
+
+
+def test_no_stall_makes_it_jump() -> None:
+    """Not even one that is the first thing it sees."""
+    loop = Loop(lambda i: 101.0 + max(0, 7 - (i - 20)) * (i >= 20) + 8 * (i == 20)).run(3000)
+    assert loop.jumps == 0
+
+
+@pytest.mark.parametrize("ppm", [-200, 200])
+def test_a_drift_costs_nothing(ppm: int) -> None:
+    def need(i: int) -> float:
+        return 101.0 + i * ppm * 1e-6
+
+    loop = Loop(need).run(40_000)
+    assert not loop.late
+    above = [phase - need(i) for i, phase in enumerate(loop.phases)][1000:]
+    assert 0 < min(above) <= max(above) < SAFETY + 0.1
+
+
+def test_bounded_jitter_never_makes_an_input_late() -> None:
+    rng = random.Random(3)
+    needs = [100.5 + rng.uniform(0, 1.28) for _ in range(20_000)]
+    loop = Loop(needs.__getitem__).run(20_000)
+    assert not loop.late
+    assert sum(loop.phases[1000:]) / 19_000 < max(needs) + SAFETY + 0.05
+
+
+def test_the_share_is_what_is_late() -> None:
+    rng = random.Random(4)
+    needs = [100.0 + rng.expovariate(2.0) for _ in range(40_000)]
+    for share in (0.01, 0.05, 0.2):
+        loop = Loop(needs.__getitem__, QuantileLead(share, safety=0.0)).run(40_000)
+        assert len([i for i in loop.late if i > 4000]) / 36_000 == pytest.approx(share, rel=0.2)
+
+
+def test_a_change_of_the_path_for_good_is_the_path_after_a_while() -> None:
+    loop = Loop(lambda i: 101.0 + 2.0 * (i >= 3000)).run(3000 + int(3 * CALM_S * RATE))
+    assert loop.phases[-1] == pytest.approx(103 + SAFETY, abs=0.02)
+    assert len(loop.late) <= 12
