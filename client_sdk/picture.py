@@ -52,6 +52,8 @@ class Picture:
 
     def smooth(self, done: Reconciled, now: float) -> None:
         """A replay has moved things: they are shown to go there gradually (what the rules placed jumps)."""
+        if not done.replayed:
+            return
         known = self._prediction.predicted
         self._smoothing = {entity: old for entity, old in self._smoothing.items() if entity in known}
         for entity, offset in done.offsets.items():

@@ -5,7 +5,8 @@ is written, never stepped. *Predicted* is confirmed plus a replay: stepped by th
 while everybody else goes on with the latest input known of them. For every predicted tick the states are kept. When
 the snapshot for tick T comes, it is compared with what was predicted for T, `==` on every bit of every entity:
 
-    equal     the prediction stands; nothing is done
+    equal     the prediction stands; nothing is done (nor where only those differ who are too far away to be met
+              before the next replay: they are put right with it)
     not       predicted = confirmed, and the inputs for T+1 .. now are replayed
 
 Edits are predicted as well: carried out at their tick by the rule that the server uses, and forgotten when it has
@@ -24,7 +25,7 @@ from shared import edits
 from shared.checks import Cell
 from shared.edits import Edit
 from shared.inputs import NEUTRAL, Input
-from shared.layout import COLUMNS, FALLING, FLAGS, ID, Int64s, X
+from shared.layout import COLUMNS, FALLING, FLAGS, ID, TEMPLATE, Int64s, X
 from shared.messages import REPEATS_MAX, ProtocolError, Snapshot
 from shared.ring import Ring
 from shared.scene import Scene
@@ -35,6 +36,8 @@ from shared.world import World
 HISTORY = 256
 """Ticks for which predictions and inputs are kept."""
 KEYFRAME = -1
+MEET_BLOCKS = 12
+"""Whoever is further away cannot be met before a replay, at the speeds that legs have."""
 NEAR_BLOCKS = 5.0
 """An edit this near may explain a correction."""
 
@@ -79,6 +82,7 @@ class Prediction:
         self._inputs: Ring[Input] = Ring(HISTORY)
         self._states: Ring[Int64s] = Ring(HISTORY)
         self._templates = len(scene.templates)
+        self._shown_ahead = np.array([template.shown == "predicted" for template in scene.templates])
         self._exist = frozenset(scene.segments())
         self._terrain_changed = self._edited_near = False
         self._acted: set[int] = set()
@@ -197,8 +201,11 @@ class Prediction:
 
     def _wish(self, tick: int) -> Input:
         """The own input of a tick; where none was sent, what the server puts in its place."""
-        wishes = (self._inputs.get(before) for before in range(tick, tick - REPEATS_MAX - 1, -1))
-        return next((wish for wish in wishes if wish is not None), NEUTRAL)
+        for before in range(tick, tick - REPEATS_MAX - 1, -1):
+            wish = self._inputs.get(before)
+            if wish is not None:
+                return wish
+        return NEUTRAL
 
     def edit(self, number: int, edit: Edit) -> int:
         """Files an edit for the next tick that has no input yet; that tick."""
@@ -223,7 +230,7 @@ class Prediction:
             self._replay(tick)
             return NOTHING
         guess, truth = self._states.get(tick), self._truth()
-        if guess is not None and not self._terrain_changed and np.array_equal(guess, truth):
+        if guess is not None and not self._terrain_changed and self._near_equal(guess, truth):
             return NOTHING
         correction = None
         if guess is not None and (mine := self._difference(guess, truth)):
@@ -267,6 +274,20 @@ class Prediction:
                     self.predicted.remove(entity)
         while self.predicted.tick < to:
             self.step()
+
+    def _near_equal(self, guess: Int64s, truth: Int64s) -> bool:
+        """Whether all that could meet the own entity, or is drawn as predicted, is as predicted."""
+        if np.array_equal(guess, truth):
+            return True
+        return np.array_equal(self._that_count(guess), self._that_count(truth))
+
+    def _that_count(self, states: Int64s) -> Int64s:
+        mine = states[states[:, ID] == self.entity]
+        if not len(mine):
+            return states
+        ways = np.abs(states[:, X : X + 3] - mine[0, X : X + 3]).max(axis=1)
+        near: Int64s = states[(ways < MEET_BLOCKS * BLOCK) | self._shown_ahead[states[:, TEMPLATE]]]
+        return near
 
     def _difference(self, guess: Int64s, truth: Int64s) -> tuple[tuple[str, ...], float] | None:
         """In which fields, and by how many blocks, the own entity is not as predicted."""

@@ -642,3 +642,26 @@ def settle(w: Arrays, rows: Any, states: Any, n: int, tick: int) -> int:
                     return i
         write(w, rows[i], states, CELL * i, tick)
     return n
+
+
+# -- reading -------------------------------------------------------------------------------------------------
+
+
+@jit
+def collect(e: Any, rows: int, out: Any) -> int:
+    """Copies the states in use to `out` (12 columns each), ascending by id, and without bookkeeping; how many."""
+    n = 0
+    for row in range(rows):
+        entity = e[(row << WIDTH_SHIFT) + ID]
+        if entity == 0:
+            continue
+        at = n
+        while at > 0 and out[(at - 1) * CELL + ID] > entity:
+            at -= 1
+        for k in range(n * CELL - 1, at * CELL - 1, -1):
+            out[k + CELL] = out[k]
+        for k in range(CELL):
+            out[at * CELL + k] = e[(row << WIDTH_SHIFT) + k]
+        out[at * CELL + FLAGS] &= FALLING
+        n += 1
+    return n

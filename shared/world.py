@@ -27,6 +27,8 @@ from shared.units import BLOCK, SEGMENT, SPEED, to_position, to_positions, to_ve
 STATES = layout.CELL
 """Columns of an entity's state: id, template, flags, x, y, z, vx, vy, vz, move_x, move_y, buttons."""
 ID_MAX = (1 << 31) - 1
+COLLECT_MAX = 1024
+"""Up to so many rows, the kernel sorts states by insertion: 1 us for some ten, instead of 9."""
 
 
 class OverlapError(SceneError):
@@ -93,6 +95,9 @@ class World:
 
     def states(self) -> layout.Int64s:
         """The whole states of all entities, [n, 12], ascending by id: equal worlds have equal ones. A copy."""
+        if self.compiled and self._rows <= COLLECT_MAX:
+            out = np.empty((self._rows, STATES), np.int64)
+            return out[: self._kernel.collect(self._entities.reshape(-1), self._rows, out.reshape(-1))]
         rows: layout.Int64s = self._entities[: self._rows, :STATES]
         rows = rows[rows[:, ID] != 0]
         rows = rows[np.argsort(rows[:, ID])]
