@@ -52,6 +52,20 @@ def test_it_takes_a_server_that_runs_already(tmp_path: Path) -> None:
     assert figures["resyncs"] == 0
 
 
+@pytest.mark.slow
+def test_memory_of_the_server_is_flat_under_sixty_clients(tmp_path: Path) -> None:
+    out = tmp_path / "out.json"
+    done = loadtest("--clients", "60", "--seconds", "20", "--policy", "dig-and-place", "--json", str(out))
+    assert done.returncode == 0, done.stdout + done.stderr
+    figures = json.loads(out.read_text())
+    memory = figures["server_rss_mb"]
+    assert len(memory) >= 15
+    assert max(memory[5:]) - memory[5] <= 8.0, memory
+    assert figures["tick_lateness_ms"]["p99"] > 0
+    assert figures["disconnects"] == 0
+    print(f"60 clients: memory {memory}, lateness {figures['tick_lateness_ms']}")
+
+
 def test_no_server_is_one_clear_line() -> None:
     done = loadtest("--url", "ws://127.0.0.1:9", "--clients", "2")
     assert done.returncode == 2

@@ -1,0 +1,115 @@
+"""A real server process under test: its streams, its pages, its end."""
+
+import json
+import os
+import queue
+import re
+import subprocess
+import sys
+import threading
+import time
+import urllib.request
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).resolve().parents[2]
+START_S = 90.0
+"""Compiling the kernel for the first time takes its time."""
+END_S = 10.0
+UPGRADE = (
+    b"GET / HTTP/1.1\r\nHost: x\r\nConnection: Upgrade\r\nUpgrade: websocket\r\n"
+    b"Sec-WebSocket-Version: 13\r\nSec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\n\r\n"
+)
+
+
+class ServerProcess:
+    """`python -m server` with its two streams read by threads."""
+
+    def __init__(self, *arguments: str, **environment: str) -> None:
+        clean = {name: value for name, value in os.environ.items() if not name.startswith("SOVEREIGN_")}
+        self.process = subprocess.Popen(
+            [sys.executable, "-m", "server", *arguments],
+            cwd=ROOT,
+            env=clean | environment,
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        self.out: queue.Queue[str | None] = queue.Queue()
+        self.errors: list[str] = []
+        self._readers = [
+            threading.Thread(target=self._read_out, daemon=True),
+            threading.Thread(target=self._read_errors, daemon=True),
+        ]
+        for reader in self._readers:
+            reader.start()
+
+    def _read_out(self) -> None:
+        assert self.process.stdout is not None
+        for line in self.process.stdout:
+            self.out.put(line)
+        self.out.put(None)
+
+    def _read_errors(self) -> None:
+        assert self.process.stderr is not None
+        self.errors.extend(self.process.stderr)
+
+    def address(self) -> tuple[str, int]:
+        """Waits for the line that says it is ready."""
+        line = self.out.get(timeout=START_S)
+        found = re.fullmatch(r"listening on ws://(\[[^]]+\]|[^:]+):(\d+)\n", line or "")
+        assert found, (line, self.errors)
+        return found[1].strip("[]"), int(found[2])
+
+    def end(self, number: int | None = None) -> int:
+        """Its exit code, after a signal if one is given; both streams have been read to their ends."""
+        if number is not None:
+            self.process.send_signal(number)
+        code = self.process.wait(END_S if number is not None else START_S)
+        for reader in self._readers:
+            reader.join(END_S)
+        return code
+
+    def rest(self) -> list[str]:
+        """The lines on stdout that nobody has read yet."""
+        lines = []
+        while (line := self.out.get(timeout=END_S)) is not None:
+            lines.append(line)
+        return lines
+
+    def close(self) -> None:
+        if self.process.poll() is None:
+            self.process.kill()
+        self.end()
+        for stream in (self.process.stdout, self.process.stderr):
+            assert stream is not None
+            stream.close()
+
+
+@contextmanager
+def running(*arguments: str, **environment: str) -> Iterator[ServerProcess]:
+    server = ServerProcess(*arguments, **environment)
+    try:
+        yield server
+    finally:
+        server.close()
+
+
+def until(condition: Callable[[], bool], seconds: float = END_S) -> None:
+    deadline = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+
+
+def page(address: tuple[str, int], path: str) -> str:
+    with urllib.request.urlopen(f"http://{address[0]}:{address[1]}{path}", timeout=END_S) as answer:
+        return str(answer.read().decode())
+
+
+def stats(address: tuple[str, int]) -> dict[str, Any]:
+    found: dict[str, Any] = json.loads(page(address, "/stats"))
+    return found
