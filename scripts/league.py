@@ -256,12 +256,13 @@ def settings(ours: Row, rivals: list[Row]) -> list[tuple[float, float, float]]:
     """Late share, safety in ticks, longest stall in seconds: with these, ours should be as late as the rivals are."""
     found: set[tuple[float, float]] = set()
     for rival in rivals:
-        share = round(rival["late_inputs_share"], 4)
+        share = rival["late_inputs_share"]
         if share < SHARE_MAX:
-            found |= {(share, 0.0), (1.15 * share, 0.0), (share, SAFETY), (2 * share, 2 * SAFETY)}
-        if share < 0.001:  # a minute has too few of those to count them: as far ahead, then, and not as late
-            more = (rival["added_latency_ms"] - ours["added_latency_ms"]) / TICK_MS
-            found.add((0.005, round(SAFETY + max(more, 0.0), 2)))
+            found |= {(round(more * share, 5), 0.0) for more in (0.7, 0.85, 1.0, 1.15)}
+            found |= {(round(share, 5), SAFETY), (round(2 * share, 5), 2 * SAFETY), (round(2 * share, 5), 3 * SAFETY)}
+        if share < 0.001:  # two minutes have too few of those to count them: a margin, as far ahead as the rival
+            more = max((rival["added_latency_ms"] - ours["added_latency_ms"]) / TICK_MS, 0.0)
+            found |= {(0.005, round(SAFETY + more + extra, 2)) for extra in (0.0, 0.4)}
     stalls = (STALL_S, LONG_S) if PRESETS[ours["preset"]].spike else (STALL_S,)
     return [(*one, stall_s) for one in sorted(found) for stall_s in stalls]
 
