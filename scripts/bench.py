@@ -2,10 +2,15 @@
 
 `physics` times the compiled step on crowds, beside the same step in C, which it builds and which must reach the
 same hash. A figure is the median of repeated runs, its range beside it. Two busy cores scatter by a third.
+
+`server` looks for the most clients that one server process holds at 30 Hz, all wandering over hills with some 50
+entities in view, beside what the same gateway holds without a game. It needs the machine for itself: while others
+work, ticks are late for their sake. The CPU time per client and tick is told as well, and what it comes to.
 """
 
 import argparse
 import json
+import os
 import statistics
 import sys
 from pathlib import Path
@@ -16,6 +21,7 @@ from rich.progress import Progress
 from rich.table import Table
 
 import _bench_physics as physics
+import _bench_server as server
 import _step_c
 from _crowds import Samples
 from shared import kernels
@@ -116,6 +122,89 @@ def run_physics(args: argparse.Namespace, console: Console) -> int:
     return 0 if report["hash_equal_to_c"] is not False and report["obstacles_agree"] else 1
 
 
+def run_server(args: argparse.Namespace, console: Console) -> int:
+    seconds, resolution, steps, searches = (1.5, 0.2, 3, 1) if args.quick else (5.0, 0.04, 9, 3)
+    cores = os.cpu_count() or 1
+    runs: list[dict[str, Any]] = []
+
+    def report(stage: dict[str, Any]) -> None:
+        console.print(
+            f"  {stage['clients']:5} clients: {'held' if stage['held'] else 'not held'}, ticks late "
+            f"{stage['tick_lateness_ms']['p99']:.1f} ms (p99), worst client {stage['snapshots_share_worst']:.0%}, "
+            f"{stage['cpu_us_per_client_tick']:.1f} us, generator {stage['generator_cpu_share']:.0%}",
+            highlight=False,
+            soft_wrap=True,
+        )
+
+    for number in range(searches):
+        load = os.getloadavg()[0]
+        console.print(f"search {number + 1} of {searches}: the game (load of the machine before: {load:.1f})")
+        with server.rig("game", seed=number + 1) as running:
+            stages = server.search(running, 400, seconds, resolution, steps, report)
+        best = server.most(stages)
+        by = best or stages[-1]
+        cpu_us = statistics.median(
+            stage["cpu_us_per_client_tick"] for stage in stages if stage["ticks_share"] > 0.5 or stage is by
+        )
+        size = int(by["bytes_down_per_client_per_s"] / server.RATE)
+        console.print(f"  the same gateway without a game, {size} bytes a tick")
+        with server.rig("echo", str(size), seed=number + 1) as running:
+            first = int(0.5 * min(1e6 / server.RATE / cpu_us, server.CAPACITY)) if args.quick else 1000
+            echoed = server.search(running, first, seconds, resolution, 2 if args.quick else steps, report)
+        echo = server.most(echoed)
+        echo_us = statistics.median(stage["cpu_us_per_client_tick"] for stage in echoed)
+        shares = server.profile(max(50, by["clients"] // 2), seconds)
+        runs.append(
+            {
+                "gateway": "websockets",
+                "max_clients": best["clients"] if best else 0,
+                "echo_bound_clients": echo["clients"] if echo else 0,
+                "cpu_us_per_client_tick": cpu_us,
+                "echo_cpu_us_per_client_tick": echo_us,
+                "clients_by_cpu": int(1e6 / server.RATE / cpu_us),
+                "echo_clients_by_cpu": int(1e6 / server.RATE / echo_us),
+                "parts": {name: share * cpu_us for name, share in shares.items()},
+                "entities_in_view": by["rows_per_snapshot"],
+                "bytes_per_client_per_s": by["bytes_down_per_client_per_s"],
+                "snapshot_age_ms": by["snapshot_age_ms"],
+                "generator_cpu_share": by["generator_cpu_share"],
+                "generator_late_ms": by["generator_late_ms"],
+                "load_before": load,
+                "stages": stages,
+                "echo_stages": echoed,
+            }
+        )
+    console.print(capacity_table(runs))
+    if max(run["load_before"] for run in runs) > cores / 2:
+        console.print("other processes were at work: the numbers of clients are too low, go by the CPU time")
+    if args.json:
+        report_ = {"quick": args.quick, "rate": server.RATE, "cores": cores, "runs": runs}
+        args.json.write_text(json.dumps(report_, indent=1) + "\n", encoding="utf-8")
+    return 0
+
+
+def capacity_table(runs: list[dict[str, Any]]) -> Table:
+    made = Table("figure", title="server: 30 Hz, one process; each search apart")
+    for number in range(len(runs)):
+        made.add_column(f"search {number + 1}", justify="right")
+    for name, form in (
+        ("max_clients", "{:,}"),
+        ("echo_bound_clients", "{:,}"),
+        ("cpu_us_per_client_tick", "{:.1f}"),
+        ("echo_cpu_us_per_client_tick", "{:.1f}"),
+        ("clients_by_cpu", "{:,}"),
+        ("echo_clients_by_cpu", "{:,}"),
+        ("entities_in_view", "{:.0f}"),
+        ("bytes_per_client_per_s", "{:,.0f}"),
+        ("generator_cpu_share", "{:.0%}"),
+    ):
+        made.add_row(name, *("" if run[name] is None else form.format(run[name]) for run in runs))
+    made.add_section()
+    for part in sorted(runs[0]["parts"], key=lambda part: -runs[0]["parts"][part]):
+        made.add_row(f"us in {part}", *(f"{run['parts'][part]:.2f}" for run in runs))
+    return made
+
+
 def table(rows: list[Row]) -> Table:
     made = Table("figure", "unit", title="physics: per entity and tick, per tick, or per call")
     for heading in ("median", "range", "target"):
@@ -135,6 +224,10 @@ def main(argv: list[str] | None = None) -> int:
     command.add_argument("--json", type=Path, metavar="OUT", help="write all figures to this file")
     command.add_argument("--quick", action="store_true", help="fewer rounds")
     command.set_defaults(run=run_physics)
+    command = commands.add_parser("server", help="clients per server process (Linux)")
+    command.add_argument("--json", type=Path, metavar="OUT", help="write all figures to this file")
+    command.add_argument("--quick", action="store_true", help="one coarse search, within 45 s")
+    command.set_defaults(run=run_server)
     args = parser.parse_args(argv)
     return int(args.run(args, Console()))
 

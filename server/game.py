@@ -102,6 +102,7 @@ class Game:
         self._respawn: list[int] = []
         self._deadline: float | None = None
         self._spawned = 0
+        self._rules = scene.to_table()
 
     # -- what arrives is filed -----------------------------------------------------------------------------
 
@@ -214,7 +215,7 @@ class Game:
                 continue
             session.entity = entity
             self.counters.joined += 1
-            welcome = Welcome(messages.VERSION, self.world.tick, entity, self.scene.to_table())
+            welcome = Welcome(messages.VERSION, self.world.tick, entity, self._rules)
             session.send(encode(welcome))
 
     def _revive(self) -> None:

@@ -1,0 +1,216 @@
+"""What `bench.py server` measures: how many clients one server process holds, and what a client costs it.
+
+A client counts as held if the server's ticks are on time (99 % start less than a tick late) and every single client
+gets at least 95 % of its snapshots. Players fill the hills from a corner on, at a constant density, so one server can
+be asked about many numbers of clients in turn. All times are of one run on one machine, the echo server's too.
+"""
+
+import contextlib
+import http.client
+import json
+import math
+import queue
+import random
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+from server.histogram import between
+
+ROOT = Path(__file__).resolve().parent.parent
+RATE = 30
+PER_SEGMENT = 5
+"""Players per segment of 32 x 32 blocks: a client, who sees nine segments or more, sees about 50."""
+CAPACITY = 2000
+SHARE_MIN = 0.95
+JOINS_PER_S = 200.0
+SETTLE_S = 1.5
+"""After the last join: terrain is delivered, caches are warm."""
+JOIN_S = 5.0
+"""What all the joins may take beyond their pace."""
+PATIENCE_S = 30.0
+START_S = 120.0
+
+Figures = dict[str, Any]
+
+
+def scene_toml(capacity: int) -> str:
+    """`hills`, as large as that many players need, with a spawn for each, segment by segment."""
+    hills = (ROOT / "shared" / "scenes" / "hills.toml").read_text("utf-8")
+    rest = "\n".join(line for line in hills.splitlines() if not line.startswith(("#", "size", "spawns")))
+    side = math.ceil(math.sqrt(capacity / PER_SEGMENT))
+    rng = random.Random(1)
+    spawns = [
+        [32 * x + rng.randrange(1, 31), 32 * y + rng.randrange(1, 31), 27]
+        for x, y in sorted(((x, y) for x in range(side) for y in range(side)), key=lambda at: (max(at), at))
+        for _ in range(PER_SEGMENT)
+    ]
+    return f"tick_rate = {RATE}\nsize = [{side}, {side}, 1]\nspawns = {spawns}\n{rest}\n"
+
+
+class Rig:
+    """A server and a generator of load, both processes of their own."""
+
+    def __init__(self, kind: str, scene: Path, *more: str, seed: int = 1) -> None:
+        self._server = self._start("_busy_server.py", kind, str(scene), *more)
+        assert self._server.stdout is not None
+        line = self._server.stdout.readline()
+        if not line.startswith("listening on "):
+            raise RuntimeError("the server did not start")
+        self.port = int(line.rpartition(":")[2])
+        order = {"port": self.port, "seed": seed, "rate": RATE, "joins_per_s": JOINS_PER_S}
+        self._generator = self._start("_generator.py", json.dumps(order))
+        self._said: queue.Queue[Figures] = queue.Queue()
+        threading.Thread(target=self._listen, daemon=True).start()
+
+    def hold(self, clients: int, seconds: float) -> Figures:
+        """So many clients, once they play, for so long: what both sides have counted."""
+        self._tell(f"clients {clients}")
+        deadline = time.monotonic() + clients / JOINS_PER_S + JOIN_S
+        while time.monotonic() < deadline:
+            status = self._next()
+            if status.get("playing") == clients == status.get("clients"):
+                break
+        time.sleep(SETTLE_S)
+        gone = self._drain().get("gone", 0)
+        before = self.stats()
+        self._tell("begin")
+        time.sleep(seconds)
+        self._tell("end")
+        figures = self._next()
+        while "seconds" not in figures:
+            figures = self._next()
+        after = self.stats()
+        ticks = max(1, after["ticks"] - before["ticks"])
+        cpu_s = after["cpu_s"] - before["cpu_s"]
+        lateness = between(before["tick_lateness_counts"], after["tick_lateness_counts"])
+        expected = RATE * figures["seconds"]
+        held = (
+            lateness["p99"] < 1e3 / RATE
+            and figures["snapshots_worst"] >= SHARE_MIN * expected
+            and figures["gone"] == gone
+            and figures["clients_in_window"] == clients
+        )
+        told = {
+            "clients": clients,
+            "held": held,
+            "tick_lateness_ms": lateness,
+            "ticks_share": ticks / RATE / (after["uptime_s"] - before["uptime_s"]),
+            "snapshots_share_worst": figures["snapshots_worst"] / expected,
+            "server_cpu_share": cpu_s / (after["uptime_s"] - before["uptime_s"]),
+            "cpu_us_per_client_tick": cpu_s * 1e6 / ticks / clients,
+            "lost": figures["gone"] - gone,
+            "rss_mb": after["rss_mb"],
+        }
+        if "samples" in after:
+            told["samples"] = {name: n - before["samples"][name] for name, n in after["samples"].items()}
+        for name in ("inputs_late", "inputs_used"):
+            if name in after:
+                told[name] = after[name] - before[name]
+        return told | {f"generator_{name}" if name in ("cpu_share", "late_ms") else name: figures[name] for name in (
+            "snapshot_age_ms", "inputs_per_client_per_s", "bytes_down_per_client_per_s", "bytes_up_per_client_per_s",
+            "rows_per_snapshot", "cpu_share", "late_ms",
+        )}  # fmt: skip
+
+    def stats(self) -> Figures:
+        connection = http.client.HTTPConnection("127.0.0.1", self.port, timeout=PATIENCE_S)
+        with contextlib.closing(connection):
+            connection.request("GET", "/stats")
+            return dict(json.loads(connection.getresponse().read()))
+
+    def close(self) -> None:
+        for process in (self._generator, self._server):
+            process.terminate()
+        for process in (self._generator, self._server):
+            try:
+                process.wait(PATIENCE_S)
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.wait()
+            for pipe in (process.stdin, process.stdout):
+                if pipe is not None:
+                    with contextlib.suppress(OSError):
+                        pipe.close()
+
+    @staticmethod
+    def _start(script: str, *arguments: str) -> subprocess.Popen[str]:
+        command = (sys.executable, str(ROOT / "scripts" / script), *arguments)
+        return subprocess.Popen(command, cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+
+    def _listen(self) -> None:
+        assert self._generator.stdout is not None
+        with contextlib.suppress(ValueError):  # closed
+            for line in self._generator.stdout:
+                self._said.put(json.loads(line))
+
+    def _next(self) -> Figures:
+        return self._said.get(timeout=PATIENCE_S)
+
+    def _drain(self) -> Figures:
+        status: Figures = {}
+        while not self._said.empty():
+            status = self._said.get()
+        return status
+
+    def _tell(self, command: str) -> None:
+        assert self._generator.stdin is not None
+        self._generator.stdin.write(command + "\n")
+        self._generator.stdin.flush()
+
+
+@contextlib.contextmanager
+def rig(kind: str, *more: str, seed: int = 1, capacity: int = CAPACITY) -> Iterator[Rig]:
+    with tempfile.TemporaryDirectory() as folder:
+        scene = Path(folder) / "wide.toml"
+        scene.write_text(scene_toml(capacity), "utf-8")
+        running = Rig(kind, scene, *more, seed=seed)
+        try:
+            yield running
+        finally:
+            running.close()
+
+
+def search(
+    running: Rig, first: int, seconds: float, resolution: float, steps: int, report: Callable[[Figures], None]
+) -> list[Figures]:
+    """What every number of clients gave that was tried on the way to the largest that is held."""
+    stages: list[Figures] = []
+    good, bad, n = 0, CAPACITY + 1, first
+    while len(stages) < steps and n > 10:
+        stage = running.hold(n, seconds)
+        stages.append(stage)
+        report(stage)
+        if stage["held"]:
+            good = n
+            room = min(max(0.97 / stage["server_cpu_share"], 1 + resolution), 2.5)
+            n = min(int(n * room), CAPACITY)
+            if n >= bad:
+                n = (good + bad) // 2
+        else:
+            bad = n
+            n = (good + bad) // 2
+        if bad - good <= resolution * good or n == good:
+            break
+    return stages
+
+
+def most(stages: list[Figures]) -> Figures | None:
+    """The stage with the most clients that were held."""
+    return max((stage for stage in stages if stage["held"]), key=lambda stage: stage["clients"], default=None)
+
+
+def profile(clients: int, seconds: float) -> dict[str, float]:
+    """The share of each part in the server's CPU time, by samples of its stack (SIGPROF) in a run apart.
+
+    A signal that comes while sockets are read is seen in the next Python code, mostly `receive`: that has the event
+    loop's share too.
+    """
+    with rig("profile") as running:
+        samples: dict[str, int] = running.hold(clients, seconds)["samples"]
+    total = max(1, sum(samples.values()))
+    return {part: n / total for part, n in samples.items()}

@@ -1,0 +1,140 @@
+"""Servers to be measured, as processes of their own; `bench.py server` starts them.
+
+_busy_server.py game SCENE         the product
+_busy_server.py profile SCENE      the product, with its stack sampled by CPU time; /stats shows how often in which part
+_busy_server.py echo SCENE BYTES   the product's gateway and ticker without a game: the bound. What comes is taken in
+                                   unread; every tick each client is sent a message of so many bytes
+"""
+
+import asyncio
+import signal
+import sys
+from types import FrameType, FunctionType
+from typing import Any, cast
+
+import msgpack
+
+from server import app
+from server.game import Game
+from server.gateway import Connection
+from server.replication import ChangeLog
+from server.rewind import Rewind
+from server.session import Link, Session
+from server.settings import Settings
+from server.warmup import warm_up
+from shared.messages import Hello, Ping, Pong, Welcome, decode_from_client, encode, join_snapshot
+from shared.scene import load_scene
+from shared.world import World
+
+
+class Echo:
+    """To the gateway and the server it looks like a `Game`."""
+
+    def __init__(self, scene: str, size: int) -> None:
+        self.scene = load_scene(scene)
+        self.size = size
+        self.links: dict[int, tuple[Link, bool]] = {}
+        self.ticks = 0
+        self._made = 0
+        self._deadline = 0.0
+
+    def open(self, link: Link, now: float) -> int:
+        self._made += 1
+        self.links[self._made] = (link, False)
+        return self._made
+
+    def receive(self, session: int, data: bytes, now: float) -> None:
+        if data[1] == 2:  # inputs
+            return
+        message, link = decode_from_client(data), self.links[session][0]
+        if isinstance(message, Hello):
+            link.send(encode(Welcome(message.version, self.ticks, session, {})))
+            self.links[session] = (link, True)
+        elif isinstance(message, Ping):
+            link.send(encode(Pong(message.sent, self.ticks + (now - self._deadline) * self.scene.tick_rate)))
+
+    def lost(self, session: int, now: float) -> None:
+        del self.links[session]
+
+    def tick(self, deadline: float, now: float) -> None:
+        self.ticks += 1
+        self._deadline = deadline
+        segment = msgpack.packb([0, 0, 0, -1, bytes(self.size), b"", b"", 0])
+        snapshot = join_snapshot((self.ticks, -1, b"", 0, b"", b"", b""), [segment])
+        for link, playing in tuple(self.links.values()):
+            if playing:
+                link.send(snapshot)
+
+    def shut_down(self, reason: str, wait: float) -> None:
+        for link, _ in tuple(self.links.values()):
+            link.close(1001, reason)
+
+    def stats(self) -> dict[str, Any]:
+        return {"tick_rate": self.scene.tick_rate, "clients": len(self.links)}
+
+
+DOORS: list[tuple[FunctionType, str]] = [
+    (cast("FunctionType", function), part)
+    for function, part in (
+        (Connection.data_received, "receive"),
+        (decode_from_client, "decode"),
+        (Game.receive, "inputs"),
+        (Game._take_inputs, "inputs"),
+        (World.step, "step"),
+        (ChangeLog.record, "encode"),
+        (ChangeLog.changed_segments, "encode"),
+        (ChangeLog.part, "encode"),
+        (Rewind.record, "rewind"),
+        (Game._send, "choose"),
+        (Session.send, "send"),
+        (Connection.outstanding, "send"),
+        (Game.tick, "rest of the tick"),
+    )
+]
+"""The functions by which a part is entered."""
+SAMPLE_S = 0.002
+
+
+class Profile:
+    """How much of this process's CPU time is spent in which part, by samples of the stack."""
+
+    def __init__(self) -> None:
+        self.samples = dict.fromkeys([*(part for _, part in DOORS), "event loop"], 0)
+        self._parts = {function.__code__: part for function, part in DOORS}
+        signal.signal(signal.SIGPROF, self._sample)
+        signal.setitimer(signal.ITIMER_PROF, SAMPLE_S, SAMPLE_S)
+
+    def _sample(self, number: int, frame: FrameType | None) -> None:
+        part = None
+        while part is None and frame is not None:
+            part = self._parts.get(frame.f_code)
+            frame = frame.f_back
+        self.samples[part or "event loop"] += 1
+
+
+def serve(served: Game) -> None:
+    """As `python -m server` does, on a port that the system picks."""
+    settings = Settings(port=0, log_level="warning")
+    with asyncio.Runner(loop_factory=app._loop_factory()) as runner:
+        runner.run(app.Server(settings, served).serve())
+
+
+def main(argv: list[str]) -> int:
+    kind, scene = argv[:2]
+    if kind == "echo":
+        serve(cast("Game", Echo(scene, int(argv[2]))))
+        return 0
+    rules = load_scene(scene)
+    warm_up(rules)
+    if kind == "game":
+        serve(Game(rules))
+        return 0
+    made = Game(rules)
+    profile, plain_stats = Profile(), made.stats
+    cast("Any", made).stats = lambda: plain_stats() | {"samples": dict(profile.samples)}
+    serve(made)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,319 @@
+"""A thousand players in one process, on the wire alone: no prediction, no world, one epoll. For `bench.py server`.
+
+argument  {"port", "seed", "rate", "joins_per_s"}, as JSON
+stdin     "clients N": have so many; "begin": the window begins; "end": it ends, tell; the end of the pipe: stop
+stdout    a JSON object per line: {"playing", "gone"} at the reports, and the window's figures after "end"
+
+Every client says hello, pings once a second, acknowledges, and sends the input of each tick at a moment of its own
+within the tick, whether or not snapshots come: `LEAD_TICKS` ahead of the server's time. It wanders: a new direction
+about once a second, a jump now and then. Of what comes, heads are read; one snapshot in `SAMPLE` is decoded whole.
+"""
+
+import contextlib
+import gc
+import json
+import math
+import os
+import random
+import select
+import socket
+import sys
+import time
+from typing import Any
+
+from websockets.speedups import apply_mask
+
+from shared import messages
+from shared.messages import Hello, Inputs, Ping, Snapshot, decode_from_server, encode
+from shared.snapshot import ROW
+
+LEAD_TICKS = 2
+"""An input goes out at most so long before the deadline of its tick, and up to a tick later."""
+REPORT_S = 0.2
+PING_S = 1.0
+SAMPLE = 997
+SLOT_S = 0.001
+"""The clock of what is sent: late by more than this is told."""
+CATCH_UP_SLOTS = 16
+MASK = b"\x5a\x13\xc7\x2e"
+REQUEST = (
+    b"GET / HTTP/1.1\r\nHost: localhost\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
+    b"Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\nSec-WebSocket-Version: 13\r\n\r\n"
+)
+ARRAY16, UINT16, UINT32 = 0xDC, 0xCD, 0xCE
+SNAPSHOT, TERRAIN, WELCOME, PONG = 18, 19, 17, 20
+
+
+def frame(message: bytes) -> bytes:
+    """One masked binary frame."""
+    n = len(message)
+    head = bytes((0x82, 0x80 | n)) if n < 126 else b"\x82\xfe" + n.to_bytes(2, "big")
+    return head + MASK + bytes(apply_mask(message, MASK))
+
+
+class Player:
+    """One connection."""
+
+    __slots__ = ("acked", "buffer", "move", "number", "open", "phase", "pinged", "rng", "sent", "snapshots", "sock")
+
+    def __init__(self, number: int, port: int, seed: int) -> None:
+        self.number = number
+        self.sock = socket.create_connection(("127.0.0.1", port))
+        self.sock.setblocking(False)
+        self.sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        self.sock.send(REQUEST)
+        self.rng = random.Random(f"{seed} {number}")
+        self.phase = self.rng.random()
+        self.buffer = b""
+        self.open = False
+        self.acked = self.sent = -1
+        self.pinged = -math.inf
+        self.move = bytes(3)
+        self.snapshots = 0
+
+
+class Swarm:
+    """All of them, and what has been counted since the window began."""
+
+    def __init__(self, order: dict[str, Any]) -> None:
+        self.order = order
+        self.rate: int = order["rate"]
+        self.slots = max(1, round(1 / self.rate / SLOT_S))
+        self.poll = select.epoll()
+        self.players: dict[int, Player] = {}
+        self.by_slot: list[list[Player]] = [[] for _ in range(self.slots)]
+        self.made = self.gone = self.wanted = 0
+        self.server_tick_0 = self.best = self.asked = -math.inf
+        """The server's time in ticks at time 0 of the clock, by the quickest pong of the last second."""
+        self.reset()
+
+    def reset(self) -> None:
+        self.began, self.cpu_0 = time.monotonic(), time.process_time()
+        self.bytes_down = self.bytes_up = self.inputs = self.stuck = 0
+        self.ages_ms: list[int] = [0] * 2048
+        self.late_ms: list[int] = [0] * 2048
+        self.rows: list[int] = []
+        for player in self.players.values():
+            player.snapshots = 0
+
+    # -- what comes ----------------------------------------------------------------------------------------
+
+    def receive(self, player: Player, now: float) -> None:
+        try:
+            data = player.sock.recv(1 << 18)
+        except BlockingIOError:
+            return
+        except OSError:
+            data = b""
+        if not data:
+            self.drop(player)
+            self.gone += 1
+            return
+        self.bytes_down += len(data)
+        if player.buffer:
+            data = player.buffer + data
+        at, size = 0, len(data)
+        if not player.open:
+            end = data.find(b"\r\n\r\n")
+            if end < 0:
+                player.buffer = data
+                return
+            player.open, at = True, end + 4
+            player.sock.send(frame(encode(Hello(messages.VERSION, {}, f"player {player.number}"))))
+        while size - at >= 2:
+            length, start = data[at + 1], at + 2
+            if length == 126:
+                if size - at < 4:
+                    break
+                length, start = data[at + 2] << 8 | data[at + 3], at + 4
+            elif length == 127:
+                if size - at < 10:
+                    break
+                length, start = int.from_bytes(data[at + 2 : at + 10], "big"), at + 10
+            if start + length > size:
+                break
+            if data[at] != 0x82:  # the server closes
+                self.drop(player)
+                self.gone += 1
+                return
+            self.take(player, data, start, start + length, now)
+            at = start + length
+        player.buffer = data[at:]
+
+    def take(self, player: Player, data: bytes, start: int, end: int, now: float) -> None:
+        """One message."""
+        if data[start] == ARRAY16:
+            form = data[start + 4]
+            if form == UINT32:
+                tick = int.from_bytes(data[start + 5 : start + 9], "big")
+            elif form == UINT16:
+                tick = data[start + 5] << 8 | data[start + 6]
+            else:
+                tick = data[start + 5] if form == 0xCC else form
+            player.acked = tick
+            player.snapshots += 1
+            if self.server_tick_0 > -math.inf:
+                age_ms = int((now * self.rate + self.server_tick_0 - tick) / self.rate * 1e3)
+                self.ages_ms[min(max(age_ms, 0), 2047)] += 1
+            if (tick + 31 * player.number) % SAMPLE == 0:
+                snapshot = decode_from_server(data[start:end])
+                assert isinstance(snapshot, Snapshot)
+                self.rows.append(sum(len(segment[4]) for segment in snapshot.segments) // ROW.itemsize)
+        elif data[start + 1] == PONG:
+            pong = decode_from_server(data[start:end])
+            assert isinstance(pong, messages.Pong)
+            # The later an answer comes, the lower this is; and a server that gives up ticks falls behind.
+            if now - self.asked >= PING_S:
+                self.asked, self.server_tick_0, self.best = now, max(self.best, pong.tick - now * self.rate), -math.inf
+            self.best = max(self.best, pong.tick - now * self.rate)
+        elif data[start + 1] == WELCOME:
+            self.by_slot[int(player.phase * self.slots)].append(player)
+        # Terrain is for those who have a world.
+
+    # -- what goes -----------------------------------------------------------------------------------------
+
+    def send(self, player: Player, now: float) -> None:
+        """The inputs up to the tick whose turn it is."""
+        if now - player.pinged >= PING_S:
+            player.pinged = now
+            self.out(player, frame(encode(Ping(time.monotonic()))))
+        if player.acked < 0 or self.server_tick_0 == -math.inf:
+            return
+        due = int(now * self.rate + self.server_tick_0 + LEAD_TICKS)
+        n = min(due - player.sent, messages.INPUT_ROWS_MAX) if player.sent >= 0 else 1
+        if n <= 0:
+            return
+        rng = player.rng
+        if rng.random() < n / self.rate:
+            angle = rng.random() * math.tau
+            player.move = bytes((int(127 * math.cos(angle)) & 0xFF, int(127 * math.sin(angle)) & 0xFF, 0))
+        row = player.move
+        if rng.random() < 0.01:
+            row = row[:2] + b"\1"
+        player.sent = due
+        self.inputs += n
+        self.out(player, frame(encode(Inputs(due - n + 1, player.acked, row * n))))
+
+    def out(self, player: Player, data: bytes) -> None:
+        try:
+            sent = player.sock.send(data)
+        except BlockingIOError:
+            sent = 0
+        except OSError:
+            return  # the next read tells
+        self.bytes_up += sent
+        if sent < len(data):  # the server has not read for so long that it cannot matter any more
+            self.stuck += 1
+            self.drop(player)
+            self.gone += 1
+
+    # -- the loop ------------------------------------------------------------------------------------------
+
+    def run(self) -> None:
+        self.poll.register(0, select.EPOLLIN)
+        os.set_blocking(0, False)
+        slot, begun = 0, time.monotonic()
+        next_join = next_report = begun
+        commands = b""
+        while True:
+            now = time.monotonic()
+            due = begun + slot / (self.slots * self.rate)
+            for _ in range(CATCH_UP_SLOTS):  # then what has come is read, however far behind it is
+                if due > now:
+                    break
+                players = self.by_slot[slot % self.slots]
+                if players:
+                    self.late_ms[min(int((now - due) * 1e3), 2047)] += 1
+                    for player in tuple(players):
+                        self.send(player, due)
+                    now = time.monotonic()
+                slot += 1
+                due = begun + slot / (self.slots * self.rate)
+            if len(self.players) < self.wanted and now >= next_join:
+                next_join = max(now, next_join) + 1 / self.order["joins_per_s"]
+                self.join()
+            elif len(self.players) > self.wanted:
+                self.drop(self.players[next(reversed(self.players))])
+            if now >= next_report:
+                next_report = now + REPORT_S
+                playing = sum(player.acked >= 0 for player in self.players.values())
+                say({"playing": playing, "gone": self.gone, "clients": len(self.players)})
+            for fd, _ in self.poll.poll(max(0.0, due - time.monotonic()), 256):
+                if fd == 0:
+                    with contextlib.suppress(BlockingIOError):
+                        told = os.read(0, 4096)
+                        if not told:
+                            return
+                        commands += told
+                    while b"\n" in commands:
+                        line, _, commands = commands.partition(b"\n")
+                        self.obey(line.decode().split())
+                elif fd in self.players:
+                    self.receive(self.players[fd], time.monotonic())
+
+    def obey(self, command: list[str]) -> None:
+        match command:
+            case ["clients", n]:
+                self.wanted = int(n)
+            case ["begin"]:
+                gc.collect()
+                gc.freeze()
+                self.reset()
+            case ["end"]:
+                say(self.figures())
+
+    def join(self) -> None:
+        player = Player(self.made, self.order["port"], self.order["seed"])
+        self.made += 1
+        self.players[player.sock.fileno()] = player
+        self.poll.register(player.sock.fileno(), select.EPOLLIN)
+
+    def drop(self, player: Player) -> None:
+        fd = player.sock.fileno()
+        if self.players.pop(fd, None) is not None:
+            self.poll.unregister(fd)
+            player.sock.close()
+            slot = self.by_slot[int(player.phase * self.slots)]
+            if player in slot:
+                slot.remove(player)
+
+    def figures(self) -> dict[str, Any]:
+        """Of the window."""
+        seconds, n = time.monotonic() - self.began, max(1, len(self.players))
+        counts = sorted(player.snapshots for player in self.players.values()) or [0]
+        return {
+            "seconds": seconds,
+            "clients_in_window": len(self.players),
+            "gone": self.gone,
+            "stuck": self.stuck,
+            "snapshots_worst": counts[0],
+            "snapshots_p50": counts[len(counts) // 2],
+            "snapshot_age_ms": quantiles(self.ages_ms),
+            "inputs_per_client_per_s": self.inputs / n / seconds,
+            "bytes_down_per_client_per_s": self.bytes_down / n / seconds,
+            "bytes_up_per_client_per_s": self.bytes_up / n / seconds,
+            "rows_per_snapshot": sum(self.rows) / len(self.rows) if self.rows else None,
+            "cpu_share": (time.process_time() - self.cpu_0) / seconds,
+            "late_ms": quantiles(self.late_ms),
+        }
+
+
+def quantiles(counts: list[int]) -> dict[str, int]:
+    """p50, p99 and max of values counted by whole milliseconds, rounded up."""
+    found, total = {}, sum(counts)
+    for name, q in (("p50", 0.5), ("p99", 0.99), ("max", 1.0)):
+        left = q * total
+        for value, n in enumerate(counts):
+            left -= n
+            if n and left <= 1e-9:
+                found[name] = value + 1
+                break
+    return found
+
+
+def say(what: dict[str, Any]) -> None:
+    print(json.dumps(what), flush=True)
+
+
+if __name__ == "__main__":
+    Swarm(json.loads(sys.argv[1])).run()
