@@ -257,7 +257,9 @@ def settings(ours: Row, rivals: list[Row]) -> list[tuple[float, float, float]]:
     found: set[tuple[float, float]] = set()
     for rival in rivals:
         share = rival["late_inputs_share"]
-        if share < SHARE_MAX:
+        if 0.2 <= share < SHARE_MAX:
+            found.add((round(share, 2), 0.0))
+        elif share < SHARE_MAX:
             found |= {(round(more * share, 5), 0.0) for more in (0.7, 0.85, 1.0, 1.15)}
             found |= {(round(share, 5), SAFETY), (round(2 * share, 5), 2 * SAFETY), (round(2 * share, 5), 3 * SAFETY)}
         if share < 0.001:  # two minutes have too few of those to count them: a margin, as far ahead as the rival
