@@ -9,6 +9,7 @@ through.
 """
 
 import dataclasses
+from collections import deque
 from collections.abc import Iterator
 from itertools import count
 from typing import Any
@@ -17,7 +18,8 @@ import numpy as np
 
 from server import interest
 from server.limits import Limits
-from server.replication import KEYFRAME, ChangeLog
+from server.pacing import LEAST_BYTES
+from server.replication import ChangeLog
 from server.rewind import Past, Rewind
 from server.session import Link, Session
 from shared import edits, messages
@@ -270,46 +272,33 @@ class Game:
                 self.counters.snapshots_skipped += 1
                 continue
             session.sent_at = now
-            self._send_snapshot(session, now)
+            self._send_snapshot(session, max(window - outstanding, session.snapshot_bytes, LEAST_BYTES), now)
             self._send_terrain(session, window - session.link.outstanding())
 
     def _look_around(self, session: Session) -> None:
-        centre = self.log.segment(session.entity)
-        if centre == session.centre:
+        centre, sight = self.log.segment(session.entity), session.sight
+        if centre == sight.centre:
             return
-        session.centre = centre
         exists = self.world.blocks.__contains__
-        added, dropped = interest.update(session.sees, centre, self.limits.see_radius, self.limits.keep_radius, exists)
-        session.sees.difference_update(dropped)
-        session.fresh.difference_update(dropped)
-        session.terrain_due = type(session.terrain_due)(s for s in session.terrain_due if s in session.sees)
-        session.sees.update(added)
-        session.fresh.update(added)
-        session.drops = sorted(session.knows - session.sees)
-        session.terrain_due.extend(segment for segment in added if exists(segment))
+        added, dropped = sight.move(centre, self.limits.see_radius, self.limits.keep_radius, exists)
+        due = [segment for segment in session.terrain_due if segment in sight.sees] + [s for s in added if exists(s)]
+        session.terrain_due = deque(sorted(due, key=lambda segment: interest.distance(segment, centre)))
         if session.terrain_now and session.terrain_now[0] in dropped:
             session.terrain_now = None
 
     def _forget(self, session: Session) -> None:
         """Begins anew with what a client sees: keyframes and terrain."""
-        session.fresh.update(session.sees)
+        session.sight.forget()
         session.terrain_now = None
-        session.terrain_due = type(session.terrain_due)(sorted(s for s in session.sees if s in self.world.blocks))
+        session.terrain_due = deque(sorted(s for s in session.sight.sees if s in self.world.blocks))
 
-    def _send_snapshot(self, session: Session, now: float) -> None:
+    def _send_snapshot(self, session: Session, room: int, now: float) -> None:
         tick, inputs = self.world.tick, session.inputs
-        changed = self.log.changed_segments(session.tick) if session.tick >= 0 else set()
-        if changed is None:  # too far behind to catch up: everything anew
+        if session.sight.lost_track(tick):
             self._forget(session)
-            changed = set()
-        parts = [self.log.part(segment, KEYFRAME) for segment in session.fresh]
-        parts += [
-            self.log.part(segment, session.tick)
-            for segment in changed
-            if segment in session.sees and segment not in session.fresh
-        ]
+        drops = np.array(session.sight.drops, "<i4").tobytes()
+        parts = session.sight.take(self.log, tick, room)
         margins = np.array(inputs.margins, "<i2").tobytes()
-        drops = np.array(session.drops, "<i4").tobytes()
         verdicts = np.array(session.verdicts[: messages.VERDICTS_MAX], VERDICT).tobytes()
         first = tick - len(inputs.fates) + 1
         header = (tick, inputs.newest, margins, first, bytes(inputs.fates), verdicts, drops)
@@ -317,10 +306,6 @@ class Game:
         session.send(message)
         session.tick = tick
         session.snapshot_bytes = len(message)
-        if session.fresh or session.drops:
-            session.knows = set(session.sees)
-            session.fresh.clear()
-            session.drops.clear()
         del session.verdicts[: messages.VERDICTS_MAX]
         session.sent_when.put(tick, now)
         inputs.told()

@@ -3,7 +3,7 @@
 Theory of operation. What a TCP connection has not acknowledged yet stands in a queue somewhere, and the newest
 snapshot goes behind it. So a snapshot is sent only while the bytes on the way (unsent and unacknowledged) fit into
 
-    max(two snapshots, 512 bytes, rate x min(3 x least round trip + one tick, 0.6 s))
+    max(two snapshots, 512 bytes, rate x (3 x least round trip + one tick))
 
 where `rate` is the fastest the path has acknowledged bytes lately and the least round trip is that of an empty
 path. Three of them, because a lost packet holds up the acknowledgements of all behind it for two or more, although
@@ -20,6 +20,7 @@ RATE_SPAN_S = 0.25
 RTT_WINDOW_S = 60.0
 STALL_RTTS = 3.0
 HOLD_S_MAX = 0.6
+"""Three round trips are enough at this length; of longer ones one and a half."""
 LEAST_BYTES = 512
 
 
@@ -68,6 +69,6 @@ class Pacing:
             self._rates.append((now, rate))
         while self._rates and self._rates[0][0] < now - RATE_WINDOW_S:
             self._rates.popleft()
-        return max(
-            2 * snapshot_bytes, LEAST_BYTES, int(self.rate * min(STALL_RTTS * self.least_rtt_s + tick_s, HOLD_S_MAX))
-        )
+        rtt_s = self.least_rtt_s
+        hold_s = min(STALL_RTTS * rtt_s, max(HOLD_S_MAX, 1.5 * rtt_s)) + tick_s
+        return max(2 * snapshot_bytes, LEAST_BYTES, int(self.rate * hold_s))

@@ -5,6 +5,7 @@ from collections import deque
 from typing import Protocol
 
 from server.pacing import Pacing
+from server.sight import Sight
 from shared.checks import Cell
 from shared.inputs import NEUTRAL, Input, clamp
 from shared.messages import (
@@ -122,13 +123,7 @@ class Session:
         # What it has been sent:
         self.tick = -1
         self.snapshot_bytes = 0
-        self.sees: set[Cell] = set()
-        self.knows: set[Cell] = set()
-        """What it saw when it was sent its latest snapshot;"""
-        self.drops: list[Cell] = []
-        """what of that it no longer sees,"""
-        self.fresh: set[Cell] = set()
-        """and what it is to be sent whole."""
+        self.sight = Sight()
         self.terrain_due: deque[Cell] = deque()
         self.terrain_now: tuple[Cell, bytes, int] | None = None
         """The packed segment that is being sent, and how much of it has been."""
@@ -140,7 +135,6 @@ class Session:
         self.edits_left = math.inf
         self.pacing = Pacing()
         self.sent_when: Ring[float] = Ring(FATES_MAX)
-        self.centre: Cell | None = None
         self.skipped = 0
 
     def send(self, message: bytes) -> None:

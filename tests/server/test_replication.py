@@ -335,12 +335,12 @@ class Told:
         """The client has just what the server has in the segments it sees."""
         game, model, session = self.game, self.model, self.session
         assert model.tick == game.world.tick
-        here = [entity for entity in game.world.entities["id"].tolist() if game.log.segment(entity) in session.sees]
+        here = [entity for entity in game.world.entities["id"].tolist() if game.log.segment(entity) in session.sight.sees]
         assert model.entities == {entity: game.world.state(entity) for entity in here}
         assert session.entity in model.entities
         under_way = {*session.terrain_due, session.terrain_now[0] if session.terrain_now else None}
-        assert set(model.blocks) - session.sees == set()
-        for segment in session.sees - under_way:
+        assert set(model.blocks) - session.sight.sees == set()
+        for segment in session.sight.sees - under_way:
             if segment in game.world.blocks:
                 assert (model.blocks[segment] == game.world.blocks.segment(segment).reshape(-1)).all()
 

@@ -1,0 +1,92 @@
+"""What one client sees and has been sent of it: which segments' changes go into its next snapshot.
+
+Theory of operation. Everything that changed goes, as long as it fits into what may be on the way to the client.
+Where it does not, the own segment goes, then the others by urgency: how many ticks of changes wait, over how far away
+they are. What waits is not lost but grows staler, so it becomes urgent: nobody is starved. A segment that is new to
+the client is sent whole (a keyframe) and waits its turn in the same order, so that walking up to a crowd does not put
+a wall of bytes in front of the own position.
+"""
+
+from collections.abc import Callable
+
+from server import interest
+from server.replication import HISTORY, KEYFRAME, ChangeLog
+from shared.checks import Cell
+
+
+class Sight:
+    """The segments that a client sees."""
+
+    def __init__(self) -> None:
+        self.sees: set[Cell] = set()
+        self.centre: Cell | None = None
+        self.drops: list[Cell] = []
+        """What the client knows and does not see any more: to be told with the next snapshot."""
+        self._knows: set[Cell] = set()
+        self._fresh: set[Cell] = set()  # no keyframe sent yet
+        self._behind: dict[Cell, int] = {}  # sent last with this tick, which is before `_tick`
+        self._tick = -1
+
+    def move(self, centre: Cell, see: int, keep: int, exists: Callable[[Cell], bool]) -> tuple[list[Cell], list[Cell]]:
+        """The entity is in another segment: what is seen from now on, nearest first, and what is let go."""
+        added, dropped = interest.update(self.sees, centre, see, keep, exists)
+        self.centre = centre
+        self.sees.difference_update(dropped)
+        self._fresh.difference_update(dropped)
+        for segment in dropped:
+            self._behind.pop(segment, None)
+        self.sees.update(added)
+        self._fresh.update(added)
+        self.drops = sorted(self._knows - self.sees)
+        return added, dropped
+
+    def forget(self) -> None:
+        """Everything is to be sent anew."""
+        self._fresh = set(self.sees)
+        self._behind.clear()
+        self._tick = -1
+
+    def lost_track(self, tick: int) -> bool:
+        """Whether something waits for longer than its changes are kept."""
+        oldest = min(self._behind.values(), default=self._tick)
+        return self._tick >= 0 and tick - oldest > HISTORY
+
+    def take(self, log: ChangeLog, tick: int, room: int) -> list[bytes]:
+        """The encoded parts of a snapshot for `tick`, of about `room` bytes; they count as sent, as do `drops`."""
+        assert not self.lost_track(tick)
+        changed = (log.changed_segments(self._tick) or set()) if self._tick >= 0 else set()
+        due = {segment: self._tick for segment in changed if segment in self.sees}
+        if self._behind or self._fresh:
+            due |= self._behind | dict.fromkeys(self._fresh, KEYFRAME)
+        parts = {segment: log.part(segment, since) for segment, since in due.items()}
+        if sum(map(len, parts.values())) > room:
+            parts = self._urgent(parts, due, tick, room)
+        if self._fresh or self.drops:
+            self._knows = self._knows.difference(self.drops) | (self._fresh & parts.keys())
+            self._fresh.difference_update(parts)
+            self.drops = []
+        self._behind = (
+            {segment: since for segment, since in due.items() if segment not in parts and since != KEYFRAME}
+            if len(parts) < len(due)
+            else {}
+        )
+        self._tick = tick
+        return list(parts.values())
+
+    def _urgent(self, parts: dict[Cell, bytes], due: dict[Cell, int], tick: int, room: int) -> dict[Cell, bytes]:
+        """The parts that fit, in the order of urgency; at least the first."""
+        centre = self.centre
+        assert centre is not None
+
+        def urgency(segment: Cell) -> float:
+            waits = tick - due[segment] if due[segment] != KEYFRAME else HISTORY
+            return waits / (1 + 3 * interest.distance(segment, centre))
+
+        order = sorted(parts, key=lambda segment: (segment != centre, -urgency(segment)))
+        chosen: dict[Cell, bytes] = {}
+        for segment in order:
+            room -= len(parts[segment])
+            if chosen and room < 0:
+                break
+            chosen[segment] = parts[segment]
+        return chosen
