@@ -55,6 +55,15 @@ _quiet = logging.getLogger(f"{__name__}.websockets")
 _quiet.setLevel(logging.WARNING)  # two lines per connection otherwise
 
 
+def _frame_head(size: int) -> bytes:
+    """What goes before an unmasked binary message of so many bytes (by way of websockets 1 us more per message)."""
+    if size < 126:
+        return bytes((FINAL_BINARY, size))
+    if size < 1 << 16:
+        return b"\x82\x7e" + size.to_bytes(2, "big")
+    return b"\x82\x7f" + size.to_bytes(8, "big")
+
+
 class Events(Protocol):
     """What the gateway tells the game."""
 
@@ -177,7 +186,7 @@ class Connection(asyncio.Protocol):
     def send(self, message: bytes) -> None:
         """Queues one binary message; nothing happens if the WebSocket is not open any more."""
         if self._transport is not None and self._protocol.state is OPEN:
-            self._transport.write(Frame(Opcode.BINARY, message).serialize(mask=False))
+            self._transport.write(_frame_head(len(message)) + message)
 
     def outstanding(self) -> int:
         """Bytes that the peer's kernel has not acknowledged (not on Linux: that ours has not taken)."""

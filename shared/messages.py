@@ -198,17 +198,15 @@ def _digests(value: Any) -> bool:
 
 
 _tick = _whole(-1, TICK_MAX)
+_first = _whole(0, TICK_MAX - INPUT_ROWS_MAX)
+_rows = _bytes(INPUT_ROWS_MAX * INPUT_ROW_BYTES, INPUT_ROW_BYTES)
 _segment = _whole(-(1 << 23), (1 << 23) - 1)
 
 KINDS: dict[int, tuple[type[Any], tuple[Check, ...]]] = {
     1: (Hello, (_whole(0, 1 << 31), _digests, _text(NAME_MAX))),
     2: (
         Inputs,
-        (
-            _whole(0, TICK_MAX - INPUT_ROWS_MAX),
-            _tick,
-            _bytes(INPUT_ROWS_MAX * INPUT_ROW_BYTES, INPUT_ROW_BYTES),
-        ),
+        (_first, _tick, _rows),
     ),
     3: (Ping, (_finite,)),
     4: (Bye, (_whole(0, 4999), _text(REASON_MAX), _finite)),
@@ -237,6 +235,7 @@ CLIENT_KINDS = frozenset({1, 2, 3, 4, 5, 6})
 SERVER_KINDS = frozenset({4, 17, 18, 19, 20})
 _KIND_OF = {kind: number for number, (kind, _) in KINDS.items()}
 _SNAPSHOT = _KIND_OF[Snapshot]
+_INPUTS_HEAD = bytes((0x94, _KIND_OF[Inputs]))
 
 
 def encode(message: Message) -> bytes:
@@ -249,7 +248,8 @@ def encode(message: Message) -> bytes:
 def join_snapshot(header: tuple[int, int, bytes, int, bytes, bytes, bytes], segments: list[bytes]) -> bytes:
     """A snapshot from its first seven fields and segments that are encoded already (shared by many clients)."""
     n = 1 + len(header) + len(segments)
-    return b"".join((b"\xdc" + n.to_bytes(2, "big"), *map(msgpack.packb, (_SNAPSHOT, *header)), *segments))
+    fields = msgpack.packb((_SNAPSHOT, *header))[1:]  # without its own head, which is one byte
+    return b"".join((b"\xdc", n.to_bytes(2, "big"), fields, *segments))
 
 
 def shown(value: Any) -> str:
@@ -284,7 +284,17 @@ def decode(data: bytes, kinds: frozenset[int], longest: int, lists: int = LIST_M
 
 
 def decode_from_client(data: bytes) -> Message:
-    """What a server may receive. Raises `ProtocolError`."""
+    """What a server may receive. Raises `ProtocolError`.
+
+    Nearly all of it is `Inputs`: those in order take 0.9 us here and not 2.3, for the rest `decode` is the judge.
+    """
+    if data[:2] == _INPUTS_HEAD and len(data) < 2 * INPUT_ROWS_MAX * INPUT_ROW_BYTES:
+        try:
+            _, first, acked, rows = msgpack.unpackb(data)
+        except Exception:
+            return decode(data, CLIENT_KINDS, CLIENT_MESSAGE_MAX, CLIENT_LIST_MAX)
+        if _first(first) and _tick(acked) and _rows(rows):
+            return Inputs(first, acked, rows)
     return decode(data, CLIENT_KINDS, CLIENT_MESSAGE_MAX, CLIENT_LIST_MAX)
 
 

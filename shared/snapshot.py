@@ -32,6 +32,7 @@ SIDE = SEGMENT * BLOCK
 """Grid steps along one side of a segment."""
 FIELDS = ("id", "template", "flags", "x", "y", "z", "vx", "vy", "vz", "move_x", "move_y", "buttons")
 assert len(FIELDS) == CELL == BUTTONS + 1
+assert SIDE & (SIDE - 1) == 0
 
 ACTED = 4
 """Flag on the wire: the server's rules placed or threw this entity."""
@@ -56,8 +57,8 @@ class SegmentPart(NamedTuple):
     check: int
 
 
-def encode_rows(rows: Int64s, segment: Cell, acted: Collection[int] = ()) -> bytes:
-    """Entities of one segment ([n, >= 12] state columns) as packed rows, those in `acted` flagged."""
+def encode_rows(rows: Int64s, acted: Collection[int] = ()) -> bytes:
+    """Entities ([n, >= 12] state columns), each in the segment of its position, as packed rows; `acted` flagged."""
     packed = np.empty(len(rows), ROW)
     for column, name in enumerate(FIELDS):
         packed[name] = rows[:, column]
@@ -65,7 +66,7 @@ def encode_rows(rows: Int64s, segment: Cell, acted: Collection[int] = ()) -> byt
     if acted:
         packed["flags"] |= np.where(np.isin(packed["id"], list(acted)), ACTED, 0).astype(np.uint8)
     for axis, name in enumerate("xyz"):
-        packed[name] = rows[:, X + axis] - segment[axis] * SIDE
+        packed[name] = rows[:, X + axis] & (SIDE - 1)
     return packed.tobytes()
 
 
@@ -80,15 +81,26 @@ def encode_part(
     check: int = 0,
 ) -> bytes:
     """One segment's part, ready to be joined into any client's snapshot."""
-    packed_gone = np.array(gone, "<u4").tobytes()
+    return join_part(segment, since, encode_rows(rows, acted), gone, edits, check)
+
+
+def join_part(
+    segment: Cell,
+    since: int,
+    packed: bytes,
+    gone: Sequence[int] = (),
+    edits: Sequence[tuple[int, int]] = (),
+    check: int = 0,
+) -> bytes:
+    """The same from rows that are packed already."""
+    packed_gone = np.array(gone, "<u4").tobytes() if gone else b""
     packed_edits = np.array(edits, EDIT).tobytes() if edits else b""
-    part = (*segment, since, encode_rows(rows, segment, acted), packed_gone, packed_edits, check)
-    return msgpack.packb(part)  # type: ignore[no-any-return]
+    return msgpack.packb((*segment, since, packed, packed_gone, packed_edits, check))  # type: ignore[no-any-return]
 
 
 def checksum(world: World, segment: Cell) -> int:
     """A number from 1 on for all of a loaded segment as it is: entities and blocks."""
-    rows = encode_rows(world.in_segment(segment), segment)
+    rows = encode_rows(world.in_segment(segment))
     return zlib.crc32(world.blocks.digest(segment).to_bytes(8, "little") + rows) or 1
 
 

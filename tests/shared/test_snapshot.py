@@ -46,7 +46,7 @@ def state_in(segment: Cell, inside: int, velocity: int, move: int, entity: int =
 
 def part_of(**fields: Any) -> list[Any]:
     """A legal part, with some fields changed."""
-    row = encode_rows(np.array([state_in((0, 0, 0), 5, 6, 7)], np.int64), (0, 0, 0))
+    row = encode_rows(np.array([state_in((0, 0, 0), 5, 6, 7)], np.int64))
     values = {"x": 0, "y": 0, "z": 0, "since": 3, "rows": row, "gone": b"\x01\0\0\0", "edits": b"\0\0\x01", "check": 0}
     return list((values | fields).values())
 
