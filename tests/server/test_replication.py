@@ -335,7 +335,8 @@ class Told:
         """The client has just what the server has in the segments it sees."""
         game, model, session = self.game, self.model, self.session
         assert model.tick == game.world.tick
-        here = [entity for entity in game.world.entities["id"].tolist() if game.log.segment(entity) in session.sight.sees]
+        sees = session.sight.sees
+        here = [entity for entity in game.world.entities["id"].tolist() if game.log.segment(entity) in sees]
         assert model.entities == {entity: game.world.state(entity) for entity in here}
         assert session.entity in model.entities
         under_way = {*session.terrain_due, session.terrain_now[0] if session.terrain_now else None}
