@@ -9,6 +9,7 @@ through.
 """
 
 import dataclasses
+import struct
 from collections import deque
 from collections.abc import Iterator
 from itertools import count
@@ -229,9 +230,10 @@ class Game:
     def _command(self) -> None:
         """What players do at the start of this tick, in the order in which they joined."""
         tick = self.world.tick + 1
+        rate = self.limits.edits_per_s
         for session in self.sessions:
-            rate = self.limits.edits_per_s
-            session.edits_left = min(session.edits_left + rate / self.scene.tick_rate, 2 * rate)
+            if session.edits_left != 2 * rate:
+                session.edits_left = min(session.edits_left + rate / self.scene.tick_rate, 2 * rate)
             while session.commands and session.commands[0].tick <= tick and not session.closed:
                 command = session.commands.popleft()
                 session.verdicts.append((command.number, self._carry_out(session, command)))
@@ -258,13 +260,14 @@ class Game:
         self.counters.fell_out += len(self._respawn)
 
     def _send(self, now: float) -> None:
+        tick_s = 1 / self.scene.tick_rate
         for session in tuple(self.sessions):
             session.allowance = min(session.allowance + self.limits.messages_per_tick, 0.0)
             if not session.entity or session.closed:
                 continue
             self._look_around(session)
             outstanding = session.link.outstanding()
-            window = session.pacing.window(outstanding, session.snapshot_bytes, 1 / self.scene.tick_rate, now)
+            window = session.pacing.window(outstanding, session.snapshot_bytes, tick_s, now)
             if session.acked < 0:
                 window = max(window, self.limits.first_bytes)
             if outstanding > window:
@@ -273,7 +276,8 @@ class Game:
                 continue
             session.sent_at = now
             self._send_snapshot(session, max(window - outstanding, session.snapshot_bytes, LEAST_BYTES), now)
-            self._send_terrain(session, window - session.link.outstanding())
+            if session.terrain_now or session.terrain_due:
+                self._send_terrain(session, window - session.link.outstanding())
 
     def _look_around(self, session: Session) -> None:
         centre, sight = self.log.segment(session.entity), session.sight
@@ -296,17 +300,19 @@ class Game:
         tick, inputs = self.world.tick, session.inputs
         if session.sight.lost_track(tick):
             self._forget(session)
-        drops = np.array(session.sight.drops, "<i4").tobytes()
+        drops = np.array(session.sight.drops, "<i4").tobytes() if session.sight.drops else b""
         parts = session.sight.take(self.log, tick, room)
-        margins = np.array(inputs.margins, "<i2").tobytes()
-        verdicts = np.array(session.verdicts[: messages.VERDICTS_MAX], VERDICT).tobytes()
+        margins = struct.pack(f"<{len(inputs.margins)}h", *inputs.margins)
+        verdicts = b""
+        if session.verdicts:
+            verdicts = np.array(session.verdicts[: messages.VERDICTS_MAX], VERDICT).tobytes()
+            del session.verdicts[: messages.VERDICTS_MAX]
         first = tick - len(inputs.fates) + 1
         header = (tick, inputs.newest, margins, first, bytes(inputs.fates), verdicts, drops)
         message = messages.join_snapshot(header, parts)
         session.send(message)
         session.tick = tick
         session.snapshot_bytes = len(message)
-        del session.verdicts[: messages.VERDICTS_MAX]
         session.sent_when.put(tick, now)
         inputs.told()
         self.counters.snapshots_sent += 1

@@ -30,18 +30,19 @@ class Pacing:
     def __init__(self) -> None:
         self.sent_bytes = 0
         self._acked: deque[tuple[float, int]] = deque()  # time, bytes acknowledged by then
+        # Time and value; whatever a later one beats is dropped, so the best is in front.
         self._rates: deque[tuple[float, float]] = deque()
         self._rtts: deque[tuple[float, float]] = deque()
 
     @property
     def rate(self) -> float:
         """Bytes per second that the path has lately been seen to carry."""
-        return max((rate for _, rate in self._rates), default=0.0)
+        return self._rates[0][1] if self._rates else 0.0
 
     @property
     def least_rtt_s(self) -> float:
         """The shortest time lately from sending a snapshot to hearing that it was applied."""
-        return min((rtt for _, rtt in self._rtts), default=0.0)
+        return self._rtts[0][1] if self._rtts else 0.0
 
     def sent(self, size: int) -> None:
         """Bytes have been handed to the transport."""

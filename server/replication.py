@@ -47,7 +47,7 @@ class ChangeLog:
         self._now = _Tick()
         self._home: dict[int, Cell] = {}
         self._changed: dict[int, set[Cell] | None] = {}
-        self._parts: dict[tuple[Cell, int], bytes] = {}
+        self._parts: dict[int, dict[Cell, bytes]] = defaultdict(dict)
         self._packed: dict[Cell, tuple[int, bytes]] = {}
         self._latest: dict[Cell, bytes] | None = None
         """The packed rows of the entities that the newest tick changed, until something is removed."""
@@ -109,11 +109,18 @@ class ChangeLog:
 
     def part(self, segment: Cell, since: int) -> bytes:
         """The encoded changes of a segment after tick `since`, which is `KEYFRAME` or at most `HISTORY` ago."""
-        key = (segment, since)
-        part = self._parts.get(key)
+        known = self._parts[since]
+        part = known.get(segment)
         if part is None:
-            part = self._parts[key] = self._keyframe(segment) if since == KEYFRAME else self._changes(segment, since)
+            part = known[segment] = self._keyframe(segment) if since == KEYFRAME else self._changes(segment, since)
         return part
+
+    def parts(self, seen: set[Cell], since: int) -> dict[Cell, bytes]:
+        """The parts of those of the `seen` segments that changed after tick `since`, which is at most `HISTORY` ago."""
+        known = self._parts[since]
+        changed = self.changed_segments(since)
+        assert changed is not None
+        return {segment: known.get(segment) or self.part(segment, since) for segment in changed & seen}
 
     def packed(self, segment: Cell) -> bytes:
         """A segment's blocks as they are, packed."""

@@ -1,6 +1,7 @@
 """One client as the server knows it: its inputs and their fates on one side, what it has been sent on the other."""
 
 import math
+import struct
 from collections import deque
 from typing import Protocol
 
@@ -23,6 +24,8 @@ from shared.messages import (
     Inputs,
 )
 from shared.ring import Ring
+
+INPUT_ROW = struct.Struct("<bbB")
 
 
 class Link(Protocol):
@@ -53,16 +56,15 @@ class InputQueue:
 
     def file(self, message: Inputs, tick: int, ahead: float) -> None:
         """Takes a message at tick `tick`; the next tick's deadline is `ahead` ticks away."""
-        rows = memoryview(message.rows).cast("b")
+        first, rows = message.first, message.rows
         count = len(rows) // INPUT_ROW_BYTES
-        known = min(max(self.newest + 1 - message.first, 0), count)  # duplicates, or an order that TCP cannot produce
-        usable = min(max(tick + AHEAD_MAX + 1 - message.first, known), count)
+        known = min(max(self.newest + 1 - first, 0), count)  # duplicates, or an order that TCP cannot produce
+        usable = min(max(tick + AHEAD_MAX + 1 - first, known), count)
         self.refused += known + count - usable
         for i in range(known, usable):
-            at = message.first + i
+            at = first + i
             self._reached(at)
-            move_x, move_y, buttons = rows[3 * i : 3 * i + 3].tolist()
-            wish = clamp(Input(move_x, move_y, buttons & 0xFF))
+            wish = clamp(Input(*INPUT_ROW.unpack_from(rows, i * INPUT_ROW_BYTES)))
             margin = math.floor((at - tick - 1 + ahead) * MARGIN_ONE)
             if at <= tick:
                 self.late += 1
@@ -78,10 +80,10 @@ class InputQueue:
 
     def _reached(self, at: int) -> None:
         """`at` is the newest from here on: ticks left out get a margin each, so that they can be counted off."""
-        if self.newest >= 0:
-            self.margins.extend([MARGIN_REFUSED] * min(at - self.newest - 1, FATES_MAX))
-        else:
+        if self.newest < 0:
             self.first = at
+        elif at > self.newest + 1:
+            self.margins.extend([MARGIN_REFUSED] * min(at - self.newest - 1, FATES_MAX))
         self.newest = at
 
     def take(self, tick: int) -> Input:

@@ -54,11 +54,12 @@ class Sight:
     def take(self, log: ChangeLog, tick: int, room: int) -> list[bytes]:
         """The encoded parts of a snapshot for `tick`, of about `room` bytes; they count as sent, as do `drops`."""
         assert not self.lost_track(tick)
-        changed = (log.changed_segments(self._tick) or set()) if self._tick >= 0 else set()
-        due = {segment: self._tick for segment in changed if segment in self.sees}
+        parts = log.parts(self.sees, self._tick) if self._tick >= 0 else {}
+        due = dict.fromkeys(parts, self._tick)
         if self._behind or self._fresh:
-            due |= self._behind | dict.fromkeys(self._fresh, KEYFRAME)
-        parts = {segment: log.part(segment, since) for segment, since in due.items()}
+            special = self._behind | dict.fromkeys(self._fresh, KEYFRAME)
+            due |= special
+            parts |= {segment: log.part(segment, since) for segment, since in special.items()}
         if sum(map(len, parts.values())) > room:
             parts = self._urgent(parts, due, tick, room)
         if self._fresh or self.drops:
