@@ -1,4 +1,4 @@
-"""A match is a large knot of references, and few objects: it is untied after each test, or memory grows by gigabytes."""
+"""A match is a large knot of references in few objects: it is untied after each test, or memory grows by gigabytes."""
 
 import gc
 from collections.abc import Iterator
