@@ -275,7 +275,9 @@ class Game:
                 self.counters.snapshots_skipped += 1
                 continue
             session.sent_at = now
-            self._send_snapshot(session, max(window - outstanding, session.snapshot_bytes, LEAST_BYTES), now)
+            self._send_snapshot(session, max(window - outstanding, LEAST_BYTES), now)
+            if outstanding == 0:
+                session.sent_when.put(self.world.tick, now)
             if session.terrain_now or session.terrain_due:
                 self._send_terrain(session, window - session.link.outstanding())
 
@@ -313,7 +315,6 @@ class Game:
         session.send(message)
         session.tick = tick
         session.snapshot_bytes = len(message)
-        session.sent_when.put(tick, now)
         inputs.told()
         self.counters.snapshots_sent += 1
         self.counters.snapshot_bytes += len(message)

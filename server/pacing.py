@@ -8,6 +8,8 @@ snapshot goes behind it. So a snapshot is sent only while the bytes on the way (
 where `rate` is the fastest the path has acknowledged bytes lately and the least round trip is that of an empty
 path. Three of them, because a lost packet holds up the acknowledgements of all behind it for two or more, although
 no queue has grown: with one, a path of 200 ms that loses 2 % of its packets gets 28 snapshots/s instead of 32.
+The round trip is measured of snapshots before which nothing was on the way; where there is always something, the
+sending pauses once a minute until there is not, or a queue of one's own would pass for distance, and grow for ever.
 A client that lost some ticks that way gets their union in its next snapshot: latest wins.
 """
 
@@ -49,7 +51,7 @@ class Pacing:
         self.sent_bytes += size
 
     def answered(self, rtt_s: float, now: float) -> None:
-        """The client has acknowledged a snapshot `rtt_s` after it was sent."""
+        """The client has acknowledged, `rtt_s` after it was sent, a snapshot before which nothing was on the way."""
         while self._rtts and (self._rtts[0][0] < now - RTT_WINDOW_S):
             self._rtts.popleft()
         while self._rtts and self._rtts[-1][1] >= rtt_s:
@@ -70,6 +72,8 @@ class Pacing:
             self._rates.append((now, rate))
         while self._rates and self._rates[0][0] < now - RATE_WINDOW_S:
             self._rates.popleft()
+        if self._rtts and now - self._rtts[-1][0] > RTT_WINDOW_S:
+            return 0
         rtt_s = self.least_rtt_s
         hold_s = min(STALL_RTTS * rtt_s, max(HOLD_S_MAX, 1.5 * rtt_s)) + tick_s
         return max(2 * snapshot_bytes, LEAST_BYTES, int(self.rate * hold_s))

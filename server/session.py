@@ -137,6 +137,7 @@ class Session:
         self.edits_left = math.inf
         self.pacing = Pacing()
         self.sent_when: Ring[float] = Ring(FATES_MAX)
+        """When snapshots were sent before which nothing was on the way."""
         self.skipped = 0
 
     def send(self, message: bytes) -> None:
