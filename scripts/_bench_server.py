@@ -207,10 +207,10 @@ def most(stages: list[Figures]) -> Figures | None:
 def profile(clients: int, seconds: float) -> dict[str, float]:
     """The share of each part in the server's CPU time, by samples of its stack (SIGPROF) in a run apart.
 
-    A signal that comes while sockets are read is seen in the next Python code, mostly `receive`: that has the event
-    loop's share too.
+    A signal that comes while sockets are written or read is seen in the next Python code, mostly `receive`: that has
+    the share of the kernel too.
     """
     with rig("profile") as running:
-        samples: dict[str, int] = running.hold(clients, seconds)["samples"]
-    total = max(1, sum(samples.values()))
+        samples: dict[str, float] = running.hold(clients, seconds)["samples"]
+    total = sum(samples.values()) or 1.0
     return {part: n / total for part, n in samples.items()}

@@ -1,7 +1,7 @@
 """Servers to be measured, as processes of their own; `bench.py server` starts them.
 
 _busy_server.py game SCENE         the product
-_busy_server.py profile SCENE      the product, with its stack sampled by CPU time; /stats shows how often in which part
+_busy_server.py profile SCENE      the product, its stack sampled by CPU time; /stats shows the seconds of each part
 _busy_server.py echo SCENE BYTES   the product's gateway and ticker without a game: the bound. What comes is taken in
                                    unread; every tick each client is sent a message of so many bytes
 """
@@ -9,6 +9,7 @@ _busy_server.py echo SCENE BYTES   the product's gateway and ticker without a ga
 import asyncio
 import signal
 import sys
+import time
 from types import FrameType, FunctionType
 from typing import Any, cast
 
@@ -99,7 +100,8 @@ class Profile:
     """How much of this process's CPU time is spent in which part, by samples of the stack."""
 
     def __init__(self) -> None:
-        self.samples = dict.fromkeys([*(part for _, part in DOORS), "event loop"], 0)
+        self.samples = dict.fromkeys([*(part for _, part in DOORS), "event loop"], 0.0)
+        self._latest = time.process_time()
         self._parts = {function.__code__: part for function, part in DOORS}
         signal.signal(signal.SIGPROF, self._sample)
         signal.setitimer(signal.ITIMER_PROF, SAMPLE_S, SAMPLE_S)
@@ -109,7 +111,9 @@ class Profile:
         while part is None and frame is not None:
             part = self._parts.get(frame.f_code)
             frame = frame.f_back
-        self.samples[part or "event loop"] += 1
+        now = time.process_time()
+        self.samples[part or "event loop"] += now - self._latest  # in the event loop's C code signals wait and are one
+        self._latest = now
 
 
 def serve(served: Game) -> None:
