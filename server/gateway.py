@@ -56,7 +56,7 @@ _quiet.setLevel(logging.WARNING)  # two lines per connection otherwise
 
 
 def _frame_head(size: int) -> bytes:
-    """What goes before an unmasked binary message of so many bytes (by way of websockets 1 us more per message)."""
+    """What goes before an unmasked binary message of so many bytes."""
     if size < 126:
         return bytes((FINAL_BINARY, size))
     if size < 1 << 16:

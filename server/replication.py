@@ -75,7 +75,7 @@ class ChangeLog:
     def record(self) -> None:
         """Takes in what the step has changed: all of it is packed at once, in the order of segments.
 
-        So a part of the newest tick, which nearly all are, is a slice of that: 9 us per client and tick became 2.
+        So a part of the newest tick, which nearly all are, is a slice of that: 4.9 us per client and tick became 1.7.
         """
         now, rows, homes = self._now, self._world.changed, self._home
         cells = rows[:, X : X + 3] >> (BLOCK_SHIFT + SEGMENT_SHIFT)
