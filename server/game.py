@@ -360,7 +360,7 @@ class Game:
             session.acked = tick
             when = session.sent_when.get(tick)
             if when is not None:
-                session.pacing.answered(now - when, now)
+                session.pacing.answered(now - when, session.snapshot_bytes, now)
 
     def _file_command(self, session: Session, command: Command) -> None:
         if command.number <= session.command:
@@ -383,7 +383,7 @@ class Game:
             self._refuse(session, messages.WRONG_SCENE, reason)
             return
         session.name = hello.name
-        session.pacing.answered(now - session.opened, now)  # of a path that was empty
+        session.pacing.answered(now - session.opened, 0, now)  # of a path that was empty
         session.joining = True
 
     def _refuse(self, session: Session, code: int, reason: str) -> None:

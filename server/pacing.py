@@ -8,11 +8,13 @@ snapshot goes behind it. So a snapshot is sent only while the bytes on the way (
 where `rate` is the fastest the path has acknowledged bytes lately and the least round trip is that of an empty
 path. Three of them, because a lost packet holds up the acknowledgements of all behind it for two or more, although
 no queue has grown: with one, a path of 200 ms that loses 2 % of its packets gets 28 snapshots/s instead of 32.
-The round trip is measured of snapshots before which nothing was on the way; where there is always something, the
-sending pauses once a minute until there is not, or a queue of one's own would pass for distance, and grow for ever.
+The round trip is measured of snapshots before which nothing was on the way. Where that never happens because the
+path is full, sending pauses once a minute until it is empty, or a queue of one's own would pass for distance, and grow
+for ever.
 A client that lost some ticks that way gets their union in its next snapshot: latest wins.
 """
 
+import math
 from collections import deque
 
 RATE_WINDOW_S = 1.0
@@ -35,6 +37,7 @@ class Pacing:
         # Time and value; whatever a later one beats is dropped, so the best is in front.
         self._rates: deque[tuple[float, float]] = deque()
         self._rtts: deque[tuple[float, float]] = deque()
+        self._full_at = -math.inf
 
     @property
     def rate(self) -> float:
@@ -50,8 +53,10 @@ class Pacing:
         """Bytes have been handed to the transport."""
         self.sent_bytes += size
 
-    def answered(self, rtt_s: float, now: float) -> None:
-        """The client has acknowledged, `rtt_s` after it was sent, a snapshot before which nothing was on the way."""
+    def answered(self, rtt_s: float, size: int, now: float) -> None:
+        """The client has acknowledged, `rtt_s` after it was sent, `size` bytes before which nothing was on the way."""
+        if now - self._full_at < RATE_WINDOW_S + rtt_s and self.rate > 0:
+            rtt_s = max(rtt_s - size / self.rate, 0.0)  # of a narrow path, part of that was its width
         while self._rtts and (self._rtts[0][0] < now - RTT_WINDOW_S):
             self._rtts.popleft()
         while self._rtts and self._rtts[-1][1] >= rtt_s:
@@ -72,8 +77,11 @@ class Pacing:
             self._rates.append((now, rate))
         while self._rates and self._rates[0][0] < now - RATE_WINDOW_S:
             self._rates.popleft()
-        if self._rtts and now - self._rtts[-1][0] > RTT_WINDOW_S:
+        if self._rtts and now - self._rtts[-1][0] > RTT_WINDOW_S > now - self._full_at:
             return 0
         rtt_s = self.least_rtt_s
         hold_s = min(STALL_RTTS * rtt_s, max(HOLD_S_MAX, 1.5 * rtt_s)) + tick_s
-        return max(2 * snapshot_bytes, LEAST_BYTES, int(self.rate * hold_s))
+        window = max(2 * snapshot_bytes, LEAST_BYTES, int(self.rate * hold_s))
+        if outstanding > window:
+            self._full_at = now
+        return window
