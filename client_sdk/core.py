@@ -51,8 +51,8 @@ from shared.messages import (
 )
 from shared.ring import Ring
 from shared.scene import Scene
+from shared.snapshot import VERDICT
 
-VERDICT = np.dtype([("number", "<u4"), ("verdict", "u1")])
 TICKS_PER_UPDATE_MAX = 16
 """A program that was away for longer does not catch up tick by tick: it begins anew."""
 UNCONFIRMED_MAX = 96

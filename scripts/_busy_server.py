@@ -16,6 +16,7 @@ from typing import Any, cast
 import msgpack
 
 from server import app
+from server.delivery import Delivery
 from server.game import Game
 from server.gateway import Connection
 from server.replication import ChangeLog
@@ -86,7 +87,7 @@ DOORS: list[tuple[FunctionType, str]] = [
         (ChangeLog.changed_segments, "encode"),
         (ChangeLog.part, "encode"),
         (Rewind.record, "rewind"),
-        (Game._send, "choose"),
+        (Delivery.serve, "choose"),
         (Session.send, "send"),
         (Connection.outstanding, "send"),
         (Game.tick, "rest of the tick"),

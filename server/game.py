@@ -9,17 +9,13 @@ through.
 """
 
 import dataclasses
-import struct
-from collections import deque
 from collections.abc import Iterator
 from itertools import count
 from typing import Any
 
-import numpy as np
-
-from server import interest
+from server.counters import Counters
+from server.delivery import Delivery
 from server.limits import Limits
-from server.pacing import LEAST_BYTES
 from server.replication import ChangeLog
 from server.rewind import Past, Rewind
 from server.session import Link, Session
@@ -36,7 +32,6 @@ from shared.messages import (
     Pong,
     ProtocolError,
     Resync,
-    Terrain,
     Welcome,
     decode_from_client,
     encode,
@@ -44,32 +39,10 @@ from shared.messages import (
 from shared.scene import Scene
 from shared.world import OverlapError, World
 
-VERDICT = np.dtype([("number", "<u4"), ("verdict", "u1")])
 RESYNC_S = 1.0
 """A client may ask for everything anew so often."""
 SPAWN_RINGS = 24
 """Where a spawn is taken, others are tried in rings around it, two blocks apart."""
-
-
-@dataclasses.dataclass
-class Counters:
-    """What has happened since the start."""
-
-    joined: int = 0
-    left: int = 0
-    refused: int = 0
-    malformed: int = 0
-    kicked: int = 0
-    inputs_used: int = 0
-    inputs_late: int = 0
-    inputs_substituted: int = 0
-    inputs_refused: int = 0
-    snapshots_sent: int = 0
-    snapshots_skipped: int = 0
-    snapshot_bytes: int = 0
-    terrain_bytes: int = 0
-    fell_out: int = 0
-    resyncs: int = 0
 
 
 class Game:
@@ -99,6 +72,7 @@ class Game:
         self.log = ChangeLog(self.world)
         self.rewind = Rewind(self.world)
         self.counters = Counters()
+        self.delivery = Delivery(self.world, self.log, self.limits, self.counters)
         self.sessions: list[Session] = []
         self._numbers = count(1)
         self._leaving: list[Session] = []
@@ -134,7 +108,7 @@ class Game:
             return
         if isinstance(message, Inputs) and session.entity:
             session.inputs.file(message, self.world.tick, self._ticks_left(now))
-            self._acked(session, message.acked, now)
+            self.delivery.acked(session, message.acked, now)
         elif isinstance(message, Ping):
             tick = self.world.tick + 1 - self._ticks_left(now)
             session.send(encode(Pong(message.sent, tick)))
@@ -146,7 +120,7 @@ class Game:
             if now - session.resynced_at >= RESYNC_S:
                 session.resynced_at = now
                 self.counters.resyncs += 1
-                self._forget(session)
+                self.delivery.forget(session)
         elif isinstance(message, Bye):
             session.close(messages.GOING_AWAY, "goodbye")
         else:
@@ -260,79 +234,10 @@ class Game:
         self.counters.fell_out += len(self._respawn)
 
     def _send(self, now: float) -> None:
-        tick_s = 1 / self.scene.tick_rate
         for session in tuple(self.sessions):
             session.allowance = min(session.allowance + self.limits.messages_per_tick, 0.0)
-            if not session.entity or session.closed:
-                continue
-            self._look_around(session)
-            outstanding = session.link.outstanding()
-            window = session.pacing.window(outstanding, session.snapshot_bytes, tick_s, now)
-            if session.acked < 0:
-                window = max(window, self.limits.first_bytes)
-            if outstanding > window:
-                session.skipped += 1
-                self.counters.snapshots_skipped += 1
-                continue
-            session.sent_at = now
-            self._send_snapshot(session, max(window - outstanding, LEAST_BYTES), now)
-            if outstanding == 0:
-                session.sent_when.put(self.world.tick, now)
-            if session.terrain_now or session.terrain_due:
-                self._send_terrain(session, window - session.link.outstanding())
-
-    def _look_around(self, session: Session) -> None:
-        centre, sight = self.log.segment(session.entity), session.sight
-        if centre == sight.centre:
-            return
-        exists = self.world.blocks.__contains__
-        added, dropped = sight.move(centre, self.limits.see_radius, self.limits.keep_radius, exists)
-        due = [segment for segment in session.terrain_due if segment in sight.sees] + [s for s in added if exists(s)]
-        session.terrain_due = deque(sorted(due, key=lambda segment: interest.distance(segment, centre)))
-        if session.terrain_now and session.terrain_now[0] in dropped:
-            session.terrain_now = None
-
-    def _forget(self, session: Session) -> None:
-        """Begins anew with what a client sees: keyframes and terrain."""
-        session.sight.forget()
-        session.terrain_now = None
-        session.terrain_due = deque(sorted(s for s in session.sight.sees if s in self.world.blocks))
-
-    def _send_snapshot(self, session: Session, room: int, now: float) -> None:
-        tick, inputs = self.world.tick, session.inputs
-        if session.sight.lost_track(tick):
-            self._forget(session)
-        drops = np.array(session.sight.drops, "<i4").tobytes() if session.sight.drops else b""
-        parts = session.sight.take(self.log, tick, room)
-        margins = struct.pack(f"<{len(inputs.margins)}h", *inputs.margins)
-        verdicts = b""
-        if session.verdicts:
-            verdicts = np.array(session.verdicts[: messages.VERDICTS_MAX], VERDICT).tobytes()
-            del session.verdicts[: messages.VERDICTS_MAX]
-        first = tick - len(inputs.fates) + 1
-        header = (tick, inputs.newest, margins, first, bytes(inputs.fates), verdicts, drops)
-        message = messages.join_snapshot(header, parts)
-        session.send(message)
-        session.tick = tick
-        session.snapshot_bytes = len(message)
-        inputs.told()
-        self.counters.snapshots_sent += 1
-        self.counters.snapshot_bytes += len(message)
-
-    def _send_terrain(self, session: Session, room: int) -> None:
-        """Terrain behind the snapshot, as far as it fits into what may be on the way."""
-        room = min(room, self.limits.terrain_bytes_per_tick)
-        while room > 0 and (session.terrain_now or session.terrain_due):
-            if session.terrain_now is None:
-                segment = session.terrain_due.popleft()
-                session.terrain_now = (segment, self.log.packed(segment), 0)
-            segment, packed, offset = session.terrain_now
-            chunk = packed[offset : offset + self.limits.terrain_chunk_bytes]
-            session.send(encode(Terrain(*segment, offset, len(packed), chunk)))
-            offset += len(chunk)
-            session.terrain_now = (segment, packed, offset) if offset < len(packed) else None
-            room -= len(chunk)
-            self.counters.terrain_bytes += len(chunk)
+            if session.entity and not session.closed:
+                self.delivery.serve(session, now)
 
     def _check_clocks(self, now: float) -> None:
         for session in tuple(self.sessions):
@@ -353,14 +258,6 @@ class Game:
         if self._deadline is None:
             return 1.0
         return 1.0 - (now - self._deadline) * self.scene.tick_rate
-
-    def _acked(self, session: Session, tick: int, now: float) -> None:
-        """The client has applied the snapshot of a tick."""
-        if session.acked < tick <= session.tick:
-            session.acked = tick
-            when = session.sent_when.get(tick)
-            if when is not None:
-                session.pacing.answered(now - when, session.snapshot_bytes, now)
 
     def _file_command(self, session: Session, command: Command) -> None:
         if command.number <= session.command:

@@ -27,6 +27,7 @@ ROW = np.dtype(
     + [(name, "<i4") for name in ("x", "y", "z", "vx", "vy", "vz")]
     + [("move_x", "i1"), ("move_y", "i1"), ("buttons", "u1")]
 )
+VERDICT = np.dtype([("number", "<u4"), ("verdict", "u1")])
 EDIT = np.dtype([("block", "<u2"), ("kind", "u1")])
 SIDE = SEGMENT * BLOCK
 """Grid steps along one side of a segment."""

@@ -1,0 +1,24 @@
+"""What a server counts."""
+
+from dataclasses import dataclass
+
+
+@dataclass
+class Counters:
+    """What has happened since the start."""
+
+    joined: int = 0
+    left: int = 0
+    refused: int = 0
+    malformed: int = 0
+    kicked: int = 0
+    inputs_used: int = 0
+    inputs_late: int = 0
+    inputs_substituted: int = 0
+    inputs_refused: int = 0
+    snapshots_sent: int = 0
+    snapshots_skipped: int = 0
+    snapshot_bytes: int = 0
+    terrain_bytes: int = 0
+    fell_out: int = 0
+    resyncs: int = 0

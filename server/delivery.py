@@ -1,0 +1,110 @@
+"""What each client is sent: the newest snapshot if its path has room, and terrain behind it.
+
+Theory of operation. Once a tick each session is served, or not: if more is on the way to it than `pacing` allows, it
+is left out, and gets the union of what it missed with its next snapshot. What goes into that is `sight`'s choice; the
+bytes of a segment's changes are `replication`'s, made once for all. A segment's blocks follow in pieces, behind the
+snapshot, as far as there is room: terrain never makes a snapshot late.
+"""
+
+import struct
+from collections import deque
+
+import numpy as np
+
+from server import interest
+from server.counters import Counters
+from server.limits import Limits
+from server.pacing import LEAST_BYTES
+from server.replication import ChangeLog
+from server.session import Session
+from shared import messages
+from shared.messages import Terrain, encode
+from shared.snapshot import VERDICT
+from shared.world import World
+
+
+class Delivery:
+    """Sends to sessions what there is for them."""
+
+    def __init__(self, world: World, log: ChangeLog, limits: Limits, counters: Counters) -> None:
+        self._world, self._log, self._limits, self._counters = world, log, limits, counters
+        self._tick_s = 1 / world.scene.tick_rate
+
+    def serve(self, session: Session, now: float) -> None:
+        """Sends a session the tick that has been recorded, if its path has room."""
+        self._look_around(session)
+        outstanding = session.link.outstanding()
+        window = session.pacing.window(outstanding, session.snapshot_bytes, self._tick_s, now)
+        if session.acked < 0:
+            window = max(window, self._limits.first_bytes)
+        if outstanding > window:
+            session.skipped += 1
+            self._counters.snapshots_skipped += 1
+            return
+        session.sent_at = now
+        self._send_snapshot(session, max(window - outstanding, LEAST_BYTES))
+        if outstanding == 0:
+            session.sent_when.put(self._world.tick, now)
+        if session.terrain_now or session.terrain_due:
+            self._send_terrain(session, window - session.link.outstanding())
+
+    def acked(self, session: Session, tick: int, now: float) -> None:
+        """The client has applied the snapshot of a tick."""
+        if session.acked < tick <= session.tick:
+            session.acked = tick
+            when = session.sent_when.get(tick)
+            if when is not None:
+                session.pacing.answered(now - when, session.snapshot_bytes, now)
+
+    def forget(self, session: Session) -> None:
+        """Begins anew with what a client sees: keyframes and terrain."""
+        session.sight.forget()
+        session.terrain_now = None
+        session.terrain_due = deque(sorted(s for s in session.sight.sees if s in self._world.blocks))
+
+    def _look_around(self, session: Session) -> None:
+        centre, sight = self._log.segment(session.entity), session.sight
+        if centre == sight.centre:
+            return
+        exists = self._world.blocks.__contains__
+        added, dropped = sight.move(centre, self._limits.see_radius, self._limits.keep_radius, exists)
+        due = [segment for segment in session.terrain_due if segment in sight.sees] + [s for s in added if exists(s)]
+        session.terrain_due = deque(sorted(due, key=lambda segment: interest.distance(segment, centre)))
+        if session.terrain_now and session.terrain_now[0] in dropped:
+            session.terrain_now = None
+
+    def _send_snapshot(self, session: Session, room: int) -> None:
+        tick, inputs = self._world.tick, session.inputs
+        if session.sight.lost_track(tick):
+            self.forget(session)
+        drops = np.array(session.sight.drops, "<i4").tobytes() if session.sight.drops else b""
+        parts = session.sight.take(self._log, tick, room)
+        margins = struct.pack(f"<{len(inputs.margins)}h", *inputs.margins)
+        verdicts = b""
+        if session.verdicts:
+            verdicts = np.array(session.verdicts[: messages.VERDICTS_MAX], VERDICT).tobytes()
+            del session.verdicts[: messages.VERDICTS_MAX]
+        first = tick - len(inputs.fates) + 1
+        header = (tick, inputs.newest, margins, first, bytes(inputs.fates), verdicts, drops)
+        message = messages.join_snapshot(header, parts)
+        session.send(message)
+        session.tick = tick
+        session.snapshot_bytes = len(message)
+        inputs.told()
+        self._counters.snapshots_sent += 1
+        self._counters.snapshot_bytes += len(message)
+
+    def _send_terrain(self, session: Session, room: int) -> None:
+        """Terrain behind the snapshot, as far as it fits into what may be on the way."""
+        room = min(room, self._limits.terrain_bytes_per_tick)
+        while room > 0 and (session.terrain_now or session.terrain_due):
+            if session.terrain_now is None:
+                segment = session.terrain_due.popleft()
+                session.terrain_now = (segment, self._log.packed(segment), 0)
+            segment, packed, offset = session.terrain_now
+            chunk = packed[offset : offset + self._limits.terrain_chunk_bytes]
+            session.send(encode(Terrain(*segment, offset, len(packed), chunk)))
+            offset += len(chunk)
+            session.terrain_now = (segment, packed, offset) if offset < len(packed) else None
+            room -= len(chunk)
+            self._counters.terrain_bytes += len(chunk)
