@@ -1,0 +1,95 @@
+"""What goes into a client's snapshot where not everything fits."""
+
+import pytest
+
+from server.replication import HISTORY, KEYFRAME
+from server.sight import Sight
+from shared.checks import Cell
+
+OWN, NEAR, FAR = (0, 0, 0), (1, 0, 0), (2, 0, 0)
+ROW = [OWN, NEAR, FAR]
+
+
+class Log:
+    """Stands for the change log: in every tick, every segment changes; a part is as long as it is told to be."""
+
+    def __init__(self, sizes: dict[Cell, int]) -> None:
+        self.sizes = sizes
+        self.asked: list[tuple[Cell, int]] = []
+
+    def parts(self, sees: set[Cell], since: int) -> dict[Cell, bytes]:
+        return {segment: self.part(segment, since) for segment in self.sizes if segment in sees}
+
+    def part(self, segment: Cell, since: int) -> bytes:
+        self.asked.append((segment, since))
+        return bytes([ROW.index(segment)]) * self.sizes[segment]
+
+
+def looking(*, see: int = 2) -> Sight:
+    sight = Sight()
+    sight.move(OWN, see, see, lambda segment: segment in ROW)
+    return sight
+
+
+def take(sight: Sight, log: Log, tick: int, room: int) -> list[Cell]:
+    log.asked.clear()
+    return [ROW[part[0]] for part in sight.take(log, tick, room)]  # type: ignore[arg-type]
+
+
+def test_everything_goes_where_it_fits_first_whole_and_then_its_changes() -> None:
+    sight, log = looking(), Log(dict.fromkeys(ROW, 10))
+    assert sorted(take(sight, log, 5, 100)) == ROW
+    assert set(log.asked) == {(segment, KEYFRAME) for segment in ROW}
+    assert sorted(take(sight, log, 6, 100)) == ROW
+    assert set(log.asked) == {(segment, 5) for segment in ROW}
+
+
+def test_the_own_segment_always_goes_however_little_room_there_is() -> None:
+    sight, log = looking(), Log(dict.fromkeys(ROW, 1000))
+    for tick in range(1, 200):
+        assert take(sight, log, tick, 10) == [OWN]
+        if sight.lost_track(tick + 1):
+            sight.forget()
+
+
+def test_what_waits_is_caught_up_with_from_where_it_was_and_nobody_starves() -> None:
+    sight, log = looking(), Log(dict.fromkeys(ROW, 10))
+    take(sight, log, 1, 100)
+    latest = dict.fromkeys(ROW, 1)
+    longest = dict.fromkeys(ROW, 0)
+    for tick in range(2, 300):
+        for segment in take(sight, log, tick, 20):
+            longest[segment] = max(longest[segment], tick - latest[segment])
+            latest[segment] = tick
+        assert not sight.lost_track(tick + 1)
+    assert longest[OWN] == 1
+    assert longest[OWN] <= longest[NEAR] <= longest[FAR] < 8
+
+
+def test_a_part_is_asked_for_since_the_tick_it_was_sent_last() -> None:
+    sight, log = looking(), Log(dict.fromkeys(ROW, 10))
+    take(sight, log, 1, 100)
+    sent = dict.fromkeys(ROW, 1)
+    for tick in range(2, 50):
+        chosen = take(sight, log, tick, 20)
+        assert dict(log.asked) == sent
+        sent |= dict.fromkeys(chosen, tick)
+
+
+@pytest.mark.parametrize("ticks", [HISTORY, HISTORY + 1])
+def test_who_is_too_far_behind_has_lost_track(ticks: int) -> None:
+    sight, log = looking(), Log(dict.fromkeys(ROW, 10))
+    take(sight, log, 1, 100)
+    assert sight.lost_track(1 + ticks) == (ticks > HISTORY)
+    sight.forget()
+    assert not sight.lost_track(1 + ticks)
+    take(sight, log, 1 + ticks, 100)
+    assert {since for _, since in log.asked} == {KEYFRAME}
+
+
+def test_only_what_was_sent_and_is_seen_no_more_is_dropped() -> None:
+    sight, log = looking(), Log(dict.fromkeys(ROW, 10))
+    take(sight, log, 1, 10)  # the client knows of its own segment only
+    sight.move((20, 0, 0), 1, 2, lambda segment: False)
+    assert sight.drops == [OWN]
+    assert sight.sees == {(20, 0, 0)}
