@@ -57,7 +57,7 @@ class Picture:
         known = self._prediction.predicted
         self._smoothing = {entity: old for entity, old in self._smoothing.items() if entity in known}
         for entity, offset in done.offsets.items():
-            if offset != (0.0, 0.0, 0.0) and entity not in done.acted:
+            if entity not in done.acted:
                 self._smoothing.setdefault(entity, Smoothing()).add(offset, now)
 
     def view(self, timeline: Timeline, clock: ServerClock, now: float) -> View:

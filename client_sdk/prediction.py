@@ -29,13 +29,12 @@ from shared.layout import COLUMNS, FALLING, FLAGS, ID, TEMPLATE, Int64s, X
 from shared.messages import REPEATS_MAX, ProtocolError, Snapshot
 from shared.ring import Ring
 from shared.scene import Scene
-from shared.snapshot import ACTED, SegmentPart, checksum, decode_parts
+from shared.snapshot import ACTED, KEYFRAME, SegmentPart, checksum, decode_parts
 from shared.units import BLOCK, BLOCK_SHIFT, SEGMENT, SEGMENT_SHIFT
 from shared.world import World
 
 HISTORY = 256
 """Ticks for which predictions and inputs are kept."""
-KEYFRAME = -1
 MEET_BLOCKS = 12
 """Whoever is further away cannot be met before a replay, at the speeds that legs have."""
 NEAR_BLOCKS = 5.0

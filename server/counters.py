@@ -2,6 +2,8 @@
 
 from dataclasses import dataclass
 
+from server.session import InputQueue
+
 
 @dataclass
 class Counters:
@@ -22,3 +24,10 @@ class Counters:
     terrain_bytes: int = 0
     fell_out: int = 0
     resyncs: int = 0
+
+    def add(self, queue: InputQueue) -> None:
+        """Counts in how one player's inputs have fared."""
+        self.inputs_used += queue.used
+        self.inputs_late += queue.late
+        self.inputs_substituted += queue.substituted
+        self.inputs_refused += queue.refused

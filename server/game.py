@@ -175,11 +175,7 @@ class Game:
                 self.counters.left += 1
                 self.world.remove(session.entity)
                 self.log.note_removal(session.entity)
-            queue = session.inputs
-            self.counters.inputs_used += queue.used
-            self.counters.inputs_late += queue.late
-            self.counters.inputs_refused += queue.refused
-            self.counters.inputs_substituted += queue.substituted
+            self.counters.add(session.inputs)
         self._leaving.clear()
 
     def _join(self) -> None:
@@ -329,14 +325,10 @@ class Game:
 
     def stats(self) -> dict[str, Any]:
         """Counters, with those of the clients that are connected."""
-        totals = dataclasses.asdict(self.counters)
+        totals = dataclasses.replace(self.counters)
         for session in self.sessions:
-            queue = session.inputs
-            totals["inputs_used"] += queue.used
-            totals["inputs_late"] += queue.late
-            totals["inputs_refused"] += queue.refused
-            totals["inputs_substituted"] += queue.substituted
-        return totals | {
+            totals.add(session.inputs)
+        return dataclasses.asdict(totals) | {
             "tick": self.world.tick,
             "tick_rate": self.scene.tick_rate,
             "clients": sum(session.entity > 0 for session in self.sessions),

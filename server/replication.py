@@ -9,20 +9,18 @@ from collections import defaultdict
 
 import numpy as np
 
-from shared.blocks import pack, segment_of
+from shared.blocks import offset_of, pack, segment_of
 from shared.checks import Cell
 from shared.layout import ID, X
 from shared.ring import Ring
-from shared.snapshot import ROW, checksum, encode_part, encode_rows, join_part
-from shared.units import BLOCK_SHIFT, SEGMENT, SEGMENT_SHIFT
+from shared.snapshot import KEYFRAME, ROW, checksum, encode_part, encode_rows, join_part
+from shared.units import BLOCK_SHIFT, SEGMENT_SHIFT
 from shared.world import World
 
 HISTORY = 64
 """Ticks for which changes are kept."""
 CHECK_TICKS = 32
 """How often a segment in which something changes is sent with its checksum."""
-KEYFRAME = -1
-"""The `since` of a part that holds everything."""
 
 
 class _Tick:
@@ -58,8 +56,7 @@ class ChangeLog:
 
     def note_edit(self, x: int, y: int, z: int) -> None:
         """A block has changed, ahead of the coming step."""
-        inside = SEGMENT - 1
-        self._now.edited[segment_of(x, y, z)].add((z & inside) << 10 | (y & inside) << 5 | (x & inside))
+        self._now.edited[segment_of(x, y, z)].add(offset_of(x, y, z))
 
     def note_act(self, entity: int) -> None:
         """The rules have placed or thrown an entity, ahead of the coming step."""

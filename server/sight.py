@@ -10,8 +10,9 @@ a wall of bytes in front of the own position.
 from collections.abc import Callable
 
 from server import interest
-from server.replication import HISTORY, KEYFRAME, ChangeLog
+from server.replication import HISTORY, ChangeLog
 from shared.checks import Cell
+from shared.snapshot import KEYFRAME
 
 
 class Sight:

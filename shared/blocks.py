@@ -76,7 +76,8 @@ def segment_of(x: int, y: int, z: int) -> Cell:
     return x >> SEGMENT_SHIFT, y >> SEGMENT_SHIFT, z >> SEGMENT_SHIFT
 
 
-def _offset(x: int, y: int, z: int) -> int:
+def offset_of(x: int, y: int, z: int) -> int:
+    """The index of a block within its segment."""
     inside = SEGMENT - 1
     return (z & inside) << 10 | (y & inside) << 5 | (x & inside)
 
@@ -141,11 +142,11 @@ class Blocks:
     def get(self, x: int, y: int, z: int) -> int | None:
         """The kind of a block; None where no segment is loaded."""
         row = self.rows.get(segment_of(x, y, z))
-        return None if row is None else int(self.kinds[row, _offset(x, y, z)])
+        return None if row is None else int(self.kinds[row, offset_of(x, y, z)])
 
     def set(self, x: int, y: int, z: int, kind: int) -> None:
         """Changes one block of a loaded segment."""
-        row, at = self.rows[segment_of(x, y, z)], _offset(x, y, z)
+        row, at = self.rows[segment_of(x, y, z)], offset_of(x, y, z)
         change = _mix_one(at, int(self.kinds[row, at])) ^ _mix_one(at, kind)
         self.kinds[row, at] = kind
         word, bit = at >> SEGMENT_SHIFT, 1 << (at & (SEGMENT - 1))

@@ -18,9 +18,6 @@ cells (-1: none) with its `next` and `prev` neighbour rows; `changed` the tick t
 WIDTH_SHIFT = 4
 """In the kernel's flat view the row r of an entity begins at r << WIDTH_SHIFT."""
 
-STATE = slice(ID, CELL)
-"""The columns that are the state of an entity; the rest is bookkeeping of this process."""
-
 FALLING = 1
 """Flag: gravity acts."""
 AWAKE = 2

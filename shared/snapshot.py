@@ -1,12 +1,15 @@
 """One segment's part of a snapshot: encoded once per tick, read by every client that sees the segment.
 
-segment   [x, y, z, since, rows, gone, edits]      a MessagePack array inside the snapshot's array
-since     what follows is what changed after this tick; -1: rows are all entities of the segment
-rows      n * 33 bytes, the whole exact state of an entity:
-          u32 id  u8 template  u8 flags  i32 x, y, z (grid steps from the segment's low corner)
-          i32 vx, vy, vz  i8 move_x, move_y  u8 buttons
-gone      n * u32: entities that have left the segment or the world
-edits     n * [u16 block, u8 kind]: blocks that changed, by index z << 10 | y << 5 | x
+    segment   [x, y, z, since, rows, gone, edits, check]   a MessagePack array inside the snapshot's array
+    since     what follows is what changed after this tick; -1 (`KEYFRAME`): rows are all entities of the segment
+    rows      n * 33 bytes, the whole exact state of an entity:
+              u32 id  u8 template  u8 flags  i32 x, y, z (grid steps from the segment's low corner)
+              i32 vx, vy, vz  i8 move_x, move_y  u8 buttons
+    gone      n * u32: entities that have left the segment or the world
+    edits     n * [u16 block, u8 kind]: blocks that changed, by index z << 10 | y << 5 | x
+    check     now and then a checksum of all of the segment, entities and blocks, else 0
+
+On the wire the flags have one bit more: `ACTED` says that the server's rules moved the entity, not the physics.
 """
 
 import zlib
@@ -35,6 +38,8 @@ FIELDS = ("id", "template", "flags", "x", "y", "z", "vx", "vy", "vz", "move_x", 
 assert len(FIELDS) == CELL == BUTTONS + 1
 assert SIDE & (SIDE - 1) == 0
 
+KEYFRAME = -1
+"""The `since` of a part that holds everything."""
 ACTED = 4
 """Flag on the wire: the server's rules placed or threw this entity."""
 PART_MAX = 200 * 1024

@@ -8,14 +8,14 @@ import pytest
 
 from server.game import Game
 from server.limits import Limits
-from server.replication import HISTORY, KEYFRAME, ChangeLog
+from server.replication import HISTORY, ChangeLog
 from server.session import Session
 from shared.blocks import Kinds, unpack
 from shared.checks import Cell
 from shared.layout import FALLING, FLAGS, ID
 from shared.messages import Hello, Resync, Snapshot, Terrain, Welcome, decode_from_server, encode
 from shared.scene import Scene
-from shared.snapshot import ACTED, decode_parts
+from shared.snapshot import ACTED, KEYFRAME, decode_parts
 from shared.units import BLOCK, SEGMENT
 from shared.world import OverlapError, World
 from tests.worlds import scene

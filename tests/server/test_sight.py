@@ -2,9 +2,10 @@
 
 import pytest
 
-from server.replication import HISTORY, KEYFRAME
+from server.replication import HISTORY
 from server.sight import Sight
 from shared.checks import Cell
+from shared.snapshot import KEYFRAME
 
 OWN, NEAR, FAR = (0, 0, 0), (1, 0, 0), (2, 0, 0)
 ROW = [OWN, NEAR, FAR]
