@@ -12,7 +12,7 @@ A move is swept: along one axis, the leading face passes the layers of cells and
 that it newly reaches, and stops *on* the first one. The numbers are whole grid steps, so "on" is equality; a
 box that overlapped nothing overlaps nothing afterwards, at any speed, with no epsilon and no second pass. What
 was overlapped at the start is no obstacle: it can be left. Rejected: the rewind along the whole velocity
-(loses 93 % of the motion along a wall) and merged slabs (6 times slower than the dense look-up, and their
+(loses 93 % of the motion along a wall) and merged slabs (4 times slower than the dense look-up, and their
 seams catch a sliding box).
 
 This source runs compiled by Numba and, unchanged, without it (`shared.kernels`): whole numbers, loops and
@@ -533,7 +533,7 @@ def mark(w: Arrays, row: int, tick: int) -> None:
 
 @jit
 def step(w: Arrays, inputs: Any, n_inputs: int, tick: int) -> None:
-    """One tick. `inputs`: [n, 4] row, move_x, move_y, buttons; an entity without one keeps its latest."""
+    """One tick. `inputs`: [n * 4] row, move_x, move_y, buttons; an entity without one keeps its latest."""
     e, n = w.entities, w.lengths
     if n[N_STEPPED] != 0:
         n[N_CHANGED] = 0
