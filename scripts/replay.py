@@ -9,13 +9,27 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
 
+import msgpack
 import numpy as np
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
-from server.journal import FILL, LOAD, PUT, REBASE, REMOVE, UNLOAD, WRITE, Call, DivergedError, JournalError, Recording
+from server.journal import (
+    FILL,
+    LOAD,
+    NOTE,
+    PUT,
+    REBASE,
+    REMOVE,
+    UNLOAD,
+    WRITE,
+    Call,
+    DivergedError,
+    JournalError,
+    Recording,
+)
 from shared.inputs import JUMP, Input
 from shared.layout import BUTTONS, FALLING, FLAGS, ID, MOVE_X, MOVE_Y, TEMPLATE, VX, Int64s, X
 from shared.units import BLOCK, BLOCK_SHIFT, SPEED
@@ -209,6 +223,8 @@ def described(call: Call) -> str:
             return f"segment {x} {y} {z} {SEGMENT_CALLS[op]}"
         case [int(op), tick] if op == REBASE:
             return f"declared to be tick {tick}"
+        case [int(op), bytes(value)] if op == NOTE:
+            return f"noted: {msgpack.unpackb(value, strict_map_key=False)}"
     return str(call)
 
 

@@ -22,7 +22,6 @@ from server.ticker import Ticker, best_alarm
 from server.warmup import warm_up
 from shared.checks import SceneError
 from shared.scene import Scene, load_scene
-from shared.world import World
 
 RESTART_WAIT_S = 2.0
 """After so long clients are asked to come back when the server goes down."""
@@ -140,7 +139,7 @@ class Server:
 
 
 @contextlib.contextmanager
-def recorded(scene: Scene, path: str) -> Iterator[World]:
+def recorded(scene: Scene, path: str) -> Iterator[RecordedWorld]:
     """A world whose changes go into a new file, which is ended properly in the end.
 
     Raises:

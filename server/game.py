@@ -16,6 +16,7 @@ from typing import Any
 from server.counters import Counters
 from server.delivery import Delivery
 from server.limits import Limits
+from server.recorder import RecordedWorld
 from server.replication import ChangeLog
 from server.rewind import Past, Rewind
 from server.session import Link, Session
@@ -37,7 +38,7 @@ from shared.messages import (
     encode,
 )
 from shared.scene import Scene
-from shared.world import OverlapError, World
+from shared.world import OverlapError
 
 RESYNC_S = 1.0
 """A client may ask for everything anew so often."""
@@ -61,12 +62,12 @@ class Game:
         *,
         limits: Limits | None = None,
         compiled: bool | None = None,
-        world: World | None = None,
+        world: RecordedWorld | None = None,
     ) -> None:
         self.scene = scene
         self.limits = limits or Limits()
         if world is None:
-            world = World(scene, compiled=compiled)
+            world = RecordedWorld(scene, compiled=compiled)
             world.load_terrain()
         self.world = world
         self.log = ChangeLog(self.world)

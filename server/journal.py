@@ -13,12 +13,13 @@ end       [nil, calls, nil, hash]                           the last record, if 
 
 call      [PUT, 12 numbers per state ...]   [REMOVE, id]   [FILL, x0, y0, z0, x1, y1, z1, kind, push]
           [LOAD, x, y, z, packed kinds or nil for as generated]   [UNLOAD, x, y, z]
-          [WRITE, x, y, z, blocks, kinds]   [REBASE, tick]
+          [WRITE, x, y, z, blocks, kinds]   [REBASE, tick]   [NOTE, packed value] (since format 2)
 
 All numbers are little-endian. Each tick's record is handed to the system at once: a process that is killed loses
 nothing, and what a crash of the machine leaves of the last record is ignored. Spawns, teleports and throws are
 recorded as what they come to: whole states. A call that fails half-way and takes itself back is recorded too,
-since it may have woken someone. The writing side is `server.recorder`.
+since it may have woken someone. A note is what the game wants told again: it changes nothing in the world. The
+writing side is `server.recorder`.
 """
 
 import struct
@@ -40,12 +41,12 @@ from shared.scene import Scene
 from shared.world import STATES, World
 
 MAGIC = b"\x89SNJ\r\n\x1a\n"
-VERSION = 1
+VERSION = 2
 HASH_TICKS = 32
 """A full hash so often, in ticks."""
 FRAME = struct.Struct("<III")
 
-PUT, REMOVE, FILL, LOAD, UNLOAD, WRITE, REBASE = range(7)
+PUT, REMOVE, FILL, LOAD, UNLOAD, WRITE, REBASE, NOTE = range(8)
 Call = list[Any]
 
 
@@ -105,8 +106,8 @@ class Recording:
         if len(head) < len(MAGIC) + 2:
             raise JournalError("a recording that broke off before its start was written")
         (version,) = struct.unpack("<H", head[len(MAGIC) :])
-        if version != VERSION:
-            raise JournalError(f"a recording in format {version}: this program reads format {VERSION}")
+        if not 1 <= version <= VERSION:
+            raise JournalError(f"a recording in format {version}: this program reads formats up to {VERSION}")
         start = self._read()
         if start is None:
             raise JournalError("a recording that broke off before its start was written")
@@ -126,7 +127,7 @@ class Recording:
         """
         while (record := self._read()) is not None:
             try:
-                moment = self._replay(record)
+                moment = redo(self.world, record)
             except (LookupError, TypeError, ValueError) as error:
                 if isinstance(error, JournalError):
                     raise
@@ -136,20 +137,6 @@ class Recording:
                 if self._file.read(1):
                     raise self._damaged("there is more after the end")
                 return
-
-    def _replay(self, record: list[Any]) -> Moment:
-        inputs, calls, marked, *hashes = record
-        for call in calls:
-            apply(self.world, call)
-        news: dict[int, Input] = {}
-        if inputs is not None:
-            news = {inputs[i]: Input(*inputs[i + 1 : i + 4]) for i in range(0, len(inputs), 4)}
-            self.world.step(news)
-            if marked is not None and mark(self.world) != marked:
-                raise DivergedError(self.world.tick, "the entities that changed are not the recorded ones")
-        if hashes and self.world.state_hash() != hashes[0]:
-            raise DivergedError(self.world.tick, "the world is not the recorded one")
-        return Moment(self.world, news, calls, bool(hashes), inputs is None)
 
     def _start(self, record: list[Any], compiled: bool | None) -> World:
         table, tick, next_id, states, segments = record
@@ -197,6 +184,27 @@ def replay(path: str | Path, *, compiled: bool | None = None) -> Iterator[Moment
         yield from Recording(file, compiled=compiled)
 
 
+def redo(world: World, record: list[Any]) -> Moment:
+    """Does to a world what a record says, and compares.
+
+    Raises:
+        DivergedError: the tick came out otherwise.
+        LookupError, TypeError, ValueError: this is not what a record says.
+    """
+    inputs, calls, marked, *hashes = record
+    for call in calls:
+        apply(world, call)
+    news: dict[int, Input] = {}
+    if inputs is not None:
+        news = {inputs[i]: Input(*inputs[i + 1 : i + 4]) for i in range(0, len(inputs), 4)}
+        world.step(news)
+        if marked is not None and mark(world) != marked:
+            raise DivergedError(world.tick, "the entities that changed are not the recorded ones")
+    if hashes and world.state_hash() != hashes[0]:
+        raise DivergedError(world.tick, "the world is not the recorded one")
+    return Moment(world, news, calls, bool(hashes), inputs is None)
+
+
 def apply(world: World, call: Call) -> None:
     """Does what a call did."""
     match call:
@@ -217,5 +225,7 @@ def apply(world: World, call: Call) -> None:
             world.write_blocks((x, y, z), offsets, kinds)
         case [int(op), tick] if op == REBASE:
             world.rebase(tick)
+        case [int(op), bytes()] if op == NOTE:
+            pass
         case _:
             raise ValueError(f"no such call: {call!r}"[:80])

@@ -1,4 +1,4 @@
-"""A world whose changes go into a recording as they happen; its format is drawn in `server.journal`."""
+"""A world that tells what happens to it: to recordings (`server.journal` draws their format) and to a store."""
 
 import struct
 import zlib
@@ -13,6 +13,7 @@ from server.journal import (
     HASH_TICKS,
     LOAD,
     MAGIC,
+    NOTE,
     PUT,
     REBASE,
     REMOVE,
@@ -24,7 +25,7 @@ from server.journal import (
     mark,
 )
 from shared import terrain
-from shared.blocks import Kinds, digest_of, pack
+from shared.blocks import Kinds, digest_of, pack, segment_of
 from shared.checks import Cell, SceneError
 from shared.inputs import Input
 from shared.layout import ID, Int64s
@@ -41,11 +42,59 @@ class Sink(Protocol):
         """Hands what was written to the system."""
 
 
-class RecordedWorld(World):
-    """A world that can be recorded. While it is not, a call costs one comparison more."""
+class Pen:
+    """Takes down what happens to a world: the calls since the last tick, and the inputs that differ from those held.
 
-    _writer: "_Writer | None" = None
+    Args:
+        first: what was written ahead of the first tick may be among its changes without a call, so it has no mark.
+    """
+
+    def __init__(self, *, first: bool = True) -> None:
+        self.calls: list[Call] = []
+        self._held: dict[int, Input] = {}
+        self._first = first
+
+    def forget(self, entities: list[int]) -> None:
+        """The inputs of these entities are not known any more."""
+        for entity in entities:
+            self._held.pop(entity, None)
+
+    def touch(self, segment: Cell) -> None:
+        """The blocks of a segment may be about to change."""
+
+    def tick(self, world: World, inputs: Mapping[int, Input]) -> None:
+        """The world has been stepped with `inputs`."""
+        raise NotImplementedError
+
+    def taken(self, world: World, inputs: Mapping[int, Input]) -> list[Any]:
+        """The record of a tick: `[inputs, calls, mark]`, and the hash where one is due."""
+        calls, self.calls = self.calls, []
+        held = self._held
+        news: list[int] = []
+        for entity, wish in inputs.items():
+            if held.get(entity) != wish:
+                held[entity] = wish
+                news += map(int, (entity, *wish))
+        first, self._first = self._first, False
+        parts: list[Any] = [news, calls, None if first else mark(world)]
+        if first or world.tick % HASH_TICKS == 0:
+            parts.append(world.state_hash())
+        return parts
+
+
+class RecordedWorld(World):
+    """A world with pens on it. While there are none, a call costs one comparison more."""
+
+    _pens: tuple[Pen, ...] = ()
     _inside = 0
+
+    def attach(self, pen: Pen) -> None:
+        """Has a pen take down everything from now on."""
+        self._pens = (*self._pens, pen)
+
+    def detach(self, pen: Pen) -> None:
+        """Does nothing if the pen is not on it."""
+        self._pens = tuple(each for each in self._pens if each is not pen)
 
     def record(self, file: Sink, failed: Callable[[OSError], None] | None = None) -> None:
         """Records from now on, into a file opened for writing bytes.
@@ -57,143 +106,151 @@ class RecordedWorld(World):
         Raises:
             JournalError: it is being recorded already.
         """
-        if self._writer is not None:
+        if any(isinstance(pen, _FilePen) for pen in self._pens):
             raise JournalError("this world is being recorded already")
-        self._writer = _Writer(file, failed or _reraise)
-        self._write(self._writer.begin)
+        pen = _FilePen(file, self, failed or _reraise)
+        self.attach(pen)
+        pen.begin()
 
     def end_recording(self) -> None:
         """Writes the last hash; the file can be closed. Does nothing if there is no recording."""
-        if self._writer is not None:
-            self._write(self._writer.end)
-            self._writer = None
+        for pen in self._pens:
+            if isinstance(pen, _FilePen):
+                pen.end()
+                self.detach(pen)
+
+    def note(self, value: Any) -> None:
+        """Takes down something that is not in the world, in order among the calls ahead of the coming tick.
+
+        Args:
+            value: whatever MessagePack can hold; it is packed at once.
+
+        Raises:
+            TypeError, ValueError, OverflowError: it cannot hold that.
+        """
+        if self._pens:
+            self._call([NOTE, msgpack.packb(value)])
 
     # -- what changes a world --------------------------------------------------------------------------------
 
     def put(self, states: Iterable[tuple[int, ...]] | Int64s) -> None:
-        if self._writer is not None and not self._inside:
+        if self._pens and not self._inside:
             states = states if isinstance(states, np.ndarray) else list(states)
             rows = np.array(states, np.int64).reshape(-1, STATES)
-            self._writer.forget(rows[:, ID].tolist())
-            self._writer.calls.append([PUT, *rows.ravel().tolist()])
+            self._forget(rows[:, ID].tolist())
+            self._call([PUT, *rows.ravel().tolist()])
         super().put(states)
 
     def remove(self, entity: int) -> None:
         super().remove(entity)
-        if self._writer is not None:
-            self._writer.forget([entity])
-            self._writer.calls.append([REMOVE, int(entity)])
+        if self._pens:
+            self._forget([entity])
+            self._call([REMOVE, int(entity)])
 
     def fill(self, low: Cell, high: Cell, kind: int, *, push: bool = False) -> int:
-        if self._writer is None:
+        if not self._pens:
             return super().fill(low, high, kind, push=push)
+        (x0, y0, z0), (x1, y1, z1) = segment_of(*low), segment_of(*(part - 1 for part in high))
+        for segment in ((x, y, z) for z in range(z0, z1 + 1) for y in range(y0, y1 + 1) for x in range(x0, x1 + 1)):
+            self._touch(segment)
         call = [FILL, *map(int, low), *map(int, high), kind, push]
         self._inside += 1  # what it pushes is not a call of its own
         try:
             changed = super().fill(low, high, kind, push=push)
         except OverlapError:
-            self._writer.calls.append(call)
+            self._call(call)
             raise
         finally:
             self._inside -= 1
-        self._writer.calls.append(call)
+        self._call(call)
         return changed
 
     def load_segment(self, index: Cell, kinds: Kinds) -> None:
+        self._touch(index)
         super().load_segment(index, kinds)
-        if self._writer is not None:
-            self._writer.calls.append([LOAD, *index, _packed(self, index)])
+        if self._pens:
+            self._call([LOAD, *index, packed(self, index)])
 
     def unload_segment(self, index: Cell) -> None:
+        self._touch(index)
         super().unload_segment(index)
-        if self._writer is not None:
-            self._writer.calls.append([UNLOAD, *index])
+        if self._pens:
+            self._call([UNLOAD, *index])
 
     def write_blocks(self, segment: Cell, offsets: Iterable[int], kinds: Iterable[int]) -> None:
+        self._touch(segment)
         offsets, kinds = list(offsets), list(kinds)
         super().write_blocks(segment, offsets, kinds)
-        if self._writer is not None:
-            self._writer.calls.append([WRITE, *segment, offsets, kinds])
+        if self._pens:
+            self._call([WRITE, *segment, offsets, kinds])
 
     def rebase(self, tick: int) -> None:
         super().rebase(tick)
-        if self._writer is not None:
-            self._writer.calls.append([REBASE, tick])
+        if self._pens:
+            self._call([REBASE, tick])
 
     def restore(self, other: World) -> None:
-        if self._writer is not None:
+        if self._pens:
             raise JournalError("a world that is being recorded cannot become another: end the recording first")
         super().restore(other)
 
     def step(self, inputs: Mapping[int, Input] | None = None) -> None:
         super().step(inputs)
-        if self._writer is not None:
-            self._writer.inputs = inputs or {}
-            self._write(self._writer.tick)
+        for pen in self._pens:
+            pen.tick(self, inputs or {})
 
-    def _write(self, part: Callable[[World], None]) -> None:
-        writer = self._writer
-        assert writer is not None
-        try:
-            part(self)
-        except OSError as error:
-            self._writer = None
-            writer.failed(error)
+    # -- inside ----------------------------------------------------------------------------------------------
+
+    def _call(self, call: Call) -> None:
+        for pen in self._pens:
+            pen.calls.append(call)
+
+    def _forget(self, entities: list[int]) -> None:
+        for pen in self._pens:
+            pen.forget(entities)
+
+    def _touch(self, segment: Cell) -> None:
+        for pen in self._pens:
+            pen.touch(segment)
 
 
-class _Writer:
-    """The pen: calls since the last tick, inputs that are held, and the file."""
+class _FilePen(Pen):
+    """Writes a recording."""
 
-    def __init__(self, file: Sink, failed: Callable[[OSError], None]) -> None:
-        self.calls: list[Call] = []
-        self.inputs: Mapping[int, Input] = {}
-        self.failed = failed
-        self._file = file
-        self._held: dict[int, Input] = {}
+    def __init__(self, file: Sink, world: RecordedWorld, failed: Callable[[OSError], None]) -> None:
+        super().__init__()
+        self._file, self._world, self._failed = file, world, failed
         self._chain = 0
-        self._first = True  # what was written ahead of the start is among its changes, and nobody knows
 
-    def begin(self, world: World) -> None:
+    def begin(self) -> None:
         """Writes the world as it is now."""
-        segments = [[*index, _packed(world, index)] for index in sorted(world.blocks)]
+        world = self._world
+        segments = [[*index, packed(world, index)] for index in sorted(world.blocks)]
         states = world.states().astype("<i8").tobytes()
-        self._file.write(MAGIC + struct.pack("<H", VERSION))
-        self._record([world.scene.to_table(), world.tick, world.next_id, states, segments])
+        head = MAGIC + struct.pack("<H", VERSION)
+        self._record([world.scene.to_table(), world.tick, world.next_id, states, segments], head)
 
-    def forget(self, entities: list[int]) -> None:
-        """The inputs of these entities are not known any more."""
-        for entity in entities:
-            self._held.pop(entity, None)
+    def tick(self, world: World, inputs: Mapping[int, Input]) -> None:
+        self._record(self.taken(world, inputs))
 
-    def end(self, world: World) -> None:
+    def end(self) -> None:
         """Writes the end."""
-        self._record([None, self.calls, None, world.state_hash()])
+        self._record([None, self.calls, None, self._world.state_hash()])
 
-    def tick(self, world: World) -> None:
-        """Writes a tick that has been stepped with `inputs`."""
-        calls, self.calls = self.calls, []
-        held = self._held
-        news: list[int] = []
-        for entity, wish in self.inputs.items():
-            if held.get(entity) != wish:
-                held[entity] = wish
-                news += map(int, (entity, *wish))
-        first, self._first = self._first, False
-        parts: list[Any] = [news, calls, None if first else mark(world)]
-        if first or world.tick % HASH_TICKS == 0:
-            parts.append(world.state_hash())
-        self._record(parts)
-
-    def _record(self, parts: list[Any]) -> None:
+    def _record(self, parts: list[Any], head: bytes = b"") -> None:
         payload = msgpack.packb(parts)
         length = struct.pack("<I", len(payload))
         check = zlib.crc32(payload, self._chain)
-        self._file.write(length + struct.pack("<II", zlib.crc32(length, self._chain), check) + payload)
-        self._file.flush()
+        try:
+            self._file.write(head + length + struct.pack("<II", zlib.crc32(length, self._chain), check) + payload)
+            self._file.flush()
+        except OSError as error:
+            self._world.detach(self)
+            self._failed(error)
         self._chain = check
 
 
-def _packed(world: World, index: Cell) -> bytes | None:
+def packed(world: World, index: Cell) -> bytes | None:
     """A loaded segment for the file; None if it is as the generator left it."""
     try:
         generated = digest_of(terrain.generate(world.scene.terrain, index))

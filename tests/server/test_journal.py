@@ -2,15 +2,18 @@
 
 import io
 import struct
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
+import msgpack
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from server import app
-from server.journal import FILL, MAGIC, PUT, REMOVE, DivergedError, JournalError, Moment, Recording, replay
-from server.recorder import RecordedWorld
+from server.journal import FILL, MAGIC, NOTE, PUT, REMOVE, DivergedError, JournalError, Moment, Recording, redo, replay
+from server.recorder import Pen, RecordedWorld
 from server.settings import SettingsError
 from shared.inputs import Input
 from shared.world import OverlapError, World
@@ -116,6 +119,53 @@ def test_held_inputs_are_written_once_and_again_after_a_teleport() -> None:
     assert [[call[0] for call in moment.calls] for moment in moments] == [[], [], [PUT]]
 
 
+def test_notes_come_back_in_order_among_the_calls() -> None:
+    file = io.BytesIO()
+    world = recorded(file)
+    told = {"who": ["Ann", None, 1.5, b"\0"], 7: True}
+    world.note(told)
+    world.remove(2)
+    told["who"] = "changed too late"
+    world.note("left")
+    world.step()
+    world.step()
+    first, second = read(file.getvalue())[0]
+    assert first.calls == [[NOTE, msgpack.packb({"who": ["Ann", None, 1.5, b"\0"], 7: True})], [REMOVE, 2],
+                           [NOTE, msgpack.packb("left")]]  # fmt: skip
+    assert second.calls == []
+    with pytest.raises(TypeError):
+        world.note(object())
+    World.step(world)  # nothing was taken down that a replay would stumble over
+
+
+def test_two_pens_write_the_same_and_each_ends_on_its_own() -> None:
+    file = io.BytesIO()
+    world = recorded(file)
+    world.step({1: worlds.EAST})
+    copy = World(world.scene, compiled=False)
+    copy.restore(world)
+
+    class Second(Pen):
+        def __init__(self) -> None:
+            super().__init__(first=False)
+            self.records: list[list[Any]] = []
+
+        def tick(self, world: World, inputs: Mapping[int, Input]) -> None:
+            self.records.append(self.taken(world, inputs))
+
+    pen = Second()
+    world.attach(pen)
+    hashes = play(world)
+    world.detach(pen)
+    world.step()
+    for record, found in zip(pen.records, hashes, strict=True):
+        redo(copy, record)  # compares the marks from the first tick on
+        assert copy.state_hash() == found
+    assert [moment.world.state_hash() for moment in Recording(io.BytesIO(file.getvalue()), compiled=False)][
+        1:-1
+    ] == hashes
+
+
 def test_a_refused_edit_is_recorded_only_where_it_may_have_woken_someone() -> None:
     file = io.BytesIO()
     world = recorded(file)
@@ -205,8 +255,9 @@ def test_another_file_and_a_newer_one_are_named() -> None:
     data = file.getvalue()
     with pytest.raises(JournalError, match="not a recording"):
         read(b"SQLite format 3\0")
-    with pytest.raises(JournalError, match=r"format 2: this program reads format 1"):
-        read(MAGIC + struct.pack("<H", 2) + data[10:])
+    with pytest.raises(JournalError, match=r"format 3: this program reads formats up to 2"):
+        read(MAGIC + struct.pack("<H", 3) + data[10:])
+    read(MAGIC + struct.pack("<H", 1) + data[10:])
 
 
 FILE = io.BytesIO()
