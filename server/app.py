@@ -14,17 +14,23 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
+from server.door import Door
+from server.faults import Faults
 from server.game import Game
 from server.gateway import CLOSE_S, Gateway
+from server.histogram import Histogram
+from server.kinds import SettingsError
+from server.metrics import metrics_page
+from server.pages import Pages, json_page, ready_page
 from server.recorder import RecordedWorld
-from server.settings import Settings, SettingsError, parse
+from server.settings import Settings, parse
 from server.ticker import Ticker, best_alarm
 from server.warmup import warm_up
 from shared.checks import SceneError
 from shared.scene import Scene, load_scene
 
-RESTART_WAIT_S = 2.0
-"""After so long clients are asked to come back when the server goes down."""
+READY_S = 1.0
+"""Ready is who has begun a tick within so long."""
 STOP_S = CLOSE_S + 0.25
 """The end waits no longer than this for peers to finish closing."""
 
@@ -62,9 +68,9 @@ def run(settings: Settings) -> int:
     warm_up(scene)
     with asyncio.Runner(loop_factory=_loop_factory()) as runner:
         if settings.record is None:
-            return runner.run(Server(settings, Game(scene)).serve())
+            return runner.run(Server(settings, Game(scene, limits=settings.limits)).serve())
         with recorded(scene, settings.record) as world:
-            return runner.run(Server(settings, Game(scene, world=world)).serve())
+            return runner.run(Server(settings, Game(scene, limits=settings.limits, world=world)).serve())
 
 
 class Server:
@@ -73,8 +79,21 @@ class Server:
     def __init__(self, settings: Settings, game: Game) -> None:
         self.settings = settings
         self.game = game
-        self.gateway = Gateway(game, self.stats if settings.stats else None)
+        self.faults = Faults()
+        self.door = Door(
+            settings.limits,
+            Pages(
+                {"/readyz": ready_page(self.unready)},
+                {"/stats": json_page(self.stats), "/metrics": metrics_page(self.stats, self._durations)},
+                self.faults.report,
+            ),
+            figures=settings.figures,
+            origins=settings.allowed_origins,
+            closing=lambda: settings.restart_s if self.draining else None,
+        )
+        self.gateway = Gateway(game, self.door, self.faults)
         self.ticker: Ticker | None = None
+        self.draining = False
         self.started = time.monotonic()
         self._stop: asyncio.Future[tuple[str, int]] | None = None
 
@@ -94,13 +113,28 @@ class Server:
             print(f"listening on ws://{shown}:{port}", flush=True)
             reason, code = await self._stop
         logger.info("stopping: %s, %d connection(s)", reason, len(self.gateway.connections))
-        self.ticker.stop()
-        self.gateway.stop_listening()
-        self.game.shut_down("the server is going down", RESTART_WAIT_S)
-        with contextlib.suppress(TimeoutError):
-            await asyncio.wait_for(self.gateway.drained(), STOP_S)
+        await self._drain()
         logger.info("stopped after %.0f s", time.monotonic() - self.started)
         return code
+
+    async def _drain(self) -> None:
+        """Tells everyone to come back later, and waits until all have gone, but not for long."""
+        self.draining = True
+        if self.ticker is not None:
+            self.ticker.stop()
+        self.game.shut_down("the server is going down", self.settings.restart_s)
+        with contextlib.suppress(TimeoutError):
+            await asyncio.wait_for(self.gateway.drained(), STOP_S)
+        self.gateway.stop_listening()  # only now: until the end `/readyz` says what is going on
+
+    def unready(self) -> str:
+        """Why no player should be sent here; empty if there is no reason."""
+        if self.draining:
+            return "draining"
+        if self.ticker is None:
+            return "starting"
+        age = time.monotonic() - self.ticker.latest
+        return f"the last tick began {age:.1f} s ago" if age > READY_S else ""
 
     def stats(self) -> dict[str, Any]:
         """What `/stats` shows."""
@@ -109,12 +143,19 @@ class Server:
             **self.game.stats(),
             **figures,
             "connections": len(self.gateway.connections),
-            "internal_errors": self.gateway.internal_errors + figures.get("ticks_failed", 0),
+            "refused_at_door": dict(self.door.refused),
+            "internal_errors": self.faults.total + figures.get("ticks_failed", 0),
+            "ready": not self.unready(),
             "uptime_s": round(time.monotonic() - self.started, 3),
             "cpu_s": round(time.process_time(), 3),
             "rss_mb": round(rss_mb(), 1),
             "pid": os.getpid(),
         }
+
+    def _durations(self) -> dict[str, Histogram]:
+        if self.ticker is None:
+            return {}
+        return {"tick_lateness_seconds": self.ticker.lateness, "tick_work_seconds": self.ticker.work}
 
     async def _listen(self) -> tuple[str, int]:
         host, port = self.settings.host, self.settings.port
@@ -134,7 +175,7 @@ class Server:
     def _loop_failed(self, loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
         """An exception that reached the event loop, or trouble of its own, such as no file descriptor left."""
         error = context.get("exception")
-        self.gateway.internal_errors += 1
+        self.faults.total += 1
         logger.error("%s", context["message"], exc_info=None if isinstance(error, OSError) else error)
 
 

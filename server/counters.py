@@ -1,6 +1,6 @@
 """What a server counts."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from server.session import InputQueue
 
@@ -24,6 +24,8 @@ class Counters:
     terrain_bytes: int = 0
     fell_out: int = 0
     resyncs: int = 0
+    closed: dict[int, int] = field(default_factory=dict)
+    """Clients told to go, by close code."""
 
     def add(self, queue: InputQueue) -> None:
         """Counts in how one player's inputs have fared."""

@@ -101,6 +101,9 @@ class Game:
         if session.allowance < -32 * self.limits.messages_per_tick:
             self._kick(session, messages.MALFORMED, "too many messages")
             return
+        if len(data) > self.limits.message_bytes_max:
+            self._kick(session, messages.TOO_BIG, f"a message longer than {self.limits.message_bytes_max} bytes")
+            return
         try:
             message = decode_from_client(data)
         except ProtocolError as error:
@@ -276,6 +279,9 @@ class Game:
             reason = f"another scene: {', '.join(name[:40] for name in differ)} differ(s)"
             self._refuse(session, messages.WRONG_SCENE, reason)
             return
+        if len(hello.name) > self.limits.name_max:
+            self._refuse(session, messages.MALFORMED, f"a name longer than {self.limits.name_max} characters")
+            return
         session.name = hello.name
         session.pacing.answered(now - session.opened, 0, now)  # of a path that was empty
         session.joining = True
@@ -290,6 +296,7 @@ class Game:
 
     def _end(self, session: Session, code: int, reason: str) -> None:
         reason = reason[: messages.REASON_MAX]
+        self.counters.closed[code] = self.counters.closed.get(code, 0) + 1
         session.send(encode(Bye(code, reason, -1.0)))
         session.close(code, reason)
 

@@ -11,21 +11,25 @@ once, as soon as the peer has closed, broken the protocol or gone. A stage that 
 """
 
 import asyncio
-import json
 import logging
 import socket
+import ssl
 import sys
 import time
-from collections.abc import Callable, Mapping
 from http import HTTPStatus
 from typing import Any, Protocol, cast
 
+from websockets.datastructures import Headers
 from websockets.exceptions import InvalidMessage
 from websockets.frames import CloseCode, Frame, Opcode
-from websockets.http11 import Request, Response
+from websockets.http11 import Request as HttpRequest
+from websockets.http11 import Response
 from websockets.protocol import CONNECTING, OPEN
 from websockets.server import ServerProtocol
 
+from server.door import Door, Request
+from server.faults import Faults
+from server.pages import Page
 from shared.messages import CLIENT_MESSAGE_MAX
 
 try:
@@ -36,8 +40,6 @@ if sys.platform == "linux":
     import fcntl
     from termios import TIOCOUTQ as SIOCOUTQ
 
-HANDSHAKE_S = 5.0
-"""A connection that has not sent its whole request by then is aborted."""
 CLOSE_S = 2.0
 """A peer that does not finish closing by then is aborted."""
 BACKLOG_BYTES_MAX = 1 << 20
@@ -64,6 +66,12 @@ def _frame_head(size: int) -> bytes:
     return b"\x82\x7f" + size.to_bytes(8, "big")
 
 
+def _response(page: Page) -> Response:
+    status = HTTPStatus(page.status)
+    fixed = (("Connection", "close"), ("Content-Length", str(len(page.body))), ("Content-Type", page.content_type))
+    return Response(status.value, status.phrase, Headers(fixed + page.headers), page.body)
+
+
 class Events(Protocol):
     """What the gateway tells the game."""
 
@@ -82,26 +90,34 @@ class Gateway:
 
     Args:
         game: told of every event.
-        stats: what `/stats` answers, as JSON; None: there is no such page.
+        door: decides who comes in, and has the pages.
+        faults: told of exceptions that the game raised.
     """
 
-    def __init__(self, game: Events, stats: Callable[[], Mapping[str, Any]] | None = None) -> None:
+    def __init__(self, game: Events, door: Door | None = None, faults: Faults | None = None) -> None:
         self.game = game
+        self.door = door or Door()
+        self.faults = faults or Faults()
         self.connections: set[Connection] = set()
-        self.internal_errors = 0
-        self._stats = stats
         self._server: asyncio.Server | None = None
-        self._empty: asyncio.Event = asyncio.Event()
+        self._fewer: asyncio.Event = asyncio.Event()
         self._closing = False
 
-    async def listen(self, host: str, port: int) -> tuple[str, int]:
-        """Starts to accept; returns the address (port 0 picks one).
+    async def listen(self, host: str, port: int, tls: ssl.SSLContext | None = None) -> tuple[str, int]:
+        """Starts to accept, in TLS if there is a context for it; returns the address (port 0 picks one).
 
         Raises:
             OSError: the address cannot be used.
         """
         loop = asyncio.get_running_loop()
-        self._server = await loop.create_server(lambda: Connection(self, loop), host, port, backlog=ACCEPT_BACKLOG)
+        self._server = await loop.create_server(
+            lambda: Connection(self, loop),
+            host,
+            port,
+            backlog=ACCEPT_BACKLOG,
+            ssl=tls,
+            ssl_handshake_timeout=self.door.limits.handshake_s if tls else None,
+        )
         sockets = self._server.sockets
         address = sockets[0].getsockname()
         # A name with several addresses has a port of its own on each if the system picked them.
@@ -117,10 +133,10 @@ class Gateway:
                 connection.abort()
 
     async def drained(self) -> None:
-        """Returns when no connection is left."""
-        while self.connections:
-            self._empty.clear()
-            await self._empty.wait()
+        """Returns when no WebSocket is left."""
+        while any(connection.opened for connection in self.connections):
+            self._fewer.clear()
+            await self._fewer.wait()
 
     def made(self, connection: "Connection") -> None:
         self.connections.add(connection)
@@ -129,36 +145,7 @@ class Gateway:
 
     def gone(self, connection: "Connection") -> None:
         self.connections.discard(connection)
-        if not self.connections:
-            self._empty.set()
-
-    def failed(self, what: str) -> None:
-        """Called where an exception of our own is handled: it is logged and counted."""
-        self.internal_errors += 1
-        logger.exception("internal error in %s", what)
-
-    def page(self, request: Request, protocol: ServerProtocol) -> Response:
-        """The answer to a request that does not ask for a WebSocket."""
-        path = request.path.partition("?")[0]
-        if request.method != "GET":
-            return protocol.reject(HTTPStatus.METHOD_NOT_ALLOWED, "GET is all there is\n")
-        if path == "/healthz":
-            return protocol.reject(HTTPStatus.OK, "ok")
-        if path == "/stats" and self._stats is not None:
-            try:
-                text = json.dumps(self._stats())
-            except Exception:
-                self.failed("stats")
-                return protocol.reject(HTTPStatus.INTERNAL_SERVER_ERROR, "internal error\n")
-            response = protocol.reject(HTTPStatus.OK, text + "\n")
-            del response.headers["Content-Type"]
-            response.headers["Content-Type"] = "application/json"
-            return response
-        if path != "/":
-            return protocol.reject(HTTPStatus.NOT_FOUND, f"{path}: no such page\n")
-        response = protocol.reject(HTTPStatus.UPGRADE_REQUIRED, "this is a game server: connect by WebSocket\n")
-        response.headers["Upgrade"] = "websocket"
-        return response
+        self._fewer.set()
 
 
 class Connection(asyncio.Protocol):
@@ -170,6 +157,7 @@ class Connection(asyncio.Protocol):
         self._loop = loop
         self._protocol = ServerProtocol(max_size=CLIENT_MESSAGE_MAX, logger=_quiet)
         self._transport: asyncio.Transport | None = None
+        self._address: str | None = None  # None: it has not been let in
         self._fd = -1
         self._unacknowledged = bytearray(4)  # a C int that the kernel fills in
         self._timer: asyncio.TimerHandle | None = None
@@ -210,7 +198,13 @@ class Connection(asyncio.Protocol):
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         self._transport = cast("asyncio.Transport", transport)
         self._gateway.made(self)
-        self._abort_in(HANDSHAKE_S)
+        peer = transport.get_extra_info("peername")
+        address = str(peer[0]) if peer else ""
+        if not self._gateway.door.arrive(address):
+            self.abort()
+            return
+        self._address = address
+        self._abort_in(self._gateway.door.limits.handshake_s)
         sock = transport.get_extra_info("socket")
         self._fd = sock.fileno()
         try:
@@ -241,6 +235,8 @@ class Connection(asyncio.Protocol):
         if self._timer is not None:
             self._timer.cancel()
         self._transport = None
+        if self._address is not None:
+            self._gateway.door.leave(self._address)
         self._gateway.gone(self)
         self._lose()
 
@@ -262,7 +258,7 @@ class Connection(asyncio.Protocol):
             start = end
             events = protocol.events_received()
             if events:
-                self._answer(cast("Request", events[0]))
+                self._answer(cast("HttpRequest", events[0]))
                 break
             if isinstance(protocol.handshake_exc, InvalidMessage):  # of itself websockets only hangs up
                 response = protocol.reject(HTTPStatus.BAD_REQUEST, "this is not an HTTP request\n")
@@ -275,10 +271,15 @@ class Connection(asyncio.Protocol):
         self._open()
         return data[start:]
 
-    def _answer(self, request: Request) -> None:
-        protocol = self._protocol
-        wanted = any("websocket" in value.lower() for value in request.headers.get_all("Upgrade"))
-        protocol.send_response(protocol.accept(request) if wanted else self._gateway.page(request, protocol))
+    def _answer(self, request: HttpRequest) -> None:
+        protocol, headers = self._protocol, request.headers
+        upgrade = any("websocket" in value.lower() for value in headers.get_all("Upgrade"))
+        origins, hosts = headers.get_all("Origin"), headers.get_all("Host")
+        asked = Request(
+            request.method, request.path, hosts[0] if hosts else "", " ".join(origins) if origins else None, upgrade
+        )
+        page = self._gateway.door.answer(asked, self._address or "", time.monotonic())
+        protocol.send_response(protocol.accept(request) if page is None else _response(page))
 
     def _open(self) -> None:
         if self._timer is not None:
@@ -287,7 +288,7 @@ class Connection(asyncio.Protocol):
         try:
             self._session = self._gateway.game.open(self, time.monotonic())
         except Exception:
-            self._gateway.failed("open")
+            self._gateway.faults.report("open")
             self.close(CloseCode.INTERNAL_ERROR, "internal error")
 
     def _cut(self, data: bytes) -> None:
@@ -351,7 +352,7 @@ class Connection(asyncio.Protocol):
         try:
             self._gateway.game.receive(self._session, message, time.monotonic())
         except Exception:
-            self._gateway.failed("receive")
+            self._gateway.faults.report("receive")
             self.close(CloseCode.INTERNAL_ERROR, "internal error")
 
     def _flush(self) -> None:
@@ -380,7 +381,7 @@ class Connection(asyncio.Protocol):
         try:
             self._gateway.game.lost(session, time.monotonic())
         except Exception:
-            self._gateway.failed("lost")
+            self._gateway.faults.report("lost")
 
     def _last_limit(self) -> None:
         """The end has begun: from now on the peer has `CLOSE_S`, whatever else it does."""

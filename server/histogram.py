@@ -29,11 +29,13 @@ class Histogram:
     """Counts durations given in seconds, and answers in milliseconds, at most 6 % too high."""
 
     count: int = 0
+    sum_s: float = 0.0
     max_s: float = 0.0
     buckets: list[int] = field(default_factory=lambda: [0] * BUCKETS)
 
     def record(self, seconds: float) -> None:
         self.count += 1
+        self.sum_s += seconds
         self.buckets[_bucket(int(seconds * 1e6))] += 1
         if seconds > self.max_s:
             self.max_s = seconds
@@ -56,9 +58,19 @@ class Histogram:
         """For every bucket with something in it, ascending: the lowest duration above it in us, and how many."""
         return [[_upper_us(bucket), n] for bucket, n in enumerate(self.buckets) if n]
 
+    def below(self, bounds_s: Sequence[float]) -> list[int]:
+        """For each bound (ascending), how many durations are certainly below it: no bucket is divided."""
+        found, n, bucket = [], 0, 0
+        for bound_s in bounds_s:
+            while bucket < BUCKETS and _upper_us(bucket) <= bound_s * 1e6:
+                n += self.buckets[bucket]
+                bucket += 1
+            found.append(n)
+        return found
+
     def reset(self) -> None:
         """Forgets everything recorded."""
-        self.count, self.max_s = 0, 0.0
+        self.count, self.sum_s, self.max_s = 0, 0.0, 0.0
         self.buckets = [0] * BUCKETS
 
 

@@ -2,32 +2,54 @@
 
 from dataclasses import dataclass
 
+from server.kinds import Kind, setting
+from shared.messages import CLIENT_MESSAGE_MAX, NAME_MAX
+
+HOUR_S = 3600.0
+
 
 @dataclass(frozen=True)
 class Limits:
-    """Bounds per server and per client."""
+    """Bounds per server and per client. Those with a `Kind` are settings (section `limits` of the file)."""
 
-    clients_max: int = 2000
+    connections_max: int = setting(
+        4096, Kind(int, "connections at a time, players or not; pages answer beyond it", "N", 1, 1_000_000)
+    )
+    connections_per_address: int = setting(
+        64, Kind(int, "connections at a time from one address (IPv6: one /64 network)", "N", 1, 1_000_000)
+    )
+    joins_per_s: float = setting(
+        200.0, Kind(float, "WebSockets opened per second, with a burst of two seconds' worth", "N", 0.1, 100_000)
+    )
+    loopback_exempt: bool = setting(
+        True, Kind(bool, "connections from this machine are not limited per address and per second")
+    )
+    clients_max: int = setting(2000, Kind(int, "players at a time", "N", 1, 1_000_000))
+    handshake_s: float = setting(5.0, Kind(float, "a connection must have sent its request by then", "S", 0.1, HOUR_S))
+    hello_s: float = setting(5.0, Kind(float, "a WebSocket must have joined by then", "S", 0.1, HOUR_S))
+    silence_s: float = setting(15.0, Kind(float, "a player heard nothing of for so long is closed", "S", 0.1, HOUR_S))
+    stalled_s: float = setting(
+        10.0, Kind(float, "a player that took no snapshot for so long is closed", "S", 0.1, HOUR_S)
+    )
+    message_bytes_max: int = setting(
+        CLIENT_MESSAGE_MAX, Kind(int, "longest message of a client, in bytes", "BYTES", 512, CLIENT_MESSAGE_MAX)
+    )
+    messages_per_tick: float = setting(
+        8.0, Kind(float, "messages of a client per tick, with a burst of 32 ticks' worth", "N", 1, 1000)
+    )
+    edits_per_s: float = setting(
+        10.0, Kind(float, "edits of a player per second, with a burst of two seconds' worth", "N", 0.5, 10_000)
+    )
+    commands_waiting_max: int = setting(64, Kind(int, "commands of a player that wait for their tick", "N", 1, 10_000))
+    name_max: int = setting(NAME_MAX, Kind(int, "longest name of a player, in characters", "N", 1, NAME_MAX))
     joins_per_tick: int = 8
     """More wait for the next tick: a spawn costs up to a millisecond."""
-    hello_s: float = 5.0
-    """A connection that has not introduced itself by then is closed."""
-    silence_s: float = 15.0
-    """A client that has sent nothing for so long is closed."""
-    stalled_s: float = 10.0
-    """A client that could not be sent a snapshot for so long is closed."""
-    messages_per_tick: float = 8.0
-    """A client's messages beyond this rate (with a burst of 32 ticks' worth) close it."""
     first_bytes: int = 4 * 1024
     """So much may be on its way to a client of which nothing is known yet."""
     terrain_chunk_bytes: int = 1024
     """Terrain goes behind snapshots in pieces of this size,"""
     terrain_bytes_per_tick: int = 12 * 1024
     """at most so many bytes a tick."""
-    commands_waiting_max: int = 64
-    """A client's commands that wait for their tick; more are answered with `TOO_MANY`."""
-    edits_per_s: float = 10.0
-    """A client's edits beyond this rate (with a burst of two seconds' worth) are answered with `TOO_MANY`."""
     see_radius: int = 1
     """A client sees the segments at most so many segments away from its own,"""
     keep_radius: int = 2

@@ -11,6 +11,7 @@ than about `CATCH_UP_MAX` ticks of work behind, and says so in `skipped_s`.
 import asyncio
 import ctypes
 import logging
+import math
 import os
 import sys
 import time
@@ -172,6 +173,8 @@ class Ticker:
         self.ticks = 0
         self.ticks_late = 0
         self.failures = 0
+        self.latest = -math.inf
+        """When the latest tick began."""
         self._tick = tick
         self._broken = broken
         self._clock = clock
@@ -215,6 +218,7 @@ class Ticker:
             self._alarm.set(self._schedule.deadline)
 
     def _run(self, deadline: float, now: float) -> None:
+        self.latest = now
         self.lateness.record(now - deadline)
         if (now - deadline) * self._schedule.rate > 1:
             self.ticks_late += 1

@@ -46,7 +46,8 @@ def last_words(link: ClientConnection) -> Message:
 def test_serves_and_tells_its_clients_when_it_ends() -> None:
     with running("--port", "0", "--scene", "flat", "--tick-rate", "64") as server:
         address = server.address()
-        assert page(address, "/healthz") == "ok"
+        assert page(address, "/healthz") == "ok\n"
+        assert page(address, "/readyz") == "ready\n"
         with joined(address) as (link, welcome):
             link.send(encode(Inputs(welcome.tick + 3, welcome.tick, bytes((127, 0, 0)) * 3)))
             until(lambda: stats(address)["tick"] > welcome.tick + 20)
@@ -55,6 +56,7 @@ def test_serves_and_tells_its_clients_when_it_ends() -> None:
             assert figures["ticks"] >= 20
             assert figures["rss_mb"] > 10
             assert figures["cpu_s"] > 0
+            assert "sovereign_clients 1.0\n" in page(address, "/metrics")
             assert set(figures["tick_lateness_ms"]) == set(figures["tick_work_ms"]) == {"p50", "p99", "max"}
             asked = time.monotonic()
             server.process.send_signal(signal.SIGTERM)

@@ -17,7 +17,10 @@ from hypothesis import strategies as st
 from websockets.frames import Frame, Opcode
 
 from server import gateway as module
+from server.door import SPARE_PER_ADDRESS, Door
 from server.gateway import Connection, Gateway
+from server.limits import Limits
+from server.pages import Pages, json_page
 from shared.messages import CLIENT_MESSAGE_MAX
 
 UPGRADE = (
@@ -26,6 +29,7 @@ UPGRADE = (
     b"Sec-WebSocket-Extensions: permessage-deflate\r\n\r\n"
 )
 TIME_OUT_S = 5.0
+HANDSHAKE_S = 3.0
 
 
 class Notes:
@@ -112,13 +116,14 @@ class Peer:
 class Bench:
     def __init__(self) -> None:
         self.notes = Notes()
-        self.gateway = Gateway(self.notes, self.stats)
-        self.address = ("", 0)
         self.figures: Callable[[], Mapping[str, Any]] = lambda: {"tick": 7}
+        pages = Pages(private={"/stats": json_page(lambda: self.figures())}, failed=lambda path: self.failed(path))
+        self.gateway = Gateway(self.notes, Door(Limits(handshake_s=HANDSHAKE_S), pages))
+        self.address = ("", 0)
         self.peers: list[Peer] = []
 
-    def stats(self) -> Mapping[str, Any]:
-        return self.figures()
+    def failed(self, path: str) -> None:
+        self.gateway.faults.report(path)
 
     async def connect(self, *first: bytes, **options: Any) -> Peer:
         peer = Peer(*await asyncio.open_connection(*self.address, **options))
@@ -253,7 +258,7 @@ async def test_a_broken_protocol_is_answered_with_its_code(
     peer.writer.close()
     await bench.all_gone()
     assert bench.notes.messages == [b"before"]
-    assert bench.gateway.internal_errors == 0
+    assert bench.gateway.faults.total == 0
     assert [record for record in caplog.records if record.levelno >= logging.WARNING] == []
 
 
@@ -305,7 +310,7 @@ async def test_an_error_of_the_game_closes_that_connection_and_is_counted(
     assert await bad.frame() == (0x88, struct.pack("!H", 1011) + b"internal error")
     good.write(binary(b"echo"))
     assert await good.frame() == (0x82, b"echo")
-    assert bench.gateway.internal_errors == 1
+    assert bench.gateway.faults.total == 1
     assert [record.exc_info is not None for record in caplog.records if record.levelno == logging.ERROR] == [True]
 
 
@@ -356,7 +361,7 @@ async def test_random_bytes_in_every_stage_and_the_server_goes_on(
     good = await bench.client()
     good.write(binary(b"echo"))
     assert await good.frame() == (0x82, b"echo")
-    assert bench.gateway.internal_errors == 0
+    assert bench.gateway.faults.total == 0
     assert [record for record in caplog.records if record.levelno >= logging.WARNING] == []
 
 
@@ -378,8 +383,8 @@ async def test_the_peer_goes_in_the_middle(bench: Bench, sent: bytes, way: str) 
     assert bench.notes.received == []
 
 
-async def test_a_handshake_must_be_finished_in_time(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, "HANDSHAKE_S", 0.05)
+async def test_a_handshake_must_be_finished_in_time(bench: Bench) -> None:
+    bench.gateway.door.limits = Limits(handshake_s=0.05)
     slow, good = await bench.connect(UPGRADE[:-2]), await bench.client()
     assert await slow.end() == b""
     good.write(binary(b"echo"))
@@ -519,7 +524,7 @@ async def get(bench: Bench, target: str, method: str = "GET") -> tuple[int, str,
 
 
 async def test_pages(bench: Bench) -> None:
-    assert await get(bench, "/healthz") == (200, "text/plain; charset=utf-8", "ok")
+    assert await get(bench, "/healthz") == (200, "text/plain; charset=utf-8", "ok\n")
     status, kind, body = await get(bench, "/stats?x=1")
     assert (status, kind, json.loads(body)) == (200, "application/json", {"tick": 7})
     for target, method, expected in (("/", "GET", 426), ("/x", "GET", 404), ("/healthz", "DELETE", 405)):
@@ -531,18 +536,41 @@ async def test_pages(bench: Bench) -> None:
 async def test_stats_that_fail_are_our_mistake(bench: Bench) -> None:
     bench.figures = lambda: {"x": object()}
     assert (await get(bench, "/stats"))[0] == 500
-    assert bench.gateway.internal_errors == 1
+    assert bench.gateway.faults.total == 1
 
 
-async def test_no_stats_no_page() -> None:
-    bench = Bench()
-    bench.gateway = Gateway(bench.notes)
-    bench.address = await bench.gateway.listen("127.0.0.1", 0)
-    assert (await get(bench, "/stats"))[0] == 404
-    bench.gateway.stop_listening()
-    for peer in bench.peers:
-        peer.writer.close()
-    await bench.all_gone()
+async def test_beyond_the_limits_a_websocket_is_refused_a_page_is_shown_and_a_flood_is_dropped(bench: Bench) -> None:
+    limits = Limits(connections_per_address=2, loopback_exempt=False)
+    bench.gateway.door.limits = limits
+    one, two = await bench.client(), await bench.client()
+    third = await bench.connect(UPGRADE)
+    answer = await third.end()
+    assert answer.startswith(b"HTTP/1.1 429 ")
+    assert b"too many connections from your address (2 are allowed)" in answer
+    assert (await get(bench, "/healthz"))[0] == 200
+    for peer in bench.peers[2:]:
+        peer.reset()
+    await bench.until(lambda: len(bench.gateway.connections) == 2)
+    silent = [await bench.connect() for _ in range(SPARE_PER_ADDRESS + 3)]
+    async with asyncio.timeout(TIME_OUT_S):
+        ended = [await peer.end() for peer in silent[SPARE_PER_ADDRESS:]]
+    assert ended == [b""] * 3
+    assert bench.gateway.door.refused == {"address": 4}
+    one.write(binary(b"echo"))
+    assert await one.frame() == (0x82, b"echo")
+    two.reset()
+    for peer in silent:
+        peer.reset()
+    await bench.until(lambda: len(bench.gateway.connections) == 1)
+    await bench.client()
+
+
+async def test_a_browser_of_another_page_is_refused(bench: Bench) -> None:
+    peer = await bench.connect(UPGRADE.replace(b"Host: x\r\n", b"Host: x\r\nOrigin: https://evil.example\r\n"))
+    assert (await peer.end()).startswith(b"HTTP/1.1 403 ")
+    peer = await bench.connect(UPGRADE.replace(b"Host: x\r\n", b"Host: x\r\nOrigin: https://x\r\n"))
+    assert (await peer.line()).startswith(b"HTTP/1.1 101 ")
+    assert bench.gateway.door.refused == {"origin": 1}
 
 
 async def test_stop_listening_ends_what_is_no_websocket_and_leaves_the_rest(bench: Bench) -> None:

@@ -30,6 +30,16 @@ def table() -> Table:
 # -- the handshake -------------------------------------------------------------------------------------------
 
 
+def test_messages_and_names_have_a_longest() -> None:
+    table = Table(Limits(message_bytes_max=600, name_max=3))
+    assert table.connect(bytes(601)).refusal() == (messages.TOO_BIG, "a message longer than 600 bytes")
+    assert table.connect(Hello(1, {}, "Anna")).refusal() == (messages.MALFORMED, "a name longer than 3 characters")
+    link = table.connect(Hello(1, {}, "Ann"))
+    table.tick()
+    assert link.session.entity
+    assert table.game.counters.closed == {messages.TOO_BIG: 1, messages.MALFORMED: 1}
+
+
 def test_who_says_hello_is_welcomed_and_shown_the_world_in_the_next_tick(table: Table) -> None:
     link = table.connect(HELLO)
     assert (link.sent, len(table.game.world)) == ([], 0)
@@ -73,7 +83,7 @@ def test_a_field_that_only_one_side_has_differs_too(table: Table) -> None:
     "said",
     [
         (HELLO, HELLO), (Inputs(1, -1, bytes(3)),), (Command(1, 1, 0.0, "edit", b""),), (Resync(),),
-        (HELLO, Inputs(1, -1, bytes(3))), (b"",), (b"\xff" * 40,), (bytes(9000),), (encode(Pong(1.0, 1.0)),),
+        (HELLO, Inputs(1, -1, bytes(3))), (b"",), (b"\xff" * 40,), (bytes(8000),), (encode(Pong(1.0, 1.0)),),
     ],
     ids=lambda said: f"{said}"[:40],
 )  # fmt: skip

@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 
 from server import app
 from server.journal import FILL, MAGIC, NOTE, PUT, REMOVE, DivergedError, JournalError, Moment, Recording, redo, replay
+from server.kinds import SettingsError
 from server.recorder import Pen, RecordedWorld
-from server.settings import SettingsError
 from shared.inputs import Input
 from shared.world import OverlapError, World
 from tests import worlds

@@ -1,0 +1,164 @@
+"""Who may come in: the decisions on connections that a gateway asks for before there is a player.
+
+A gateway tells `arrive` of each connection, asks `answer` what to do with its request, and tells `leave` when it is
+gone. A request for a WebSocket that is refused gets an HTTP status and a reason; nothing has been set up for it by
+then. Pages are answered even when the server is full, so that whoever watches it does not take it for dead: `SPARE`
+connections beyond the limits get that far, and those beyond them are dropped without a word.
+"""
+
+import ipaddress
+import math
+from collections import Counter
+from collections.abc import Callable
+from http import HTTPStatus
+from typing import NamedTuple
+
+from server.limits import Limits
+from server.pages import Page, Pages, line
+
+SPARE = 32
+"""Connections beyond the limit in total that are answered,"""
+SPARE_PER_ADDRESS = 4
+"""and of one address."""
+BURST_S = 2.0
+RETRY_S = "2"
+
+
+class Request(NamedTuple):
+    """What matters of an HTTP request. `upgrade`: it asks for a WebSocket."""
+
+    method: str
+    target: str
+    host: str
+    origin: str | None
+    upgrade: bool
+
+
+class Door:
+    """Counts connections, and answers requests.
+
+    Args:
+        figures: whose addresses may see the private pages: none, loopback, private or all.
+        origins: see `Settings.allowed_origins`.
+        closing: the seconds after which to come back once the server is going down; None while it is not.
+    """
+
+    def __init__(
+        self,
+        limits: Limits | None = None,
+        pages: Pages | None = None,
+        *,
+        figures: str = "private",
+        origins: tuple[str, ...] = (),
+        closing: Callable[[], float | None] = lambda: None,
+    ) -> None:
+        self.limits = limits or Limits()
+        self.refused: Counter[str] = Counter()
+        """Connections and requests that were refused, by reason."""
+        self._pages = pages or Pages()
+        self._figures = figures
+        self._origins = frozenset(origin.rstrip("/").lower() for origin in origins)
+        self._closing = closing
+        self._total = 0
+        self._by_network: Counter[str] = Counter()
+        self._joins = math.inf  # that is: the whole burst
+        self._joins_at = 0.0
+
+    def arrive(self, address: str) -> bool:
+        """A connection has come from an address; if False, drop it at once (and do not call `leave`)."""
+        limits, network = self.limits, network_of(address)
+        if self._total >= limits.connections_max + SPARE:
+            self.refused["connections"] += 1
+            return False
+        if self._limited(address) and self._by_network[network] >= limits.connections_per_address + SPARE_PER_ADDRESS:
+            self.refused["address"] += 1
+            return False
+        self._total += 1
+        self._by_network[network] += 1
+        return True
+
+    def leave(self, address: str) -> None:
+        """A connection that had arrived is gone."""
+        network = network_of(address)
+        self._total -= 1
+        self._by_network[network] -= 1
+        if not self._by_network[network]:
+            del self._by_network[network]
+
+    def answer(self, request: Request, address: str, now: float) -> Page | None:
+        """What to answer to a request; None: let it have its WebSocket."""
+        if not request.upgrade:
+            return self._pages.get(request.method, request.target, trusted=self._trusted(address))
+        reason, page = self._refusal(request, address, now)
+        if page is not None:
+            self.refused[reason] += 1
+        return page
+
+    def _refusal(self, request: Request, address: str, now: float) -> tuple[str, Page | None]:
+        limits, wait = self.limits, self._closing()
+        if wait is not None:
+            retry = str(max(1, round(wait)))
+            return "closing", line(HTTPStatus.SERVICE_UNAVAILABLE, "the server is going down", retry_after=retry)
+        if not self._welcome(request):
+            return "origin", line(HTTPStatus.FORBIDDEN, f"not from pages of {str(request.origin)[:100]}")
+        if self._total > limits.connections_max:
+            reason = f"the server is full ({limits.connections_max} connections)"
+            return "connections", line(HTTPStatus.SERVICE_UNAVAILABLE, reason, retry_after=RETRY_S)
+        if self._limited(address):
+            if self._by_network[network_of(address)] > limits.connections_per_address:
+                reason = f"too many connections from your address ({limits.connections_per_address} are allowed)"
+                return "address", line(HTTPStatus.TOO_MANY_REQUESTS, reason, retry_after=RETRY_S)
+            if not self._take_join(now):
+                reason = f"too many are joining right now ({limits.joins_per_s:g} per second are allowed)"
+                return "joins", line(HTTPStatus.SERVICE_UNAVAILABLE, reason, retry_after=RETRY_S)
+        return "", None
+
+    def _take_join(self, now: float) -> bool:
+        rate = self.limits.joins_per_s
+        self._joins = min(self._joins + (now - self._joins_at) * rate, max(1.0, BURST_S * rate))
+        self._joins_at = now
+        if self._joins < 1:
+            return False
+        self._joins -= 1
+        return True
+
+    def _welcome(self, request: Request) -> bool:
+        """Only browsers send an origin, and they tell the truth about it."""
+        if request.origin is None or "*" in self._origins:
+            return True
+        origin = request.origin.lower()
+        return origin in self._origins or origin.partition("://")[2] == request.host.lower() != ""
+
+    def _limited(self, address: str) -> bool:
+        return not (self.limits.loopback_exempt and is_loopback(address))
+
+    def _trusted(self, address: str) -> bool:
+        match self._figures:
+            case "all":
+                return True
+            case "private":
+                return _parsed(address).is_private
+            case "loopback":
+                return is_loopback(address)
+            case _:
+                return False
+
+
+def is_loopback(address: str) -> bool:
+    """Whether an address is this machine's own."""
+    return _parsed(address).is_loopback
+
+
+def network_of(address: str) -> str:
+    """What connections are counted by: an IPv4 address, or an IPv6 network of 64 bits, which one customer has."""
+    parsed = _parsed(address)
+    return str(parsed) if parsed.version == 4 else str(int(parsed) >> 64)
+
+
+def _parsed(address: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address:
+    """IPv4 in IPv6's clothes is IPv4. What is no address (of a peer that has gone already) is nobody's."""
+    try:
+        parsed = ipaddress.ip_address(address.partition("%")[0])
+    except ValueError:
+        return ipaddress.IPv6Address("2000::")
+    return getattr(parsed, "ipv4_mapped", None) or parsed

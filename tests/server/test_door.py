@@ -1,0 +1,161 @@
+"""Who is let in, by address, rate and origin, with the clock in the test's hand."""
+
+import pytest
+
+from server.door import SPARE, SPARE_PER_ADDRESS, Door, Request, is_loopback, network_of
+from server.limits import Limits
+from server.pages import Page, Pages
+
+JOIN = Request("GET", "/", "play.example:8765", None, upgrade=True)
+HEALTH = Request("GET", "/healthz", "play.example:8765", None, upgrade=False)
+
+
+def refused(page: Page | None) -> tuple[int, str]:
+    assert page is not None, "it was let in"
+    return page.status, page.body.decode().rstrip("\n")
+
+
+def test_an_address_gets_its_share_and_pages_beyond_it_and_then_nothing() -> None:
+    door = Door(Limits(connections_per_address=2))
+    for _ in range(2):
+        assert door.arrive("1.2.3.4")
+        assert door.answer(JOIN, "1.2.3.4", 0.0) is None
+    for _ in range(SPARE_PER_ADDRESS):
+        assert door.arrive("1.2.3.4")
+        status, text = refused(door.answer(JOIN, "1.2.3.4", 0.0))
+        assert (status, text) == (429, "too many connections from your address (2 are allowed)")
+        assert refused(door.answer(HEALTH, "1.2.3.4", 0.0)) == (200, "ok")
+    assert not door.arrive("1.2.3.4")
+    assert door.arrive("1.2.3.5"), "another address is not concerned"
+    assert door.refused == {"address": SPARE_PER_ADDRESS + 1}
+    for _ in range(1 + SPARE_PER_ADDRESS):
+        door.leave("1.2.3.4")
+    assert door.arrive("1.2.3.4")
+    assert door.answer(JOIN, "1.2.3.4", 0.0) is None
+
+
+def test_what_has_left_leaves_nothing_behind() -> None:
+    door = Door(Limits(connections_per_address=1))
+    for n in range(1000):
+        address = f"10.0.{n >> 8}.{n & 255}"
+        assert door.arrive(address)
+        door.leave(address)
+    assert (door._total, len(door._by_network)) == (0, 0)
+
+
+def test_all_connections_together_have_a_limit() -> None:
+    door = Door(Limits(connections_max=3))
+    assert all(door.arrive("127.0.0.1") for _ in range(3 + SPARE))
+    status, text = refused(door.answer(JOIN, "127.0.0.1", 0.0))
+    assert (status, text) == (503, "the server is full (3 connections)")
+    assert refused(door.answer(HEALTH, "127.0.0.1", 0.0))[0] == 200, "a full server is not a dead one"
+    assert not door.arrive("127.0.0.1")
+    assert not door.arrive("1.2.3.4")
+
+
+def test_joins_have_a_rate_and_a_burst_of_two_seconds() -> None:
+    door = Door(Limits(joins_per_s=10.0))
+
+    def joins(now: float) -> int:
+        n = 0
+        while door.answer(JOIN, "1.2.3.4", now) is None:
+            n += 1
+        return n
+
+    assert (joins(100.0), joins(100.0), joins(100.5), joins(103.0), joins(1000.0)) == (20, 0, 5, 20, 20)
+    assert refused(door.answer(JOIN, "1.2.3.4", 1000.0))[0] == 503
+    assert door.answer(JOIN, "127.0.0.1", 1000.0) is None
+    assert refused(door.answer(HEALTH, "1.2.3.4", 1000.0))[0] == 200
+
+
+def test_a_rate_below_one_in_two_seconds_lets_somebody_in() -> None:
+    door = Door(Limits(joins_per_s=0.1))
+    found = [door.answer(JOIN, "1.2.3.4", now) is None for now in (0.0, 1.0, 9.0, 10.5, 11.0, 21.0)]
+    assert found == [True, False, False, True, False, True]
+
+
+def test_this_machine_is_limited_only_on_request() -> None:
+    exempt = Door(Limits(connections_per_address=1))
+    limited = Door(Limits(connections_per_address=1, loopback_exempt=False))
+    for address in ("127.0.0.1", "::1", "::ffff:127.0.0.1"):
+        for door in (exempt, limited):
+            door.arrive(address)
+            door.arrive(address)
+        assert exempt.answer(JOIN, address, 0.0) is None
+        assert refused(limited.answer(JOIN, address, 0.0))[0] == 429
+
+
+def test_ipv6_counts_by_the_network_that_one_customer_has() -> None:
+    assert network_of("2001:db8:1:2::1") == network_of("2001:db8:1:2:ffff::9%eth0") != network_of("2001:db8:1:3::1")
+    assert network_of("::ffff:1.2.3.4") == network_of("1.2.3.4") != network_of("1.2.3.5")
+    assert not is_loopback("")
+
+
+@pytest.mark.parametrize(
+    ("allowed", "origin", "host", "welcome"),
+    [
+        ((), None, "", True),
+        ((), "https://play.example", "play.example", True),
+        ((), "http://localhost:8765", "localhost:8765", True),
+        ((), "https://PLAY.example", "play.example", True),
+        ((), "https://evil.example", "play.example", False),
+        ((), "https://play.example.evil", "play.example", False),
+        ((), "http://play.example:81", "play.example", False),
+        ((), "null", "play.example", False),
+        ((), "", "", False),
+        ((), "https://play.example https://play.example", "play.example", False),
+        (("https://a.b",), "https://A.b", "play.example", True),
+        (("https://a.b/",), "https://a.b", "play.example", True),
+        (("https://a.b",), "http://a.b", "play.example", False),
+        (("https://a.b",), "https://x.a.b", "play.example", False),
+        (("*",), "null", "play.example", True),
+    ],
+)
+def test_browsers_come_from_known_pages(allowed: tuple[str, ...], origin: str | None, host: str, welcome: bool) -> None:
+    door = Door(origins=allowed)
+    page = door.answer(Request("GET", "/", host, origin, upgrade=True), "1.2.3.4", 0.0)
+    assert (page is None) is welcome
+    if page is not None:
+        assert page.status == 403
+
+
+def test_a_server_that_goes_down_says_when_to_come_back() -> None:
+    wait: list[float] = []
+    door = Door(closing=lambda: wait[0] if wait else None)
+    assert door.answer(JOIN, "127.0.0.1", 0.0) is None
+    wait.append(3.2)
+    page = door.answer(JOIN, "127.0.0.1", 0.0)
+    assert refused(page) == (503, "the server is going down")
+    assert page is not None
+    assert page.headers == (("Retry-After", "3"),)
+    assert refused(door.answer(HEALTH, "127.0.0.1", 0.0))[0] == 200
+
+
+@pytest.mark.parametrize(
+    ("figures", "seen_from"),
+    [
+        ("none", []),
+        ("loopback", ["127.0.0.1", "::1", "::ffff:127.0.0.1"]),
+        ("private", ["127.0.0.1", "::1", "::ffff:127.0.0.1", "10.1.2.3", "192.168.1.1", "fd00::1"]),
+        (
+            "all",
+            ["127.0.0.1", "::1", "::ffff:127.0.0.1", "10.1.2.3", "192.168.1.1", "fd00::1", "8.8.8.8", "2a00::1", ""],
+        ),
+    ],
+)
+def test_figures_are_not_for_everyone(figures: str, seen_from: list[str]) -> None:
+    door = Door(pages=Pages(private={"/stats": lambda: Page(200, b"{}")}), figures=figures)
+    for address in (
+        "127.0.0.1",
+        "::1",
+        "::ffff:127.0.0.1",
+        "10.1.2.3",
+        "192.168.1.1",
+        "fd00::1",
+        "8.8.8.8",
+        "2a00::1",
+        "",
+    ):
+        page = door.answer(Request("GET", "/stats", "x", None, upgrade=False), address, 0.0)
+        assert page is not None
+        assert page.status == (200 if address in seen_from else 403), address

@@ -1,0 +1,37 @@
+"""Pages by path, and what a page that fails looks like."""
+
+import json
+
+import pytest
+
+from server.pages import Page, Pages, json_page, ready_page
+
+
+def test_pages_by_path_and_method() -> None:
+    pages = Pages({"/readyz": lambda: Page(200, b"yes")}, {"/stats": json_page(lambda: {"tick": 7})})
+    found = {
+        path: pages.get("GET", path, trusted=False) for path in ("/", "/healthz", "/readyz?x=/stats", "/stats", "/x")
+    }
+    assert [page.status for page in found.values()] == [426, 200, 200, 403, 404]
+    assert all(len(page.body.splitlines()) == 1 for page in found.values())
+    assert ("Upgrade", "websocket") in found["/"].headers
+    page = pages.get("GET", "/stats?a=b", trusted=True)
+    assert (page.status, page.content_type, json.loads(page.body)) == (200, "application/json", {"tick": 7})
+    assert pages.get("POST", "/stats", trusted=True).status == 405
+    assert Pages().get("GET", "/stats", trusted=True).status == 404
+
+
+def test_ready_or_the_reason() -> None:
+    reasons = [""]
+    page = ready_page(lambda: reasons[0])
+    assert page().status == 200
+    reasons[0] = "draining"
+    assert (page().status, page().body) == (503, b"not ready: draining\n")
+
+
+@pytest.mark.parametrize("figures", [lambda: {"x": object()}, lambda: 1 / 0])
+def test_a_page_that_fails_is_told_of_and_says_nothing_of_why(figures: object) -> None:
+    failed: list[str] = []
+    pages = Pages(private={"/stats": json_page(figures)}, failed=failed.append)  # type: ignore[arg-type]
+    page = pages.get("GET", "/stats", trusted=True)
+    assert (page.status, page.body, failed) == (500, b"internal error\n", ["/stats"])
