@@ -272,7 +272,7 @@ class Core:
             text = messages.VERDICT_TEXTS[min(verdict, len(messages.VERDICT_TEXTS) - 1)]
             self._events.append(Answered(number, verdict == messages.DONE, text))
         self._wrong = prediction.apply(snapshot) or self._wrong
-        self.picture.interpolation.push(snapshot.tick, prediction.confirmed.states())
+        self.picture.interpolation.push(snapshot.tick, prediction.truth)
 
     def _reconcile(self, now: float) -> None:
         """Compares the prediction with the newest snapshot: once per update, however many have come."""

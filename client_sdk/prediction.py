@@ -21,11 +21,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from client_sdk.events import Corrected
-from shared import edits
+from shared import edits, kernels
 from shared.checks import Cell
 from shared.edits import Edit
 from shared.inputs import NEUTRAL, Input
-from shared.layout import COLUMNS, FALLING, FLAGS, ID, TEMPLATE, Int64s, X
+from shared.layout import COLUMNS, FALLING, FLAGS, ID, Int64s, X
 from shared.messages import REPEATS_MAX, ProtocolError, Snapshot
 from shared.ring import Ring
 from shared.scene import Scene
@@ -77,11 +77,13 @@ class Prediction:
         """Inputs are filed so many ticks ahead of the predicted world: the input delay."""
         self.confirmed = World(scene, compiled=compiled)
         self.predicted = World(scene, compiled=compiled)
+        self.truth = self.confirmed.states()
+        """The states of the confirmed world, [n, 12], ascending by id. Not to be written to."""
         self.begun = False
         self._inputs: Ring[Input] = Ring(HISTORY)
         self._states: Ring[Int64s] = Ring(HISTORY)
         self._templates = len(scene.templates)
-        self._shown_ahead = np.array([template.shown == "predicted" for template in scene.templates])
+        self._shown_ahead = np.array([template.shown == "predicted" for template in scene.templates], np.int64)
         self._exist = frozenset(scene.segments())
         self._terrain_changed = self._edited_near = False
         self._acted: set[int] = set()
@@ -114,19 +116,17 @@ class Prediction:
             ProtocolError: a part of it is malformed.
         """
         world = self.confirmed
-        parts, states = decode_parts(snapshot.segments, self._templates)
+        parts, states = decode_parts(snapshot.segments, self._templates, compiled=world.compiled)
         here = set(states[:, ID].tolist())
-        self._acted.update(states[states[:, FLAGS] & ACTED != 0, ID].tolist())
-        states[:, FLAGS] &= FALLING
-        drops = {(x, y, z) for x, y, z in np.frombuffer(snapshot.drops, "<i4").reshape(-1, 3).tolist()}
-        homes = self._homes() if drops or any(part.gone or part.since == KEYFRAME for part in parts) else {}
-        for entity, home in homes.items():
-            if home in drops and entity not in here:
-                world.remove(entity)
+        if max(states[:, FLAGS].tolist(), default=0) >= ACTED:
+            self._acted.update(states[states[:, FLAGS] & ACTED != 0, ID].tolist())
+            states[:, FLAGS] &= FALLING
+        drops: set[Cell] = set()
+        if snapshot.drops:
+            drops = {(x, y, z) for x, y, z in np.frombuffer(snapshot.drops, "<i4").reshape(-1, 3).tolist()}
+        if drops or any(part.gone or part.since == KEYFRAME for part in parts):
+            self._take_away(parts, drops, here)
         for part in parts:
-            for entity in self._gone(part, homes):
-                if entity in world and entity not in here:
-                    world.remove(entity)
             if len(part.edits):
                 changes = part.edits["block"].tolist(), part.edits["kind"].tolist()
                 if part.segment in world.blocks:
@@ -143,6 +143,7 @@ class Prediction:
                 world.unload_segment(segment)
                 self._terrain_changed = True
         world.rebase(snapshot.tick)
+        self.truth = world.states()
         for part in parts:
             if part.check and part.segment in world.blocks and checksum(world, part.segment) != part.check:
                 return f"segment {part.segment} is not the server's"
@@ -166,15 +167,15 @@ class Prediction:
         around = {(x + i, y + j, z + k) for i in (-1, 0, 1) for j in (-1, 0, 1) for k in (-1, 0, 1)}
         return all(segment in self.confirmed.blocks for segment in around & self._exist)
 
-    def _gone(self, part: SegmentPart, homes: dict[int, Cell]) -> list[int]:
-        if part.since == KEYFRAME:
-            return [entity for entity, home in homes.items() if home == part.segment]
-        return [entity for entity in part.gone if homes.get(entity) == part.segment]
-
-    def _homes(self) -> dict[int, Cell]:
-        states = self.confirmed.states()
-        segments = (states[:, X : X + 3] >> (BLOCK_SHIFT + SEGMENT_SHIFT)).tolist()
-        return {entity: (x, y, z) for entity, (x, y, z) in zip(states[:, ID].tolist(), segments, strict=True)}
+    def _take_away(self, parts: list[SegmentPart], drops: set[Cell], here: set[int]) -> None:
+        """Removes who is gone, or was in a segment that is not seen any more or sent whole, and is not `here`."""
+        segments = (self.truth[:, X : X + 3] >> (BLOCK_SHIFT + SEGMENT_SHIFT)).tolist()
+        whole = drops | {part.segment for part in parts if part.since == KEYFRAME}
+        gone = {(part.segment, entity) for part in parts for entity in part.gone}
+        for entity, (x, y, z) in zip(self.truth[:, ID].tolist(), segments, strict=True):
+            home = (x, y, z)
+            if entity not in here and (home in whole or (home, entity) in gone):
+                self.confirmed.remove(entity)
 
     # -- the guess -----------------------------------------------------------------------------------------
 
@@ -261,8 +262,7 @@ class Prediction:
         self._replay(self.predicted.tick)
 
     def _truth(self) -> Int64s:
-        states = self.confirmed.states()
-        return states if self.neighbours else states[states[:, ID] == self.entity]
+        return self.truth if self.neighbours else self.truth[self.truth[:, ID] == self.entity]
 
     def _replay(self, to: int) -> None:
         self.predicted.restore(self.confirmed)
@@ -276,17 +276,12 @@ class Prediction:
 
     def _near_equal(self, guess: Int64s, truth: Int64s) -> bool:
         """Whether all that could meet the own entity, or is drawn as predicted, is as predicted."""
-        if np.array_equal(guess, truth):
+        if guess.tobytes() == truth.tobytes():
             return True
-        return np.array_equal(self._that_count(guess), self._that_count(truth))
-
-    def _that_count(self, states: Int64s) -> Int64s:
-        mine = states[states[:, ID] == self.entity]
-        if not len(mine):
-            return states
-        ways = np.abs(states[:, X : X + 3] - mine[0, X : X + 3]).max(axis=1)
-        near: Int64s = states[(ways < MEET_BLOCKS * BLOCK) | self._shown_ahead[states[:, TEMPLATE]]]
-        return near
+        compiled = self.confirmed.compiled
+        kernel = kernels.compiled() if compiled else kernels.PLAIN
+        a, b, always = (kernels.lent(array, compiled) for array in (guess, truth, self._shown_ahead))
+        return bool(kernel.alike(a, len(guess), b, len(truth), self.entity, MEET_BLOCKS * BLOCK, always))
 
     def _difference(self, guess: Int64s, truth: Int64s) -> tuple[tuple[str, ...], float] | None:
         """In which fields, and by how many blocks, the own entity is not as predicted."""

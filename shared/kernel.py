@@ -665,3 +665,65 @@ def collect(e: Any, rows: int, out: Any) -> int:
         out[at * CELL + FLAGS] &= FALLING
         n += 1
     return n
+
+
+@jit
+def admit(states: Any, parts: Any, n_parts: int, low: Any, high: Any, templates: int) -> bool:
+    """Whether all values of states from the wire are within bounds; adds to each position its part's corner.
+
+    Of each part, `parts` has the low corner in grid steps, and how many states are its.
+    """
+    at = 0
+    for part in range(0, 4 * n_parts, 4):
+        for _ in range(parts[part + 3]):
+            for k in range(CELL):
+                if states[at + k] < low[k] or states[at + k] > high[k]:
+                    return False
+            if states[at + TEMPLATE] >= templates:
+                return False
+            for k in range(3):
+                states[at + X + k] += parts[part + k]
+            at += CELL
+    return True
+
+
+@inlined
+def counts(states: Any, at: int, mine: int, reach: int, always: Any) -> bool:
+    """Whether the state at `at` counts for the one at `mine`; -1: for nobody, so it does."""
+    if mine < 0 or always[states[at + TEMPLATE]] != 0:
+        return True
+    return (
+        abs(states[at + X] - states[mine + X]) < reach
+        and abs(states[at + Y] - states[mine + Y]) < reach
+        and abs(states[at + Z] - states[mine + Z]) < reach
+    )
+
+
+@jit
+def alike(a: Any, n: int, b: Any, m: int, entity: int, reach: int, always: Any) -> bool:
+    """Whether two lists of states are the same in all that count for `entity`.
+
+    Those that do are less than `reach` away from it along each axis, or of a template that `always` counts (not 0);
+    where `entity` is not in a list, all of that list do.
+    """
+    mine = -1
+    for i in range(n):
+        if a[CELL * i + ID] == entity:
+            mine = CELL * i
+    own = -1
+    for j in range(m):
+        if b[CELL * j + ID] == entity:
+            own = CELL * j
+    i = j = 0
+    while True:
+        while i < n and not counts(a, CELL * i, mine, reach, always):
+            i += 1
+        while j < m and not counts(b, CELL * j, own, reach, always):
+            j += 1
+        if i == n or j == m:
+            return i == n and j == m
+        for k in range(CELL):
+            if a[CELL * i + k] != b[CELL * j + k]:
+                return False
+        i += 1
+        j += 1

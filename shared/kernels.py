@@ -8,6 +8,9 @@ import functools
 import importlib.util
 import sys
 from types import ModuleType
+from typing import Any
+
+import numpy as np
 
 from shared import kernel
 
@@ -17,6 +20,12 @@ PLAIN: ModuleType = kernel
 def available() -> bool:
     """Whether Numba is installed, without importing it."""
     return importlib.util.find_spec("numba") is not None
+
+
+def lent(array: np.ndarray[Any, Any], to_compiled: bool) -> Any:
+    """An array, flat, as the kernel wants it: memoryviews give the plain source Python's own whole numbers."""
+    flat = array.reshape(-1)
+    return flat if to_compiled else memoryview(flat)  # type: ignore[arg-type]
 
 
 @functools.cache

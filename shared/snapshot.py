@@ -19,8 +19,9 @@ from typing import Any, NamedTuple
 import msgpack
 import numpy as np
 
+from shared import kernels
 from shared.checks import Cell
-from shared.layout import BUTTONS, CELL, FALLING, TEMPLATE, Int64s, X
+from shared.layout import BUTTONS, CELL, FALLING, ID, MOVE_X, TEMPLATE, Int64s, X
 from shared.messages import ENTITY_MAX, ProtocolError, shown
 from shared.units import BLOCK, SEGMENT
 from shared.world import World
@@ -30,13 +31,23 @@ ROW = np.dtype(
     + [(name, "<i4") for name in ("x", "y", "z", "vx", "vy", "vz")]
     + [("move_x", "i1"), ("move_y", "i1"), ("buttons", "u1")]
 )
+ROW_BYTES = ROW.itemsize
+ROW_BY_SIZE = np.dtype([("id", "<u4"), ("kind", "u1", 2), ("place", "<i4", 6), ("move", "i1", 2), ("buttons", "u1")])
+"""The same bytes in runs of equal size, each of which is converted at once."""
+COLUMNS_BY_SIZE = (
+    (ID, "id"), (slice(TEMPLATE, X), "kind"), (slice(X, MOVE_X), "place"), (slice(MOVE_X, BUTTONS), "move"),
+    (BUTTONS, "buttons"),
+)  # fmt: skip
 VERDICT = np.dtype([("number", "<u4"), ("verdict", "u1")])
 EDIT = np.dtype([("block", "<u2"), ("kind", "u1")])
+NO_EDITS = np.zeros(0, EDIT)
 SIDE = SEGMENT * BLOCK
 """Grid steps along one side of a segment."""
 FIELDS = ("id", "template", "flags", "x", "y", "z", "vx", "vy", "vz", "move_x", "move_y", "buttons")
 assert len(FIELDS) == CELL == BUTTONS + 1
 assert SIDE & (SIDE - 1) == 0
+FAR = 1 << 23
+"""No index of a segment is further from 0 along an axis."""
 
 KEYFRAME = -1
 """The `since` of a part that holds everything."""
@@ -110,8 +121,10 @@ def checksum(world: World, segment: Cell) -> int:
     return zlib.crc32(world.blocks.digest(segment).to_bytes(8, "little") + rows) or 1
 
 
-def decode_parts(segments: Sequence[Any], templates: int) -> tuple[list[SegmentPart], Int64s]:
-    """Checks and unpacks `Snapshot.segments`, in a scene of so many templates.
+def decode_parts(
+    segments: Sequence[Any], templates: int, *, compiled: bool = False
+) -> tuple[list[SegmentPart], Int64s]:
+    """Checks and unpacks `Snapshot.segments`, in a scene of so many templates; `compiled` by Numba, or not.
 
     Returns:
         The parts, and the states ([n, 12], as `World.put` takes them but for `ACTED`) of all their entities, part
@@ -121,16 +134,20 @@ def decode_parts(segments: Sequence[Any], templates: int) -> tuple[list[SegmentP
         ProtocolError: anything is not as drawn above.
     """
     parts = [_decode_part(segment) for segment in segments]
-    packed = np.frombuffer(b"".join([segment[4] for segment in segments]), ROW)
+    packed = np.frombuffer(b"".join([segment[4] for segment in segments]), ROW_BY_SIZE)
     states = np.empty((len(packed), CELL), np.int64)
     if len(packed):
-        for column, name in enumerate(FIELDS):
-            states[:, column] = packed[name]
-        low, high = states.min(axis=0), states.max(axis=0)
-        if (low < STATE_LOW).any() or (high > STATE_HIGH).any() or high[TEMPLATE] >= templates:
+        for columns, name in COLUMNS_BY_SIZE:
+            states[:, columns] = packed[name]
+        told: list[int] = []
+        for (x, y, z), _, entities, *_ in parts:
+            told += (x * SIDE, y * SIDE, z * SIDE, entities)
+        kernel = kernels.compiled() if compiled else kernels.PLAIN
+        flat, corners, low, high = (
+            kernels.lent(array, compiled) for array in (states, np.array(told, np.int64), STATE_LOW, STATE_HIGH)
+        )
+        if not kernel.admit(flat, corners, len(parts), low, high, templates):
             raise ProtocolError("segment.rows: a value is out of range")
-        origins = np.array([part.segment for part in parts], np.int64) * SIDE
-        states[:, X : X + 3] += np.repeat(origins, [part.entities for part in parts], axis=0)
     return parts, states
 
 
@@ -138,18 +155,18 @@ def _decode_part(part: Any) -> SegmentPart:
     if type(part) is not list or len(part) != 8:
         raise ProtocolError("segment: not eight fields")
     x, y, z, since, rows, gone, edits, check = part
-    for name, value in (("x", x), ("y", y), ("z", z)):
-        if type(value) is not int or not -(1 << 23) <= value < 1 << 23:
-            raise ProtocolError(f"segment.{name} = {shown(value)}: not allowed")
+    if not (type(x) is type(y) is type(z) is int and -FAR <= x < FAR and -FAR <= y < FAR and -FAR <= z < FAR):
+        raise ProtocolError(f"segment {shown(x)} {shown(y)} {shown(z)}: not allowed")
     if type(check) is not int or not 0 <= check < 1 << 32:
         raise ProtocolError(f"segment.check = {shown(check)}: not allowed")
     if type(since) is not int or not -1 <= since < 1 << 53:
         raise ProtocolError(f"segment.since = {shown(since)}: not allowed")
-    for name, value, size in (("rows", rows, ROW.itemsize), ("gone", gone, 4), ("edits", edits, EDIT.itemsize)):
-        if type(value) is not bytes or len(value) > PART_MAX or len(value) % size:
-            raise ProtocolError(f"segment.{name}: not allowed")
-    edited = np.frombuffer(edits, EDIT)
+    if not type(rows) is type(gone) is type(edits) is bytes or max(len(rows), len(gone), len(edits)) > PART_MAX:
+        raise ProtocolError("segment: rows, gone or edits are no bytes, or too many")
+    if len(rows) % ROW_BYTES or len(gone) % 4 or len(edits) % EDIT.itemsize:
+        raise ProtocolError("segment: part of a row")
+    edited = np.frombuffer(edits, EDIT) if edits else NO_EDITS
     if edits and int(edited["block"].max()) >= SEGMENT**3:
         raise ProtocolError("segment.edits: a block is out of range")
     left = np.frombuffer(gone, "<u4").tolist() if gone else []
-    return SegmentPart((x, y, z), since, len(rows) // ROW.itemsize, left, edited, check)
+    return SegmentPart((x, y, z), since, len(rows) // ROW_BYTES, left, edited, check)

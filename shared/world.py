@@ -368,8 +368,10 @@ class World:
 
     def put(self, states: Iterable[tuple[int, ...]] | layout.Int64s) -> None:
         """Writes whole states ([n, 12], as `state` gives them), new or known: what a snapshot says, verbatim."""
-        new = np.array(states if isinstance(states, np.ndarray) else list(states), np.int64).reshape(-1, STATES)
-        rows = np.array([self._row(entity) for entity in new[:, ID].tolist()], np.int64)
+        new = np.asarray(states if isinstance(states, np.ndarray) else list(states), np.int64).reshape(-1, STATES)
+        ids = new[:, ID].tolist()
+        known = list(map(self._row_of.get, ids))
+        rows = np.array([self._row(entity) for entity in ids] if None in known else known, np.int64)
         self._kernel.store(self._arrays, self._lent(rows), self._lent(new), len(rows), self._tick + 1)
 
     def write_blocks(self, segment: Cell, offsets: Iterable[int], kinds: Iterable[int]) -> None:
@@ -471,9 +473,7 @@ class World:
         self._arrays = Arrays(*(self._lent(array) for array in arrays))
 
     def _lent(self, array: np.ndarray[Any, Any]) -> Any:
-        """An array as the kernel wants it: memoryviews give the plain source Python's own whole numbers."""
-        flat = array.reshape(-1)
-        return flat if self.compiled else memoryview(flat)  # type: ignore[arg-type]
+        return kernels.lent(array, self.compiled)
 
     def _row(self, entity: int) -> int:
         """The row of an entity, a new one if it is not known."""

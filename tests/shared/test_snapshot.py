@@ -98,14 +98,14 @@ def test_any_legal_part_is_lossless(
     assert part.edits.tolist() == edits
 
 
-def test_parts_share_one_table_of_states_and_each_has_its_own_corner() -> None:
+def test_parts_share_one_table_of_states_and_each_has_its_own_corner(compiled: bool) -> None:
     segments = [(0, 0, 0), (-2, 1, 3), (5, 5, -5)]
     tables = [[state_in(s, 9, 1, 2, 10 * i + j) for j in range(i)] for i, s in enumerate(segments)]
     encoded = [
         msgpack.unpackb(encode_part(s, -1, np.array(t, np.int64).reshape(-1, CELL), [], []))
         for s, t in zip(segments, tables, strict=True)
     ]
-    parts, decoded = decode_parts(encoded, 255)
+    parts, decoded = decode_parts(encoded, 255, compiled=compiled)
     assert [part.entities for part in parts] == [0, 1, 2]
     assert [tuple(row) for row in decoded.tolist()] == [state for table in tables for state in table]
 
@@ -172,15 +172,15 @@ def test_a_part_beyond_its_bounds_is_refused(fields: dict[str, Any]) -> None:
         (MOVE_X, -128), (MOVE_X + 1, -128),
     ],
 )  # fmt: skip
-def test_a_state_that_no_world_has_is_refused(column: int, value: int) -> None:
+def test_a_state_that_no_world_has_is_refused(column: int, value: int, compiled: bool) -> None:
     with pytest.raises(ProtocolError, match=r"segment\.rows"):
-        decode_parts([part_of(), part_of(rows=part_of()[4] + row_with(column, value))], 255)
+        decode_parts([part_of(), part_of(rows=part_of()[4] + row_with(column, value))], 255, compiled=compiled)
 
 
-def test_a_template_is_one_of_the_scene() -> None:
-    decode_parts([part_of(rows=row_with(TEMPLATE, 2))], 3)
+def test_a_template_is_one_of_the_scene(compiled: bool) -> None:
+    decode_parts([part_of(rows=row_with(TEMPLATE, 2))], 3, compiled=compiled)
     with pytest.raises(ProtocolError, match=r"segment\.rows"):
-        decode_parts([part_of(rows=row_with(TEMPLATE, 3))], 3)
+        decode_parts([part_of(rows=row_with(TEMPLATE, 3))], 3, compiled=compiled)
 
 
 def test_nesting_a_thousand_deep_is_refused_like_anything_else() -> None:
