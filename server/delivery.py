@@ -6,7 +6,6 @@ bytes of a segment's changes are `replication`'s, made once for all. A segment's
 snapshot, as far as there is room: terrain never makes a snapshot late.
 """
 
-import struct
 from collections import deque
 
 import numpy as np
@@ -18,6 +17,7 @@ from server.pacing import LEAST_BYTES
 from server.replication import ChangeLog
 from server.session import Session
 from shared import messages
+from shared.checks import Cell
 from shared.messages import Terrain, encode
 from shared.snapshot import VERDICT
 from shared.world import World
@@ -32,7 +32,9 @@ class Delivery:
 
     def serve(self, session: Session, now: float) -> None:
         """Sends a session the tick that has been recorded, if its path has room."""
-        self._look_around(session)
+        centre = self._log.segment(session.entity)
+        if centre is not session.sight.centre:
+            self._look_around(session, centre)
         outstanding = session.link.outstanding()
         window = session.pacing.window(outstanding, session.snapshot_bytes, self._tick_s, now)
         if session.acked < 0:
@@ -43,8 +45,8 @@ class Delivery:
             return
         session.sent_at = now
         self._send_snapshot(session, max(window - outstanding, LEAST_BYTES))
-        if outstanding == 0:
-            session.sent_when.put(self._world.tick, now)
+        if outstanding == 0 and session.probe is None:
+            session.probe = (self._world.tick, now, session.snapshot_bytes)
         if session.terrain_now or session.terrain_due:
             self._send_terrain(session, window - session.link.outstanding())
 
@@ -52,9 +54,11 @@ class Delivery:
         """The client has applied the snapshot of a tick."""
         if session.acked < tick <= session.tick:
             session.acked = tick
-            when = session.sent_when.get(tick)
-            if when is not None:
-                session.pacing.answered(now - when, session.snapshot_bytes, now)
+            if session.probe is not None and tick >= session.probe[0]:
+                probe, sent_at, size = session.probe
+                session.probe = None
+                if tick == probe:
+                    session.pacing.answered(now - sent_at, size, now)
 
     def forget(self, session: Session) -> None:
         """Begins anew with what a client sees: keyframes and terrain."""
@@ -62,10 +66,9 @@ class Delivery:
         session.terrain_now = None
         session.terrain_due = deque(sorted(s for s in session.sight.sees if s in self._world.blocks))
 
-    def _look_around(self, session: Session) -> None:
-        centre, sight = self._log.segment(session.entity), session.sight
-        if centre == sight.centre:
-            return
+    def _look_around(self, session: Session, centre: Cell) -> None:
+        """The entity is in another segment."""
+        sight = session.sight
         exists = self._world.blocks.__contains__
         added, dropped = sight.move(centre, self._limits.see_radius, self._limits.keep_radius, exists)
         due = [segment for segment in session.terrain_due if segment in sight.sees] + [s for s in added if exists(s)]
@@ -74,18 +77,17 @@ class Delivery:
             session.terrain_now = None
 
     def _send_snapshot(self, session: Session, room: int) -> None:
-        tick, inputs = self._world.tick, session.inputs
-        if session.sight.lost_track(tick):
+        tick, inputs, sight = self._world.tick, session.inputs, session.sight
+        if sight.lost_track(tick):
             self.forget(session)
-        drops = np.array(session.sight.drops, "<i4").tobytes() if session.sight.drops else b""
-        parts = session.sight.take(self._log, tick, room)
-        margins = struct.pack(f"<{len(inputs.margins)}h", *inputs.margins)
+        drops = np.array(sight.drops, "<i4").tobytes() if sight.drops else b""
+        parts = sight.take(self._log, tick, room)
         verdicts = b""
         if session.verdicts:
             verdicts = np.array(session.verdicts[: messages.VERDICTS_MAX], VERDICT).tobytes()
             del session.verdicts[: messages.VERDICTS_MAX]
         first = tick - len(inputs.fates) + 1
-        header = (tick, inputs.newest, margins, first, bytes(inputs.fates), verdicts, drops)
+        header = (tick, inputs.newest, inputs.margins.tobytes(), first, bytes(inputs.fates), verdicts, drops)
         message = messages.join_snapshot(header, parts)
         session.send(message)
         session.tick = tick

@@ -235,7 +235,8 @@ class Game:
 
     def _send(self, now: float) -> None:
         for session in tuple(self.sessions):
-            session.allowance = min(session.allowance + self.limits.messages_per_tick, 0.0)
+            if session.allowance < 0:
+                session.allowance = min(session.allowance + self.limits.messages_per_tick, 0.0)
             if session.entity and not session.closed:
                 self.delivery.serve(session, now)
 

@@ -6,6 +6,7 @@ ticks behind, or has just begun to see the segment, gets a keyframe. Nothing is 
 """
 
 from collections import defaultdict
+from collections.abc import Mapping
 
 import numpy as np
 
@@ -36,6 +37,17 @@ class _Tick:
         return self.changed.keys() | self.gone.keys() | self.edited.keys()
 
 
+class _Parts(dict[Cell, bytes]):
+    """The encoded changes after one tick, each made when it is asked for first."""
+
+    def __init__(self, log: "ChangeLog", since: int) -> None:
+        self._log, self._since = log, since
+
+    def __missing__(self, segment: Cell) -> bytes:
+        part = self[segment] = self._log.encode(segment, self._since)
+        return part
+
+
 class ChangeLog:
     """The changes of one world. Record each tick once, after its step; then ask for parts."""
 
@@ -45,7 +57,7 @@ class ChangeLog:
         self._now = _Tick()
         self._home: dict[int, Cell] = {}
         self._changed: dict[int, set[Cell] | None] = {}
-        self._parts: dict[int, dict[Cell, bytes]] = defaultdict(dict)
+        self._parts: dict[int, _Parts] = {}
         self._packed: dict[Cell, tuple[int, bytes]] = {}
         self._latest: dict[Cell, bytes] | None = None
         """The packed rows of the entities that the newest tick changed, until something is removed."""
@@ -104,20 +116,20 @@ class ChangeLog:
             self._changed[since] = None if ticks is None else set().union(*(tick.segments() for tick in ticks))
         return self._changed[since]
 
-    def part(self, segment: Cell, since: int) -> bytes:
-        """The encoded changes of a segment after tick `since`, which is `KEYFRAME` or at most `HISTORY` ago."""
-        known = self._parts[since]
-        part = known.get(segment)
-        if part is None:
-            part = known[segment] = self._keyframe(segment) if since == KEYFRAME else self._changes(segment, since)
-        return part
+    def since(self, since: int) -> Mapping[Cell, bytes]:
+        """Each segment's encoded changes after tick `since`, `KEYFRAME` or at most `HISTORY` ago; empty: none."""
+        parts = self._parts.get(since)
+        if parts is None:
+            parts = self._parts[since] = _Parts(self, since)
+        return parts
 
-    def parts(self, seen: set[Cell], since: int) -> dict[Cell, bytes]:
-        """The parts of those of the `seen` segments that changed after tick `since`, which is at most `HISTORY` ago."""
-        known = self._parts[since]
+    def encode(self, segment: Cell, since: int) -> bytes:
+        """A part, made anew: ask `since` for one that is shared."""
+        if since == KEYFRAME:
+            return self._keyframe(segment)
         changed = self.changed_segments(since)
-        assert changed is not None
-        return {segment: known.get(segment) or self.part(segment, since) for segment in changed & seen}
+        assert changed is not None, "lost track"
+        return self._changes(segment, since) if segment in changed else b""
 
     def packed(self, segment: Cell) -> bytes:
         """A segment's blocks as they are, packed."""

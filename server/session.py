@@ -2,7 +2,10 @@
 
 import math
 import struct
+import sys
+from array import array
 from collections import deque
+from functools import lru_cache
 from typing import Protocol
 
 from server.pacing import Pacing
@@ -23,9 +26,9 @@ from shared.messages import (
     Command,
     Inputs,
 )
-from shared.ring import Ring
 
 INPUT_ROW = struct.Struct("<bbB")
+assert sys.byteorder == "little", "margins lie in memory as they go over the wire"
 
 
 class Link(Protocol):
@@ -42,41 +45,51 @@ class Link(Protocol):
         """Closes once what was sent has gone out."""
 
 
+@lru_cache(4096)
+def _wish(row: bytes) -> Input:
+    """A row as an input that is allowed. Hands hold keys for longer than a tick: most rows have been seen before."""
+    return clamp(Input(*INPUT_ROW.unpack(row)))
+
+
 class InputQueue:
     """The inputs of one player: exactly one is taken per tick, and each one's fate is kept until it is told."""
 
     def __init__(self) -> None:
-        self._ring: Ring[Input] = Ring(AHEAD_MAX + 1)
+        self._waiting: dict[int, Input] = {}  # by tick, at most `AHEAD_MAX` ahead
         self._held = NEUTRAL  # the latest to arrive whose tick has come
         self._missing = 0  # ticks since anything has arrived
         self.first = self.newest = -1
-        self.margins: deque[int] = deque(maxlen=FATES_MAX)
-        self.fates: deque[int] = deque(maxlen=FATES_MAX)
+        self.margins = array("h")
+        """As they go over the wire, up to that of `newest`; at most `FATES_MAX`, like the fates."""
+        self.fates = bytearray()
         self.late = self.refused = self.used = self.substituted = 0
 
     def file(self, message: Inputs, tick: int, ahead: float) -> None:
         """Takes a message at tick `tick`; the next tick's deadline is `ahead` ticks away."""
-        first, rows = message.first, message.rows
-        count = len(rows) // INPUT_ROW_BYTES
-        known = min(max(self.newest + 1 - first, 0), count)  # duplicates, or an order that TCP cannot produce
-        usable = min(max(tick + AHEAD_MAX + 1 - first, known), count)
-        self.refused += known + count - usable
-        for i in range(known, usable):
-            at = first + i
-            self._reached(at)
-            wish = clamp(Input(*INPUT_ROW.unpack_from(rows, i * INPUT_ROW_BYTES)))
-            margin = math.floor((at - tick - 1 + ahead) * MARGIN_ONE)
-            if at <= tick:
-                self.late += 1
-                self._held, self._missing = wish, 0
-                margin = min(margin, -1)
+        at, _, rows = message
+        for start in range(0, len(rows), INPUT_ROW_BYTES):
+            if at <= self.newest:  # a duplicate, or an order that TCP cannot produce
+                self.refused += 1
             else:
-                self._ring.put(at, wish)
-            self.margins.append(max(MARGIN_REFUSED + 1, min(margin, -MARGIN_REFUSED - 1)))
-        if usable < count:
-            self._reached(message.first + usable)
-            self.margins.extend([MARGIN_REFUSED] * (count - usable))
-            self.newest = message.first + count - 1
+                self._reached(at)
+                self.margins.append(self._filed(at, rows[start : start + INPUT_ROW_BYTES], tick, ahead))
+            at += 1
+        if len(self.margins) > FATES_MAX:
+            del self.margins[:-FATES_MAX]
+
+    def _filed(self, at: int, row: bytes, tick: int, ahead: float) -> int:
+        """Files the input for the tick `at`; its margin."""
+        if at > tick + AHEAD_MAX:
+            self.refused += 1
+            return MARGIN_REFUSED
+        margin = math.floor((at - tick - 1 + ahead) * MARGIN_ONE)
+        if at > tick:
+            self._waiting[at] = _wish(row)
+        else:
+            self.late += 1
+            self._held, self._missing = _wish(row), 0
+            margin = min(margin, -1)
+        return margin if abs(margin) < -MARGIN_REFUSED else max(MARGIN_REFUSED + 1, min(margin, -MARGIN_REFUSED - 1))
 
     def _reached(self, at: int) -> None:
         """`at` is the newest from here on: ticks left out get a margin each, so that they can be counted off."""
@@ -88,7 +101,7 @@ class InputQueue:
 
     def take(self, tick: int) -> Input:
         """The input for a tick whose time has come."""
-        wish = self._ring.get(tick)
+        wish = self._waiting.pop(tick, None)
         if wish is not None:
             fate, self._missing, self._held = USED, 0, wish
             self.used += 1
@@ -99,11 +112,13 @@ class InputQueue:
             self.substituted += 1
             fate = REPEATED if self._missing <= REPEATS_MAX else NEUTRALISED
         self.fates.append(fate)
+        if len(self.fates) > FATES_MAX:
+            del self.fates[0]
         return NEUTRAL if fate == NEUTRALISED else self._held
 
     def told(self) -> None:
         """Margins and fates have been sent."""
-        self.margins.clear()
+        del self.margins[:]
         self.fates.clear()
 
 
@@ -136,13 +151,13 @@ class Session:
         self.verdicts: list[tuple[int, int]] = []
         self.edits_left = math.inf
         self.pacing = Pacing()
-        self.sent_when: Ring[float] = Ring(FATES_MAX)
-        """When snapshots were sent before which nothing was on the way."""
+        self.probe: tuple[int, float, int] | None = None
+        """A snapshot before which nothing was on the way: its tick, when it was sent, its bytes."""
         self.skipped = 0
 
     def send(self, message: bytes) -> None:
         """Hands a message to the link."""
-        self.pacing.sent(len(message))
+        self.pacing.sent_bytes += len(message)
         self.link.send(message)
 
     def close(self, code: int, reason: str) -> None:

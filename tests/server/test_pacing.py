@@ -9,7 +9,7 @@ def stream(pacing: Pacing, seconds: float, bytes_per_tick: int, outstanding: int
     """Sends evenly while so much is on the way; the time afterwards."""
     now = start
     for _ in range(int(seconds / TICK_S)):
-        pacing.sent(bytes_per_tick)
+        pacing.sent_bytes += bytes_per_tick
         now += TICK_S
         pacing.window(outstanding, bytes_per_tick, TICK_S, now)
     return now

@@ -56,7 +56,10 @@ class Recorded:
 
     def part(self, segment: Cell, since: int) -> tuple[list[int], list[int], list[tuple[int, int]]]:
         """Ids of the rows, ids of the gone, edits."""
-        (part,), states = decode_parts([msgpack.unpackb(self.log.part(segment, since))], 255)
+        encoded = self.log.since(since)[segment]
+        if not encoded:
+            return [], [], []
+        (part,), states = decode_parts([msgpack.unpackb(encoded)], 255)
         assert (part.segment, part.since) == (segment, since)
         for state in states.tolist():
             state[FLAGS] &= FALLING
@@ -153,7 +156,7 @@ def test_who_was_acted_upon_is_flagged_in_every_part_that_tells_of_it(told: Reco
     told.log.note_act(1)
     told.tick(2)
     for since, flagged in ((1, [1]), (0, [1]), (2, [])):
-        _, states = decode_parts([msgpack.unpackb(told.log.part(HOME, since))], 255)
+        _, states = decode_parts([msgpack.unpackb(told.log.since(since)[HOME])], 255)
         assert states[states[:, FLAGS] & ACTED != 0, ID].tolist() == flagged
 
 
@@ -185,7 +188,7 @@ def test_the_void_below_the_floor_has_parts_like_any_segment(told: Recorded) -> 
 def test_one_encoding_serves_all_who_ask_for_the_same(told: Recorded) -> None:
     told.world.spawn("box", (5, 5, 9))
     told.tick(2)
-    assert told.log.part(HOME, 1) is told.log.part(HOME, 1)
+    assert told.log.since(1)[HOME] is told.log.since(1)[HOME]
     assert told.log.packed(HOME) is told.log.packed(HOME)
     before = told.log.packed(HOME)
     told.edit(1, 1, 1, 1)
@@ -197,7 +200,7 @@ def test_memory_is_bounded_by_history_and_by_what_exists(told: Recorded) -> None
     for i in range(HISTORY + 50):
         told.world.spawn("box", (5, 5, 20))
         told.tick()
-        told.log.part(HOME, max(0, i - 3))
+        told.log.since(max(0, i - 3))[HOME]
         told.remove(i + 1)
     told.tick(HISTORY + 1)
     assert told.log._home == {}

@@ -18,12 +18,17 @@ class Log:
         self.sizes = sizes
         self.asked: list[tuple[Cell, int]] = []
 
-    def parts(self, sees: set[Cell], since: int) -> dict[Cell, bytes]:
-        return {segment: self.part(segment, since) for segment in self.sizes if segment in sees}
+    def since(self, since: int) -> "Parts":
+        return Parts(self, since)
 
-    def part(self, segment: Cell, since: int) -> bytes:
-        self.asked.append((segment, since))
-        return bytes([ROW.index(segment)]) * self.sizes[segment]
+
+class Parts:
+    def __init__(self, log: Log, since: int) -> None:
+        self.log, self.since = log, since
+
+    def __getitem__(self, segment: Cell) -> bytes:
+        self.log.asked.append((segment, self.since))
+        return bytes([ROW.index(segment)]) * self.log.sizes[segment]
 
 
 def looking(*, see: int = 2) -> Sight:
