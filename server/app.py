@@ -14,6 +14,7 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
+from server.database import StoreError
 from server.door import Door
 from server.faults import Faults
 from server.game import Game
@@ -24,6 +25,7 @@ from server.metrics import metrics_page
 from server.pages import Pages, json_page, ready_page
 from server.recorder import RecordedWorld
 from server.settings import Settings, parse
+from server.store import Store
 from server.ticker import Ticker, best_alarm
 from server.warmup import warm_up
 from shared.checks import SceneError
@@ -47,7 +49,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             print(settings, end="")
             return 0
         return run(settings)
-    except (SettingsError, SceneError) as error:
+    except (SettingsError, SceneError, StoreError) as error:
         print("error:", *str(error).split(), file=sys.stderr)
         return 2
 
@@ -58,6 +60,7 @@ def run(settings: Settings) -> int:
     Raises:
         SceneError: the scene cannot be used.
         SettingsError: nor can the address, or the file to record into.
+        StoreError: nor can what was saved.
     """
     logging.basicConfig(
         stream=sys.stderr, level=settings.log_level.upper(), format="%(asctime)s %(levelname)s %(name)s: %(message)s"
@@ -66,19 +69,23 @@ def run(settings: Settings) -> int:
     if settings.tick_rate is not None:
         scene = dataclasses.replace(scene, tick_rate=settings.tick_rate)
     warm_up(scene)
-    with asyncio.Runner(loop_factory=_loop_factory()) as runner:
-        if settings.record is None:
-            return runner.run(Server(settings, Game(scene, limits=settings.limits)).serve())
-        with recorded(scene, settings.record) as world:
-            return runner.run(Server(settings, Game(scene, limits=settings.limits, world=world)).serve())
+    with asyncio.Runner(loop_factory=_loop_factory()) as runner, contextlib.ExitStack() as stack:
+        store = world = None
+        if settings.data is not None:
+            store = stack.enter_context(saved(scene, settings.data, power=settings.durability == "power"))
+            world = store.world
+        if settings.record is not None:
+            world = stack.enter_context(recorded(scene, settings.record, world))
+        return runner.run(Server(settings, Game(scene, limits=settings.limits, world=world), store).serve())
 
 
 class Server:
     """The parts and their lives: start, run, stop."""
 
-    def __init__(self, settings: Settings, game: Game) -> None:
+    def __init__(self, settings: Settings, game: Game, store: Store | None = None) -> None:
         self.settings = settings
         self.game = game
+        self.store = store
         self.faults = Faults()
         self.door = Door(
             settings.limits,
@@ -105,6 +112,8 @@ class Server:
         with _on_signals(loop, lambda name: self._end(name, 0)):
             host, port = await self._listen()
             rate = self.game.scene.tick_rate
+            if self.store is not None:
+                self.store.start(lambda: None)
             self.ticker = Ticker(rate, self.game.tick, self._broken, lambda ring: best_alarm(loop, ring))
             freeze()
             kind = type(loop).__module__.partition(".")[0]
@@ -133,6 +142,8 @@ class Server:
             return "draining"
         if self.ticker is None:
             return "starting"
+        if self.store is not None and self.store.trouble:
+            return f"cannot save: {self.store.trouble}"
         age = time.monotonic() - self.ticker.latest
         return f"the last tick began {age:.1f} s ago" if age > READY_S else ""
 
@@ -142,6 +153,7 @@ class Server:
         return {
             **self.game.stats(),
             **figures,
+            **({} if self.store is None else self.store.stats()),
             "connections": len(self.gateway.connections),
             "refused_at_door": dict(self.door.refused),
             "internal_errors": self.faults.total + figures.get("ticks_failed", 0),
@@ -180,8 +192,23 @@ class Server:
 
 
 @contextlib.contextmanager
-def recorded(scene: Scene, path: str) -> Iterator[RecordedWorld]:
-    """A world whose changes go into a new file, which is ended properly in the end.
+def saved(scene: Scene, directory: str, *, power: bool) -> Iterator[Store]:
+    """A store with the world of a directory, where all of it is saved in the end.
+
+    Raises:
+        StoreError: what is there cannot be used.
+    """
+    store = Store(directory, scene, power=power)
+    logger.info("%s: at tick %d, state hash %s", directory, *store.restored)
+    try:
+        yield store
+    finally:
+        store.close()
+
+
+@contextlib.contextmanager
+def recorded(scene: Scene, path: str, world: RecordedWorld | None = None) -> Iterator[RecordedWorld]:
+    """A world (by default a new one) whose changes go into a new file, which is ended properly in the end.
 
     Raises:
         SettingsError: the file exists or cannot be written.
@@ -192,8 +219,9 @@ def recorded(scene: Scene, path: str) -> Iterator[RecordedWorld]:
         raise SettingsError(f"record = {path!r}: exists already, and a recording is never overwritten") from None
     except OSError as error:
         raise SettingsError(f"record = {path!r}: cannot be written ({error.strerror or error})") from error
-    world = RecordedWorld(scene)
-    world.load_terrain()
+    if world is None:
+        world = RecordedWorld(scene)
+        world.load_terrain()
     try:
         world.record(file, lambda error: logger.error("recording into %s has ended: %s", path, error))
         yield world

@@ -2,7 +2,7 @@
 
 import struct
 import zlib
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, Protocol
 
 import msgpack
@@ -40,6 +40,22 @@ class Sink(Protocol):
 
     def flush(self) -> object:
         """Hands what was written to the system."""
+
+
+class Saves(Protocol):
+    """What a game needs to know of where its world is saved (`server.store`)."""
+
+    kept: Any
+    """What the game's `keep()` returned for the checkpoint that was loaded; None for a new world."""
+    notes: Sequence[tuple[int, Any]]
+    """What was noted since then, in order, each with the tick that came next."""
+    trouble: str
+    """Why nothing can be saved just now; empty if all is well. Commands are refused while it lasts."""
+
+    @property
+    def durable_tick(self) -> int:
+        """Verdicts on what was done in this tick and before may be told."""
+        ...
 
 
 class Pen:

@@ -44,6 +44,11 @@ class Settings:
     restart_s: float = setting(2.0, Kind(float, "when the server ends, clients come back after so long", "S", 0, 3600))
     log_level: str = setting("info", Kind(str, "what goes to stderr", choices=LOG_LEVELS))
     record: str | None = setting(None, Kind(str, "record every change of the world into a new file", "FILE"))
+    data: str | None = setting(None, Kind(str, "save the world there, and go on with the one that is there", "DIR"))
+    durability: str = setting(
+        "power",
+        Kind(str, "what a saved edit survives: the end of the process, or a power cut", choices=("process", "power")),
+    )
     limits: Limits = field(default_factory=Limits)
     origins: Mapping[str, str] = field(default_factory=dict, compare=False)
 

@@ -187,15 +187,13 @@ class World:
 
     def state_hash(self, entities: Iterable[int] | None = None) -> bytes:
         """16 bytes over the tick, all blocks and all entities (or just some, and then no blocks)."""
-        digest = hashlib.blake2b(struct.pack("<q", self._tick), digest_size=16)
         if entities is None:
-            entities = self._row_of
-            for index in sorted(self.blocks):
-                digest.update(struct.pack("<qqqQ", *index, self.blocks.digest(index)))
+            rows = list(self.blocks.rows.values())
+            return hash_of(self._tick, self.blocks.segments[rows], self.blocks.digests[rows], self.states())
+        nothing = np.zeros((0, 3), np.int64)
         states = self.rows(sorted(entities))[:, :STATES]
         states[:, FLAGS] &= FALLING
-        digest.update(states.astype("<i8").tobytes())
-        return digest.digest()
+        return hash_of(self._tick, nothing, nothing[:, 0].astype(np.uint64), states)
 
     # -- blocks --------------------------------------------------------------------------------------------
 
@@ -578,6 +576,18 @@ class World:
         """Wakes what stands on an entity that is about to go or to change."""
         box = self._box_at(int(self._entities[row, TEMPLATE]), self._entities[row, X : X + 3].tolist())
         self._kernel.wake_on(self._arrays, row, box[0], box[1], box[3], box[4], box[5])
+
+
+def hash_of(tick: int, segments: layout.Int64s, digests: npt.NDArray[np.uint64], states: layout.Int64s) -> bytes:
+    """The hash of a world from its parts: segments [n, 3] and their digests [n] in any order, states [n, 12] by id."""
+    order = np.lexsort((segments[:, 2], segments[:, 1], segments[:, 0]))
+    blocks = np.empty((len(order), 4), "<i8")
+    blocks[:, :3] = segments[order]
+    blocks[:, 3] = digests[order].view(np.int64)
+    digest = hashlib.blake2b(struct.pack("<q", tick), digest_size=16)
+    digest.update(blocks.tobytes())
+    digest.update(states.astype("<i8").tobytes())
+    return digest.digest()
 
 
 LISTS = (

@@ -1,0 +1,135 @@
+"""A world as it was at the end of a tick, taken while it goes on, and a world from what was taken."""
+
+import threading
+from collections.abc import Iterator, Mapping
+from typing import NamedTuple
+
+import numpy as np
+
+from server.recorder import RecordedWorld
+from shared import terrain
+from shared.blocks import Kinds, digest_of, pack, unpack
+from shared.checks import Cell
+from shared.layout import FALLING, FLAGS, ID
+from shared.scene import Scene
+from shared.world import STATES, World, hash_of
+
+Segment = tuple[int, int, int, bytes | None, int]
+"""Index of a loaded segment, its packed blocks (None: as the generator makes them), and their digest."""
+
+
+class Checkpoint(NamedTuple):
+    """All of a world at the end of a tick, ready for the disk."""
+
+    tick: int
+    next_id: int
+    states: bytes
+    """n * 12 int64, little-endian, ascending by id."""
+    hash: bytes
+    """`World.state_hash` at that tick."""
+    kept: bytes
+    """What the game wanted kept, in MessagePack."""
+    segments: list[Segment]
+    """Those that are not as they were in the checkpoint before,"""
+    gone: list[Cell]
+    """and those that were loaded then and are not any more."""
+
+
+class Copy:
+    """Takes a world at this instant; the blocks follow piece by piece.
+
+    What the kernel writes to is copied at once: a row of 128 bytes per entity. Of the segments only the digests are
+    copied at once; `pieces` copies and packs those that have changed, one after the other, in another thread. The world
+    may go on meanwhile, if only it says `touch` ahead of every change: then that segment is copied just before.
+
+    Args:
+        world: between two ticks.
+        kept: goes into the checkpoint as it is.
+    """
+
+    def __init__(self, world: World, kept: bytes) -> None:
+        blocks = world.blocks
+        self.tick, self._next_id, self._kept = world.tick, world.next_id, kept
+        self._entities = world.matrix.copy()
+        self._rows = dict(blocks.rows)
+        self._segments = blocks.segments[: blocks.count].copy()
+        self._digests = blocks.digests[: blocks.count].copy()
+        self.digests: dict[Cell, int] = {}
+        """Those of all segments, once the checkpoint is there."""
+        self._blocks = blocks
+        self._lock = threading.Lock()  # held for the copying of one segment at most, some 5 us
+        self._taken: dict[Cell, Kinds | None] = {}  # None: it has been fetched, nobody needs it any more
+
+    def touch(self, segment: Cell) -> None:
+        """The blocks of this segment are about to change."""
+        with self._lock:
+            if segment in self._rows and segment not in self._taken:
+                self._taken[segment] = self._blocks.segment(segment).copy()
+
+    def pieces(self, saved: Mapping[Cell, int]) -> Iterator[Checkpoint | None]:
+        """Does the work in pieces of a millisecond or so; None after each, and the checkpoint in the end.
+
+        Args:
+            saved: the digests of the segments in the checkpoint before.
+        """
+        states = self._entities[:, :STATES]
+        states = states[states[:, ID] != 0]
+        states = states[np.argsort(states[:, ID])]
+        states[:, FLAGS] &= FALLING
+        yield None
+        rows = list(self._rows.values())
+        self.digests = dict(zip(self._rows, self._digests[rows].tolist(), strict=True))
+        checked = hash_of(self.tick, self._segments[rows], self._digests[rows], states)
+        yield None
+        segments: list[Segment] = []
+        for cell, digest in self.digests.items():
+            if saved.get(cell) != digest:
+                segments.append((*cell, pack(self._fetch(cell)), digest))
+                yield None
+        gone = [cell for cell in saved if cell not in self.digests]
+        packed = states.astype("<i8", copy=False).tobytes()
+        yield Checkpoint(self.tick, self._next_id, packed, checked, self._kept, segments, gone)
+
+    def _fetch(self, cell: Cell) -> Kinds:
+        with self._lock:
+            kinds = self._taken.get(cell)
+            if kinds is None:
+                kinds = self._blocks.segment(cell).copy()
+            self._taken[cell] = None
+        return kinds
+
+
+def generated(scene: Scene, *, compiled: bool | None = None) -> tuple[RecordedWorld, Checkpoint]:
+    """A new world of a scene with all its terrain, and its checkpoint."""
+    world = RecordedWorld(scene, compiled=compiled)
+    world.load_terrain()
+    segments: list[Segment] = [(*cell, None, world.blocks.digest(cell)) for cell in world.blocks]
+    return world, Checkpoint(world.tick, world.next_id, b"", world.state_hash(), NOTHING, segments, [])
+
+
+def restored(scene: Scene, checkpoint: Checkpoint, *, compiled: bool | None = None) -> RecordedWorld:
+    """The world of a checkpoint that holds all segments.
+
+    Raises:
+        ValueError: what comes out is not what was saved.
+    """
+    loaded = {
+        (x, y, z): terrain.generate(scene.terrain, (x, y, z)) if packed is None else unpack(packed)
+        for x, y, z, packed, _ in checkpoint.segments
+    }
+    states = np.frombuffer(checkpoint.states, "<i8").astype(np.int64).reshape(-1, STATES)
+    digests = np.array([digest_of(kinds) for kinds in loaded.values()], np.uint64)
+    cells = np.array(list(loaded), np.int64).reshape(-1, 3)
+    if hash_of(checkpoint.tick, cells, digests, states) != checkpoint.hash:  # ahead of the kernel: it trusts its rows
+        raise ValueError(f"the world of tick {checkpoint.tick} is not the one that was saved")
+    world = RecordedWorld(scene, compiled=compiled)
+    for cell, kinds in loaded.items():
+        world.load_segment(cell, kinds)
+    world.put(states)
+    world.next_id = checkpoint.next_id
+    world.rebase(checkpoint.tick)
+    return world
+
+
+NOTHING = b"\xc0"
+"""MessagePack's nil."""
