@@ -10,8 +10,9 @@ with Client.connect("ws://localhost:8765", name="Ann") as client:
 """
 
 import time
+from collections.abc import Mapping
 from types import TracebackType
-from typing import Protocol
+from typing import Any, Protocol
 
 from client_sdk.core import Core
 from client_sdk.events import Event, Stats
@@ -114,6 +115,22 @@ class Client:
             RuntimeError: the client is not playing.
         """
         return self.core.edit(x, y, z, kind)
+
+    def command(self, name: str, data: Any = None) -> int:
+        """Asks the game's rules for something: what `name` and `data` mean is theirs.
+
+        Their word comes as an `Answered` event with the number that is returned here.
+
+        Raises:
+            RuntimeError: the client is not playing.
+            ValueError: the name or the data are too long (32 characters, 1,024 bytes), or no MessagePack.
+        """
+        return self.core.command(name, data)
+
+    @property
+    def shared(self) -> Mapping[str, Any]:
+        """The values that the game shares with all clients."""
+        return self.core.shared
 
     def set_input_delay(self, ticks: int) -> None:
         """Shows the effect of inputs so many ticks (0 to 3) after `set_input`; may change at any time.

@@ -9,6 +9,7 @@
 
 import math
 from collections import deque
+from typing import Any
 
 import numpy as np
 
@@ -18,6 +19,7 @@ from client_sdk.events import (
     Corrected,
     Diverged,
     Event,
+    Happened,
     Joined,
     Left,
     Resynchronised,
@@ -103,6 +105,8 @@ class Core:
         self._seen = 0.0
         self._newest = -1
         self.picture: Picture | None = None
+        self.shared: dict[str, Any] = {}
+        """The values that the game shares with all clients."""
         self._neighbours = neighbours
         self._delay = 0
         self._late = False
@@ -129,6 +133,26 @@ class Core:
     def lost(self, code: int, reason: str, now: float) -> None:
         """The connection is gone."""
         self._end(Left(code, reason))
+
+    def command(self, name: str, data: Any = None) -> int:
+        """Asks the game's rules for something, with the next tick; the number by which it is `Answered`.
+
+        Raises:
+            RuntimeError: the client has not joined.
+            ValueError: the name or the data are too long (32 characters, 1,024 bytes), or no MessagePack.
+        """
+        if self.state != "playing":
+            raise RuntimeError("command: the client has not joined")
+        assert self.prediction is not None
+        if not 0 < len(name) <= messages.NAME_MAX or name == edits.NAME:
+            raise ValueError(
+                f"command {name[:80]!r}: must be 1 to {messages.NAME_MAX} characters, and not {edits.NAME!r}"
+            )
+        payload = messages.pack_value(data)
+        self._number += 1
+        tick = self.prediction.predicted.tick + self._delay + 1
+        self._send(Command(self._number, tick, self._seen, name, payload))
+        return self._number
 
     def edit(self, x: int, y: int, z: int, kind: int) -> int:
         """Places (kind 1 to 255) or removes (0) a block with the next tick; the number by which it is `Answered`.
@@ -220,6 +244,11 @@ class Core:
                 self._terrain(message)
             case Welcome():
                 self._welcome(message)
+            case messages.Happened():
+                data = messages.unpack_value(message.payload)
+                self._events.append(Happened(message.tick, message.name, data))
+            case messages.Shared():
+                self.shared = message.values
             case Bye():
                 self._end(Left(message.code, message.reason, message.wait))
             case _:

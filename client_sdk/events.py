@@ -1,6 +1,7 @@
 """What happens to a client, as values: `poll()` gives them in order, a `match` statement tells them apart."""
 
 from dataclasses import dataclass, field
+from typing import Any
 
 from shared.checks import Cell
 from shared.scene import Scene
@@ -49,6 +50,15 @@ class Answered:
 
 
 @dataclass(frozen=True)
+class Happened:
+    """The game's rules tell something: what `name` and `data` mean is theirs."""
+
+    tick: int
+    name: str
+    data: Any
+
+
+@dataclass(frozen=True)
 class Diverged:
     """The two sides computed different worlds from the same inputs, or a copy is damaged: an alarm.
 
@@ -74,7 +84,7 @@ class SegmentLoaded:
     segment: Cell
 
 
-Event = Joined | Left | Corrected | Answered | Diverged | Resynchronised | SegmentLoaded
+Event = Joined | Left | Corrected | Answered | Happened | Diverged | Resynchronised | SegmentLoaded
 
 
 @dataclass

@@ -1,6 +1,9 @@
 """What to draw: the own entity (and templates shown so) as predicted, all others a moment ago, corrections smoothed."""
 
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 
@@ -16,12 +19,16 @@ from shared.units import BLOCK, SPEED
 
 @dataclass(frozen=True)
 class Figure:
-    """One entity as it is to be drawn: position in blocks, velocity in blocks/s, `template` by number in the scene."""
+    """One entity as it is to be drawn: position in blocks, velocity in blocks/s, `template` by number in the scene.
+
+    `attributes` is what the game's rules say of it ("name", for one).
+    """
 
     entity: int
     template: int
     position: Vec
     velocity: Vec
+    attributes: Mapping[str, Any] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -34,6 +41,7 @@ class View:
 
 
 NOTHING = View(0.0, None, [])
+NONE_SAID: Mapping[str, Any] = MappingProxyType({})
 
 
 class Picture:
@@ -71,7 +79,7 @@ class Picture:
             if entity == prediction.entity:
                 continue
             ahead = self._ahead(entity, tick, now) if state[TEMPLATE] in self._predicted else None
-            others.append(ahead or figure(state, place))
+            others.append(ahead or self._figure(state, place))
         return View(tick, self._ahead(prediction.entity, tick, now), others)
 
     def _ahead(self, entity: int, tick: float, now: float) -> Figure | None:
@@ -85,11 +93,11 @@ class Picture:
         old, new = np.array(before[X : X + 3]) / BLOCK, np.array(state[X : X + 3]) / BLOCK
         smoothing = self._smoothing.get(entity)
         place = old + (new - old) * share + (smoothing.offset(now) if smoothing else 0.0)
-        return figure(list(state), place.tolist())
+        return self._figure(state, place.tolist())
 
-
-def figure(state: list[int], place: list[float]) -> Figure:
-    """A state with the position to draw it at."""
-    x, y, z = place
-    vx, vy, vz = (part / SPEED for part in state[VX : VX + 3])
-    return Figure(state[ID], state[TEMPLATE], (x, y, z), (vx, vy, vz))
+    def _figure(self, state: Sequence[int], place: list[float]) -> Figure:
+        """A state with the position to draw it at."""
+        x, y, z = place
+        vx, vy, vz = (part / SPEED for part in state[VX : VX + 3])
+        said = self._prediction.attributes.get(state[ID], NONE_SAID)
+        return Figure(state[ID], state[TEMPLATE], (x, y, z), (vx, vy, vz), said)

@@ -17,6 +17,7 @@ pressed a key). No tolerance: the physics is exact, so a lone player is never co
 """
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -79,6 +80,8 @@ class Prediction:
         self.predicted = World(scene, compiled=compiled)
         self.truth = self.confirmed.states()
         """The states of the confirmed world, [n, 12], ascending by id. Not to be written to."""
+        self.attributes: dict[int, dict[str, Any]] = {}
+        """What the game's rules say of the entities that are seen."""
         self.begun = False
         self._inputs: Ring[Input] = Ring(HISTORY)
         self._states: Ring[Int64s] = Ring(HISTORY)
@@ -137,6 +140,8 @@ class Prediction:
                     self._early[part.segment].append(changes)
         if here:
             world.put(states)
+        for part in parts:
+            self.attributes.update((entity, said) for entity, said in part.attributes if entity in world)
         for segment in drops:
             self._early.pop(segment, None)
             if segment in world.blocks and not len(world.in_segment(segment)):
@@ -176,6 +181,7 @@ class Prediction:
             home = (x, y, z)
             if entity not in here and (home in whole or (home, entity) in gone):
                 self.confirmed.remove(entity)
+                self.attributes.pop(entity, None)
 
     # -- the guess -----------------------------------------------------------------------------------------
 

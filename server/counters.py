@@ -11,6 +11,7 @@ class Counters:
 
     joined: int = 0
     left: int = 0
+    resumed: int = 0
     refused: int = 0
     malformed: int = 0
     kicked: int = 0
@@ -26,6 +27,7 @@ class Counters:
     resyncs: int = 0
     closed: dict[int, int] = field(default_factory=dict)
     """Clients told to go, by close code."""
+    rules_failed: int = 0
 
     def add(self, queue: InputQueue) -> None:
         """Counts in how one player's inputs have fared."""

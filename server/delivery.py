@@ -44,6 +44,9 @@ class Delivery:
             self._counters.snapshots_skipped += 1
             return
         session.sent_at = now
+        for message in session.outbox:
+            session.send(message)
+        session.outbox.clear()
         self._send_snapshot(session, max(window - outstanding, LEAST_BYTES))
         if outstanding == 0 and session.probe is None:
             session.probe = (self._world.tick, now, session.snapshot_bytes)
@@ -82,10 +85,11 @@ class Delivery:
             self.forget(session)
         drops = np.array(sight.drops, "<i4").tobytes() if sight.drops else b""
         parts = sight.take(self._log, tick, room)
-        verdicts = b""
-        if session.verdicts:
-            verdicts = np.array(session.verdicts[: messages.VERDICTS_MAX], VERDICT).tobytes()
-            del session.verdicts[: messages.VERDICTS_MAX]
+        verdicts, player = b"", session.player
+        assert player is not None
+        if player.verdicts:
+            verdicts = np.array(player.verdicts[: messages.VERDICTS_MAX], VERDICT).tobytes()
+            del player.verdicts[: messages.VERDICTS_MAX]
         first = tick - len(inputs.fates) + 1
         header = (tick, inputs.newest, inputs.margins.tobytes(), first, bytes(inputs.fates), verdicts, drops)
         message = messages.join_snapshot(header, parts)

@@ -9,7 +9,9 @@ through.
 """
 
 import dataclasses
-from collections.abc import Iterator
+import hashlib
+import secrets
+from collections.abc import Callable, Iterator
 from itertools import count
 from typing import Any
 
@@ -17,9 +19,10 @@ from server.counters import Counters
 from server.delivery import Delivery
 from server.limits import Limits
 from server.recorder import RecordedWorld
-from server.replication import ChangeLog
 from server.rewind import Past, Rewind
-from server.session import Link, Session
+from server.rules import Rules
+from server.session import Link, Player, Session
+from server.stage import Stage
 from shared import edits, messages
 from shared.checks import Vec
 from shared.inputs import Input
@@ -54,6 +57,9 @@ class Game:
         limits: bounds.
         compiled: as for `World`.
         world: to be played in, with its blocks; by default a new one.
+        rules: what happens beyond moving and editing.
+        authenticate: gives the subject of the token that a client shows; a `ValueError` of it refuses the client,
+            with its text. None: whoever comes may play.
     """
 
     def __init__(
@@ -63,6 +69,8 @@ class Game:
         limits: Limits | None = None,
         compiled: bool | None = None,
         world: RecordedWorld | None = None,
+        rules: Rules | None = None,
+        authenticate: Callable[[str], str] | None = None,
     ) -> None:
         self.scene = scene
         self.limits = limits or Limits()
@@ -70,13 +78,17 @@ class Game:
             world = RecordedWorld(scene, compiled=compiled)
             world.load_terrain()
         self.world = world
-        self.log = ChangeLog(self.world)
         self.rewind = Rewind(self.world)
         self.counters = Counters()
+        self.stage = Stage(self.world, self.rewind, self.counters, rules or Rules())
+        self.log = self.stage.log
         self.delivery = Delivery(self.world, self.log, self.limits, self.counters)
         self.sessions: list[Session] = []
+        self.players: dict[int, Player] = self.stage.players
+        """By entity, in the order in which they joined; also those whose connection is lost, for a while."""
+        self._authenticate = authenticate
         self._numbers = count(1)
-        self._leaving: list[Session] = []
+        self._leaving: list[Player] = []
         self._respawn: list[int] = []
         self._deadline: float | None = None
         self._spawned = 0
@@ -116,7 +128,7 @@ class Game:
         elif isinstance(message, Ping):
             tick = self.world.tick + 1 - self._ticks_left(now)
             session.send(encode(Pong(message.sent, tick)))
-        elif isinstance(message, Hello) and not session.entity and not session.joining:
+        elif isinstance(message, Hello) and not session.entity and session.hello is None:
             self._hello(session, message, now)
         elif isinstance(message, Command) and session.entity:
             self._file_command(session, message)
@@ -126,6 +138,7 @@ class Game:
                 self.counters.resyncs += 1
                 self.delivery.forget(session)
         elif isinstance(message, Bye):
+            self._leave_for_good(session)
             session.close(messages.GOING_AWAY, "goodbye")
         else:
             self._kick(session, messages.MALFORMED, f"{type(message).__name__} at this point")
@@ -135,7 +148,12 @@ class Game:
         session.closed = True
         if session in self.sessions:
             self.sessions.remove(session)
-            self._leaving.append(session)
+        player = session.player
+        if player is not None and player.session is session:
+            if session.acked >= 0:
+                player.heard()
+            player.session = None
+            player.away_until = now + self.limits.resume_s
 
     def shut_down(self, reason: str, wait: float) -> None:
         """Tells every client, with the seconds after which to come back, and closes the connections."""
@@ -161,10 +179,11 @@ class Game:
     def tick(self, deadline: float, now: float) -> None:
         """One tick. `deadline`: the time it was due, by the same clock as `now`; it ends tick T at `deadline`."""
         self._deadline = deadline
-        self._leave()
+        self._leave(now)
         self._join()
         self._revive()
         self._command()
+        self.stage.act()
         inputs = self._take_inputs()
         self.world.step(inputs)
         self.log.record()
@@ -173,31 +192,53 @@ class Game:
         self._send(now)
         self._check_clocks(now)
 
-    def _leave(self) -> None:
-        for session in self._leaving:
-            if session.entity:
+    def _leave(self, now: float) -> None:
+        self._leaving += [player for player in self.players.values() if now >= player.away_until]
+        for player in self._leaving:
+            if self.players.pop(player.entity, None) is not None:
                 self.counters.left += 1
-                self.world.remove(session.entity)
-                self.log.note_removal(session.entity)
-            self.counters.add(session.inputs)
+                self.counters.add(player.inputs)
+                self.stage.left(player)
         self._leaving.clear()
 
     def _join(self) -> None:
-        joining = [session for session in self.sessions if session.joining and not session.closed]
+        joining = [session for session in self.sessions if session.hello is not None and not session.closed]
         for session in joining[: self.limits.joins_per_tick]:
-            session.joining = False
-            entity = self._spawn()
-            if entity is None:
-                self._refuse(session, messages.FULL, "no room to spawn")
-                continue
-            session.entity = entity
-            self.counters.joined += 1
-            welcome = Welcome(messages.VERSION, self.world.tick, entity, self._rules)
-            session.send(encode(welcome))
+            assert session.hello is not None
+            player = self._returning(session, session.hello)
+            if player is None:
+                entity = self._spawn()
+                if entity is None:
+                    self._refuse(session, messages.FULL, "no room to spawn")
+                    continue
+                player = self.players[entity] = Player(entity, session.hello.name, session.subject)
+                self.counters.joined += 1
+                session.seat(player)
+                self.stage.joined(player)
+            else:
+                self.counters.resumed += 1
+                session.seat(player)
+            token = secrets.token_bytes(messages.RESUME_BYTES)
+            player.tokens.append(_digest(token))
+            session.send(encode(Welcome(messages.VERSION, self.world.tick, player.entity, self._rules, token)))
+
+    def _returning(self, session: Session, hello: Hello) -> Player | None:
+        """The player that this is, if it was here before and still is; a connection that it still has is closed."""
+        wanted = _digest(hello.resume)
+        for player in self.players.values() if hello.resume else ():
+            old = player.session
+            if old is not None and old.acked >= 0:
+                player.heard()
+            if wanted in player.tokens and player.subject == session.subject:
+                del player.tokens[player.tokens.index(wanted) + 1 :]
+                if old is not None and not old.closed:
+                    self._end(old, messages.TAKEN_OVER, "the player goes on over another connection")
+                return player
+        return None
 
     def _revive(self) -> None:
         for entity in self._respawn:
-            if entity in self.world:
+            if entity in self.world and not self.stage.fell_out(entity):
                 self._to_spawn(entity)
         self._respawn.clear()
 
@@ -205,31 +246,40 @@ class Game:
         """What players do at the start of this tick, in the order in which they joined."""
         tick = self.world.tick + 1
         rate = self.limits.edits_per_s
-        for session in self.sessions:
-            if session.edits_left != 2 * rate:
-                session.edits_left = min(session.edits_left + rate / self.scene.tick_rate, 2 * rate)
-            while session.commands and session.commands[0].tick <= tick and not session.closed:
-                command = session.commands.popleft()
-                session.verdicts.append((command.number, self._carry_out(session, command)))
+        for player in tuple(self.players.values()):
+            if player.edits_left != 2 * rate:
+                player.edits_left = min(player.edits_left + rate / self.scene.tick_rate, 2 * rate)
+            while player.commands and player.commands[0].tick <= tick:
+                if player.session is not None and player.session.closed:
+                    break
+                command = player.commands.popleft()
+                player.settle(command.number, self._carry_out(player, command))
 
-    def _carry_out(self, session: Session, command: Command) -> int:
-        edit = edits.unpack(command.payload) if command.name == edits.NAME else None
+    def _carry_out(self, player: Player, command: Command) -> int:
+        if command.name != edits.NAME:
+            return self.stage.command(player, command)
+        edit = edits.unpack(command.payload)
         if edit is None:
             return messages.INVALID
-        if session.edits_left < 1:
+        if player.edits_left < 1:
             return messages.TOO_MANY
-        session.edits_left -= 1
-        verdict = edits.apply(self.world, session.entity, edit)
+        player.edits_left -= 1
+        if not self.stage.may_edit(player, edit):
+            return messages.FORBIDDEN
+        verdict = edits.apply(self.world, player.entity, edit)
         if verdict == messages.DONE:
             self.log.note_edit(*edit[:3])
         return verdict
 
     def _take_inputs(self) -> dict[int, Input]:
         tick = self.world.tick + 1
-        return {session.entity: session.inputs.take(tick) for session in self.sessions if session.entity}
+        inputs = {entity: player.inputs.take(tick) for entity, player in self.players.items()}
+        inputs.update(self.stage.steered)
+        self.stage.steered.clear()
+        return inputs
 
     def _fell_out(self) -> None:
-        """Who is below the floor comes back at a spawn, in the next tick."""
+        """Who is below the floor comes back at a spawn, in the next tick, unless the rules have other plans."""
         self._respawn = self.world.fell
         self.counters.fell_out += len(self._respawn)
 
@@ -238,7 +288,9 @@ class Game:
             if session.allowance < 0:
                 session.allowance = min(session.allowance + self.limits.messages_per_tick, 0.0)
             if session.entity and not session.closed:
+                self.stage.tell(session)
                 self.delivery.serve(session, now)
+        self.stage.told()
 
     def _check_clocks(self, now: float) -> None:
         for session in tuple(self.sessions):
@@ -247,6 +299,8 @@ class Game:
             if not session.entity:
                 if now - session.opened > self.limits.hello_s:
                     self._kick(session, messages.NO_HELLO, f"no hello within {self.limits.hello_s:g} s")
+            elif len(session.outbox) > self.limits.outbox_max:
+                self._kick(session, messages.TOO_SLOW, f"{len(session.outbox)} messages behind")
             elif now - session.heard > self.limits.silence_s:
                 self._kick(session, messages.TOO_SLOW, f"nothing heard for {self.limits.silence_s:g} s")
             elif now - session.sent_at > self.limits.stalled_s:
@@ -261,13 +315,17 @@ class Game:
         return 1.0 - (now - self._deadline) * self.scene.tick_rate
 
     def _file_command(self, session: Session, command: Command) -> None:
-        if command.number <= session.command:
+        player = session.player
+        assert player is not None
+        if command.number <= player.command:
+            if command.number in player.settled:  # asked again after a lost connection
+                player.verdicts.append((command.number, player.settled[command.number]))
             return
-        session.command = command.number
-        if len(session.commands) >= self.limits.commands_waiting_max or command.tick > self.world.tick + AHEAD_MAX:
-            session.verdicts.append((command.number, messages.TOO_MANY))
+        player.command = command.number
+        if len(player.commands) >= self.limits.commands_waiting_max or command.tick > self.world.tick + AHEAD_MAX:
+            player.settle(command.number, messages.TOO_MANY)
         else:
-            session.commands.append(command)
+            player.commands.append(command)
 
     def _hello(self, session: Session, hello: Hello, now: float) -> None:
         if hello.version != messages.VERSION:
@@ -283,9 +341,14 @@ class Game:
         if len(hello.name) > self.limits.name_max:
             self._refuse(session, messages.MALFORMED, f"a name longer than {self.limits.name_max} characters")
             return
-        session.name = hello.name
+        if self._authenticate is not None:
+            try:
+                session.subject = self._authenticate(hello.token)
+            except ValueError as error:
+                self._refuse(session, messages.UNAUTHORISED, str(error))
+                return
         session.pacing.answered(now - session.opened, 0, now)  # of a path that was empty
-        session.joining = True
+        session.hello = hello._replace(token="")
 
     def _refuse(self, session: Session, code: int, reason: str) -> None:
         self.counters.refused += 1
@@ -293,7 +356,15 @@ class Game:
 
     def _kick(self, session: Session, code: int, reason: str) -> None:
         self.counters.kicked += 1
+        if code != messages.TOO_SLOW:  # that is the network's fault
+            self._leave_for_good(session)
         self._end(session, code, reason)
+
+    def _leave_for_good(self, session: Session) -> None:
+        """The player of this connection is not kept for a return."""
+        if session.player is not None and session.player.session is session:
+            session.player.session = None
+            self._leaving.append(session.player)
 
     def _end(self, session: Session, code: int, reason: str) -> None:
         reason = reason[: messages.REASON_MAX]
@@ -335,13 +406,19 @@ class Game:
     def stats(self) -> dict[str, Any]:
         """Counters, with those of the clients that are connected."""
         totals = dataclasses.replace(self.counters)
-        for session in self.sessions:
-            totals.add(session.inputs)
+        for player in self.players.values():
+            totals.add(player.inputs)
         return dataclasses.asdict(totals) | {
             "tick": self.world.tick,
             "tick_rate": self.scene.tick_rate,
             "clients": sum(session.entity > 0 for session in self.sessions),
+            "players": len(self.players),
             "entities": len(self.world),
             "entities_awake": self.world.awake_count,
             "segments": len(self.world.blocks.rows),
         }
+
+
+def _digest(token: bytes) -> bytes:
+    """What is kept of a token: enough to know it again, not enough to show it."""
+    return hashlib.sha256(token).digest()

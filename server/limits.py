@@ -31,6 +31,9 @@ class Limits:
     stalled_s: float = setting(
         10.0, Kind(float, "a player that took no snapshot for so long is closed", "S", 0.1, HOUR_S)
     )
+    resume_s: float = setting(
+        15.0, Kind(float, "a player whose connection is lost keeps the entity for so long", "S", 0.0, HOUR_S)
+    )
     message_bytes_max: int = setting(
         CLIENT_MESSAGE_MAX, Kind(int, "longest message of a client, in bytes", "BYTES", 512, CLIENT_MESSAGE_MAX)
     )
@@ -44,6 +47,8 @@ class Limits:
     name_max: int = setting(NAME_MAX, Kind(int, "longest name of a player, in characters", "N", 1, NAME_MAX))
     joins_per_tick: int = 8
     """More wait for the next tick: a spawn costs up to a millisecond."""
+    outbox_max: int = 1024
+    """A client that is so many of the rules' messages behind is closed."""
     first_bytes: int = 4 * 1024
     """So much may be on its way to a client of which nothing is known yet."""
     terrain_chunk_bytes: int = 1024

@@ -7,6 +7,7 @@ ticks behind, or has just begun to see the segment, gets a keyframe. Nothing is 
 
 from collections import defaultdict
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 
@@ -32,9 +33,10 @@ class _Tick:
         self.gone: dict[Cell, list[int]] = defaultdict(list)
         self.edited: dict[Cell, set[int]] = defaultdict(set)  # block offsets by segment
         self.acted: set[int] = set()  # ids that the rules placed or threw
+        self.said: dict[Cell, set[int]] = defaultdict(set)  # ids whose attributes are news in the segment
 
     def segments(self) -> set[Cell]:
-        return self.changed.keys() | self.gone.keys() | self.edited.keys()
+        return self.changed.keys() | self.gone.keys() | self.edited.keys() | self.said.keys()
 
 
 class _Parts(dict[Cell, bytes]):
@@ -49,10 +51,16 @@ class _Parts(dict[Cell, bytes]):
 
 
 class ChangeLog:
-    """The changes of one world. Record each tick once, after its step; then ask for parts."""
+    """The changes of one world. Record each tick once, after its step; then ask for parts.
 
-    def __init__(self, world: World) -> None:
+    Args:
+        attributes: what the game's rules say of entities, by id; whoever changes it calls `note_attributes`.
+    """
+
+    def __init__(self, world: World, attributes: Mapping[int, Mapping[str, Any]] | None = None) -> None:
         self._world = world
+        self._attributes = {} if attributes is None else attributes
+        self._said: set[int] = set()
         self._ticks: Ring[_Tick] = Ring(HISTORY)
         self._now = _Tick()
         self._home: dict[int, Cell] = {}
@@ -73,6 +81,10 @@ class ChangeLog:
     def note_act(self, entity: int) -> None:
         """The rules have placed or thrown an entity, ahead of the coming step."""
         self._now.acted.add(entity)
+
+    def note_attributes(self, entity: int) -> None:
+        """The attributes of an entity have changed, ahead of the coming step."""
+        self._said.add(entity)
 
     def note_removal(self, entity: int) -> None:
         """An entity has been removed, ahead of the coming step."""
@@ -104,6 +116,11 @@ class ChangeLog:
                     if home is not None:
                         now.gone[home].append(entity)
                     homes[entity] = segment
+                    if entity in self._attributes:
+                        now.said[segment].add(entity)
+        for entity in self._said & homes.keys():
+            now.said[homes[entity]].add(entity)
+        self._said.clear()
         self._ticks.put(self._world.tick, now)
         self._now = _Tick()
         self._parts.clear()
@@ -147,9 +164,11 @@ class ChangeLog:
 
     def _keyframe(self, segment: Cell) -> bytes:
         if segment in self._world.blocks:
-            return encode_part(segment, KEYFRAME, self._world.in_segment(segment))
-        strays = [entity for entity, home in self._home.items() if home == segment]
-        return encode_part(segment, KEYFRAME, self._world.rows(sorted(strays)))
+            rows = self._world.in_segment(segment)
+        else:
+            strays = [entity for entity, home in self._home.items() if home == segment]
+            rows = self._world.rows(sorted(strays))
+        return encode_part(segment, KEYFRAME, rows, attributes=self._of(rows[:, ID].tolist()))
 
     def _changes(self, segment: Cell, since: int) -> bytes:
         ticks = self._since(since)
@@ -159,7 +178,17 @@ class ChangeLog:
         due = (self._world.tick + hash(segment)) % CHECK_TICKS == 0 and segment in self._world.blocks
         check = checksum(self._world, segment) if due else 0
         kinds = self._kinds(segment, sorted(edited))
-        return join_part(segment, since, self._rows(segment, since, ticks), sorted(gone), kinds, check)
+        said = {entity for tick in ticks for entity in tick.said.get(segment, ()) if self._home.get(entity) == segment}
+        rows = self._rows(segment, since, ticks)
+        return join_part(segment, since, rows, sorted(gone), kinds, check, self._of(sorted(said)))
+
+    def _of(self, entities: list[int]) -> list[Any]:
+        """The attributes of these entities, for the wire."""
+        if not self._attributes:
+            return []
+        return [
+            part for entity in entities if (all_ := self._attributes.get(entity)) is not None for part in (entity, all_)
+        ]
 
     def _rows(self, segment: Cell, since: int, ticks: list[_Tick]) -> bytes:
         """What changed and is still there, packed."""

@@ -1,4 +1,4 @@
-"""One client as the server knows it: its inputs and their fates on one side, what it has been sent on the other."""
+"""One client as the server knows it: a `Player`, who may come back, and a `Session`, the connection of the moment."""
 
 import math
 import struct
@@ -24,10 +24,12 @@ from shared.messages import (
     REPEATS_MAX,
     USED,
     Command,
+    Hello,
     Inputs,
 )
 
 INPUT_ROW = struct.Struct("<bbB")
+SETTLED_MAX = 128
 assert sys.byteorder == "little", "margins lie in memory as they go over the wire"
 
 
@@ -122,20 +124,64 @@ class InputQueue:
         self.fates.clear()
 
 
+class Player:
+    """Somebody who plays: stays while the entity stays, whatever becomes of the connection.
+
+    Args:
+        entity: the player's own.
+        name: what it calls itself.
+        subject: whose token it showed; empty where none is asked for.
+    """
+
+    def __init__(self, entity: int, name: str = "", subject: str = "") -> None:
+        self.entity = entity
+        self.name = name
+        self.subject = subject
+        self.inputs = InputQueue()
+        self.commands: deque[Command] = deque()
+        """Those that wait for their tick."""
+        self.command = -1
+        """The highest number of a command so far."""
+        self.verdicts: list[tuple[int, int]] = []
+        """Number and verdict of commands, to be told."""
+        self.settled: dict[int, int] = {}
+        """The latest verdicts: who was cut off before hearing one asks again, and is told the same."""
+        self.edits_left = math.inf
+        self.tokens: list[bytes] = []
+        """Digests of the tokens with which to come back: the newest, and the one before until that has been heard."""
+        self.away_until = math.inf
+        """While there is no connection: when the entity goes."""
+        self.session: Session | None = None
+
+    def heard(self) -> None:
+        """The client has got its newest token: it may throw away the one before, and so is that one worth nothing."""
+        del self.tokens[:-1]
+
+    def settle(self, number: int, verdict: int) -> None:
+        """A command has been carried out, or not."""
+        self.verdicts.append((number, verdict))
+        self.settled[number] = verdict
+        if len(self.settled) > SETTLED_MAX:
+            del self.settled[next(iter(self.settled))]
+
+
 class Session:
     """One connection, from the handshake to its end."""
 
     def __init__(self, number: int, link: Link, now: float) -> None:
         self.number = number
         self.link = link
-        self.name = ""
+        self.player: Player | None = None
         self.entity = 0
         """The player's entity; 0 before the client has joined."""
+        self.inputs = InputQueue()
+        """The player's."""
+        self.hello: Hello | None = None
+        """With which it waits to join."""
+        self.subject = ""
         self.opened = self.heard = self.sent_at = now
         self.allowance = 0.0
-        self.joining = False
         self.closed = False
-        self.inputs = InputQueue()
         self.acked = -1
         # What it has been sent:
         self.tick = -1
@@ -144,16 +190,21 @@ class Session:
         self.terrain_due: deque[Cell] = deque()
         self.terrain_now: tuple[Cell, bytes, int] | None = None
         """The packed segment that is being sent, and how much of it has been."""
-        self.commands: deque[Command] = deque()
-        self.command = -1
-        """The highest number of a command so far."""
+        self.outbox: list[bytes] = []
+        """Messages of the rules that go ahead of the next snapshot."""
+        self.shared = 0
+        """The version of the game's shared values that it has been sent."""
         self.resynced_at = now
-        self.verdicts: list[tuple[int, int]] = []
-        self.edits_left = math.inf
         self.pacing = Pacing()
         self.probe: tuple[int, float, int] | None = None
         """A snapshot before which nothing was on the way: its tick, when it was sent, its bytes."""
         self.skipped = 0
+
+    def seat(self, player: Player) -> None:
+        """This connection is the player's from now on."""
+        self.player, self.entity, self.inputs = player, player.entity, player.inputs
+        player.session, player.away_until = self, math.inf
+        self.hello = None
 
     def send(self, message: bytes) -> None:
         """Hands a message to the link."""

@@ -6,7 +6,7 @@ and Python itself is quicker the second time. So a scratch client does everythin
 
 from server.game import Game
 from shared import edits, messages
-from shared.messages import Command, Hello, Inputs, Message, Ping, Resync, encode
+from shared.messages import Bye, Command, Hello, Inputs, Message, Ping, Resync, encode
 from shared.scene import Scene
 from shared.units import SEGMENT
 
@@ -62,6 +62,5 @@ def warm_up(scene: Scene) -> None:
     tick()
     tick()
     game.stats()
-    for session in sessions:
-        game.lost(session, now)
+    say(Bye(messages.GOING_AWAY, "", -1.0))
     tick()

@@ -4,12 +4,14 @@ A message is one binary WebSocket message: a MessagePack array `[kind, field, ..
 travels as packed little-endian records in a MessagePack `bin`.
 
     client -> server                                     server -> client
-      1 Hello    version scene name                        17 Welcome   version tick entity scene
+      1 Hello    version scene name token resume           17 Welcome   version tick entity scene resume
       2 Inputs   first acked rows                          18 Snapshot  tick newest margins first fates verdicts
       3 Ping     sent                                                   drops segment*
       4 Bye      code reason wait                          19 Terrain   x y z offset total chunk
       5 Command  number tick seen name payload             20 Pong      sent tick
-      6 Resync                                              4 Bye       code reason wait
+      6 Resync                                             21 Happened  tick name payload
+                                                           22 Shared    values
+                                                            4 Bye       code reason wait
 
     Inputs.rows    n * [i8 move_x, i8 move_y, u8 buttons], for the ticks first, first + 1, ...
     Snapshot       the state at the end of `tick`; how early the client's inputs came (margins, n * i16 in 1/256
@@ -19,6 +21,10 @@ travels as packed little-endian records in a MessagePack `bin`.
     Terrain        a part of a packed segment (`shared.blocks.pack`), which is complete with byte `total`.
     Command        something to do at the start of `tick`; `seen` is the tick at which the client drew the others.
     Resync         the client has lost track: everything it sees, anew.
+    Hello.token    proves who the client is, where the server asks for it. Hello.resume is the one of the latest
+                   `Welcome`, to go on as the player that one was about.
+    Happened       something that the game's rules tell, once. Its payload is MessagePack, as a command's.
+    Shared         values of the game that all clients know, by name: a score, the time left. All of them, each time.
     Pong.tick      the server's time in ticks when it answered: 17.25 is a quarter of a tick after tick 17.
 
 `decode(any bytes)` gives a message whose every field has been checked, or raises `ProtocolError`.
@@ -49,6 +55,8 @@ VERDICTS_MAX = 128
 COMMAND_MAX = (1 << 32) - 1
 PAYLOAD_MAX = 1024
 SEGMENTS_MAX = 1024
+TOKEN_MAX = 2048
+RESUME_BYTES = 16
 LIST_MAX = 8 * 1024
 CLIENT_LIST_MAX = 8
 TABLE_MAX = 64
@@ -69,13 +77,21 @@ MARGIN_ONE = 256
 MARGIN_REFUSED = -(1 << 15)
 """Stands for the margin of an input that was refused."""
 
-DONE, OVERLAPS, OUT_OF_REACH, TOO_MANY, INVALID, FORBIDDEN = range(6)
+DONE, OVERLAPS, OUT_OF_REACH, TOO_MANY, INVALID, FORBIDDEN, FAILED = range(7)
 """The verdict on a command."""
-VERDICT_TEXTS = ("done", "an entity is in the way", "out of reach", "too many", "not possible there", "not allowed")
+VERDICT_TEXTS = (
+    "done",
+    "an entity is in the way",
+    "out of reach",
+    "too many",
+    "not possible there",
+    "not allowed",
+    "the server failed",
+)
 
 # Close codes.
 GOING_AWAY, PROTOCOL, TEXT, TOO_BIG, INTERNAL = 1001, 1002, 1003, 1009, 1011
-WRONG_VERSION, WRONG_SCENE, MALFORMED, FULL, TOO_SLOW, NO_HELLO = range(4001, 4007)
+WRONG_VERSION, WRONG_SCENE, MALFORMED, FULL, TOO_SLOW, NO_HELLO, TAKEN_OVER, UNAUTHORISED = range(4001, 4009)
 
 
 class ProtocolError(ValueError):
@@ -88,6 +104,8 @@ class Hello(NamedTuple):
     version: int
     scene: dict[str, bytes]
     name: str
+    token: str = ""
+    resume: bytes = b""
 
 
 class Inputs(NamedTuple):
@@ -133,6 +151,7 @@ class Welcome(NamedTuple):
     tick: int
     entity: int
     scene: dict[str, Any]
+    resume: bytes = b""
 
 
 class Snapshot(NamedTuple):
@@ -169,7 +188,21 @@ class Pong(NamedTuple):
     tick: float
 
 
-Message = Hello | Inputs | Ping | Bye | Command | Resync | Welcome | Snapshot | Terrain | Pong
+class Happened(NamedTuple):
+    """The game's rules tell something, at the end of `tick`."""
+
+    tick: int
+    name: str
+    payload: bytes
+
+
+class Shared(NamedTuple):
+    """The values that the game shares with all clients, by name."""
+
+    values: dict[str, Any]
+
+
+Message = Hello | Inputs | Ping | Bye | Command | Resync | Welcome | Snapshot | Terrain | Pong | Happened | Shared
 Check = Callable[[Any], bool]
 
 
@@ -189,6 +222,14 @@ def _finite(value: Any) -> bool:
     return type(value) in (int, float) and math.isfinite(value)
 
 
+def _named(value: Any) -> bool:
+    return type(value) is dict and all(type(name) is str for name in value)
+
+
+def _resume(value: Any) -> bool:
+    return type(value) is bytes and len(value) in (0, RESUME_BYTES)
+
+
 def _digests(value: Any) -> bool:
     return (
         type(value) is dict
@@ -203,7 +244,7 @@ _rows = _bytes(INPUT_ROWS_MAX * INPUT_ROW_BYTES, INPUT_ROW_BYTES)
 _segment = _whole(-(1 << 23), (1 << 23) - 1)
 
 KINDS: dict[int, tuple[type[Any], tuple[Check, ...]]] = {
-    1: (Hello, (_whole(0, 1 << 31), _digests, _text(NAME_MAX))),
+    1: (Hello, (_whole(0, 1 << 31), _digests, _text(NAME_MAX), _text(TOKEN_MAX), _resume)),
     2: (
         Inputs,
         (_first, _tick, _rows),
@@ -214,7 +255,7 @@ KINDS: dict[int, tuple[type[Any], tuple[Check, ...]]] = {
     6: (Resync, ()),
     17: (
         Welcome,
-        (_whole(0, 1 << 31), _tick, _whole(1, ENTITY_MAX), lambda value: type(value) is dict),
+        (_whole(0, 1 << 31), _tick, _whole(1, ENTITY_MAX), lambda value: type(value) is dict, _resume),
     ),
     18: (
         Snapshot,
@@ -230,9 +271,11 @@ KINDS: dict[int, tuple[type[Any], tuple[Check, ...]]] = {
     ),
     19: (Terrain, (_segment, _segment, _segment, _whole(0, PACKED_MAX), _whole(1, PACKED_MAX), _bytes(PACKED_MAX))),
     20: (Pong, (_finite, _finite)),
+    21: (Happened, (_tick, _text(NAME_MAX), _bytes(PAYLOAD_MAX))),
+    22: (Shared, (_named,)),
 }
 CLIENT_KINDS = frozenset({1, 2, 3, 4, 5, 6})
-SERVER_KINDS = frozenset({4, 17, 18, 19, 20})
+SERVER_KINDS = frozenset({4, 17, 18, 19, 20, 21, 22})
 _KIND_OF = {kind: number for number, (kind, _) in KINDS.items()}
 _SNAPSHOT = _KIND_OF[Snapshot]
 _INPUTS_HEAD = bytes((0x94, _KIND_OF[Inputs]))
@@ -255,6 +298,34 @@ def join_snapshot(header: tuple[int, int, bytes, int, bytes, bytes, bytes], segm
 def shown(value: Any) -> str:
     """A peer's value in the text of an error: short, and not opened if it is nested (it may be so a thousand deep)."""
     return type(value).__name__ if isinstance(value, list | dict) else str(value)[:40]
+
+
+def pack_value(value: Any) -> bytes:
+    """A small MessagePack value, as the payload of a command or of `Happened`.
+
+    Raises:
+        ValueError: it is none, or longer than `PAYLOAD_MAX` bytes.
+    """
+    try:
+        payload: bytes = msgpack.packb(value)
+        unpack_value(payload)
+    except (TypeError, ValueError, OverflowError, RecursionError) as error:
+        raise ValueError(f"{str(value)[:80]}: not a MessagePack value ({error})") from error
+    if len(payload) > PAYLOAD_MAX:
+        raise ValueError(f"a value of {len(payload)} bytes: longer than {PAYLOAD_MAX}")
+    return payload
+
+
+def unpack_value(payload: bytes) -> Any:
+    """The reverse of `pack_value`.
+
+    Raises:
+        ProtocolError: the bytes are not MessagePack.
+    """
+    try:
+        return msgpack.unpackb(payload, max_array_len=PAYLOAD_MAX, max_map_len=TABLE_MAX)
+    except Exception as error:  # msgpack raises some ten kinds for bytes that are not MessagePack
+        raise ProtocolError(f"payload: not MessagePack ({type(error).__name__})") from error
 
 
 def decode(data: bytes, kinds: frozenset[int], longest: int, lists: int = LIST_MAX) -> Message:

@@ -4,7 +4,7 @@ import functools
 import hashlib
 import tomllib
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -185,6 +185,22 @@ class Scene:
     def index_of(self) -> dict[str, int]:
         """Template names to their numbers."""
         return {template.name: i for i, template in enumerate(self.templates)}
+
+    def with_template(self, name: str, like: str | None = None, **changes: Any) -> "Scene":
+        """The same scene with one template more.
+
+        Args:
+            like: the template to begin with; None: that of players.
+            changes: what is different, by the field's name.
+
+        Raises:
+            SceneError: there is no template to begin with, a field is unknown or out of range, or the name is taken.
+        """
+        base = like or self.player
+        if base not in self.index_of:
+            raise SceneError(f"like = {base!r}: no such template (there are {', '.join(self.index_of)})")
+        entry = {f.name: getattr(self.templates[self.index_of[base]], f.name) for f in fields(Template)}
+        return replace(self, templates=(*self.templates, _template({**entry, **changes, "name": name})))
 
     def segments(self) -> list[Cell]:
         """The index of every segment of the world, in ascending order of z, y, x."""

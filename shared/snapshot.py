@@ -1,6 +1,6 @@
 """One segment's part of a snapshot: encoded once per tick, read by every client that sees the segment.
 
-    segment   [x, y, z, since, rows, gone, edits, check]   a MessagePack array inside the snapshot's array
+    segment   [x, y, z, since, rows, gone, edits, check, attributes]   an array inside the snapshot's array
     since     what follows is what changed after this tick; -1 (`KEYFRAME`): rows are all entities of the segment
     rows      n * 33 bytes, the whole exact state of an entity:
               u32 id  u8 template  u8 flags  i32 x, y, z (grid steps from the segment's low corner)
@@ -8,6 +8,8 @@
     gone      n * u32: entities that have left the segment or the world
     edits     n * [u16 block, u8 kind]: blocks that changed, by index z << 10 | y << 5 | x
     check     now and then a checksum of all of the segment, entities and blocks, else 0
+    attributes  [u32 id, {name: value}, u32 id, ...]: all that the game's rules say of an entity (its name, say), where
+              that has changed, or the entity has come into the segment, since then
 
 On the wire the flags have one bit more: `ACTED` says that the server's rules moved the entity, not the physics.
 """
@@ -72,6 +74,7 @@ class SegmentPart(NamedTuple):
     gone: list[int]
     edits: np.ndarray[Any, np.dtype[Any]]
     check: int
+    attributes: list[tuple[int, dict[str, Any]]]
 
 
 def encode_rows(rows: Int64s, acted: Collection[int] = ()) -> bytes:
@@ -96,9 +99,10 @@ def encode_part(
     *,
     acted: Collection[int] = (),
     check: int = 0,
+    attributes: Sequence[Any] = (),
 ) -> bytes:
     """One segment's part, ready to be joined into any client's snapshot."""
-    return join_part(segment, since, encode_rows(rows, acted), gone, edits, check)
+    return join_part(segment, since, encode_rows(rows, acted), gone, edits, check, attributes)
 
 
 def join_part(
@@ -108,11 +112,12 @@ def join_part(
     gone: Sequence[int] = (),
     edits: Sequence[tuple[int, int]] = (),
     check: int = 0,
+    attributes: Sequence[Any] = (),
 ) -> bytes:
     """The same from rows that are packed already."""
     packed_gone = np.array(gone, "<u4").tobytes() if gone else b""
     packed_edits = np.array(edits, EDIT).tobytes() if edits else b""
-    return msgpack.packb((*segment, since, packed, packed_gone, packed_edits, check))  # type: ignore[no-any-return]
+    return msgpack.packb((*segment, since, packed, packed_gone, packed_edits, check, attributes))  # type: ignore[no-any-return]
 
 
 def checksum(world: World, segment: Cell) -> int:
@@ -152,9 +157,9 @@ def decode_parts(
 
 
 def _decode_part(part: Any) -> SegmentPart:
-    if type(part) is not list or len(part) != 8:
-        raise ProtocolError("segment: not eight fields")
-    x, y, z, since, rows, gone, edits, check = part
+    if type(part) is not list or len(part) != 9:
+        raise ProtocolError("segment: not nine fields")
+    x, y, z, since, rows, gone, edits, check, attributes = part
     if not (type(x) is type(y) is type(z) is int and -FAR <= x < FAR and -FAR <= y < FAR and -FAR <= z < FAR):
         raise ProtocolError(f"segment {shown(x)} {shown(y)} {shown(z)}: not allowed")
     if type(check) is not int or not 0 <= check < 1 << 32:
@@ -169,4 +174,17 @@ def _decode_part(part: Any) -> SegmentPart:
     if edits and int(edited["block"].max()) >= SEGMENT**3:
         raise ProtocolError("segment.edits: a block is out of range")
     left = np.frombuffer(gone, "<u4").tolist() if gone else []
-    return SegmentPart((x, y, z), since, len(rows) // ROW_BYTES, left, edited, check)
+    said = _decode_attributes(attributes) if attributes != [] else []
+    return SegmentPart((x, y, z), since, len(rows) // ROW_BYTES, left, edited, check, said)
+
+
+def _decode_attributes(attributes: Any) -> list[tuple[int, dict[str, Any]]]:
+    if type(attributes) is not list or len(attributes) % 2:
+        raise ProtocolError("segment.attributes: not allowed")
+    said = list(zip(attributes[::2], attributes[1::2], strict=True))
+    for entity, values in said:
+        if type(entity) is not int or not 0 < entity <= ENTITY_MAX:
+            raise ProtocolError(f"segment.attributes: entity {shown(entity)}: not allowed")
+        if type(values) is not dict or any(type(name) is not str for name in values):
+            raise ProtocolError(f"segment.attributes of entity {entity}: not allowed")
+    return said

@@ -1,9 +1,11 @@
 """A game at a table: fake links that keep what they are sent, and a time that is told."""
 
+from dataclasses import replace
 from typing import Any
 
 from server.game import Game
 from server.limits import Limits
+from server.rules import Rules
 from server.session import Session
 from shared import edits, messages
 from shared.edits import Edit
@@ -61,11 +63,19 @@ class FakeLink:
 
 
 class Table:
-    """A game and its time."""
+    """A game and its time; whose connection is lost leaves at once, if nothing else is said."""
 
-    def __init__(self, limits: Limits | None = None, fill: list[list[int]] = FLOOR, **changes: Any) -> None:
+    def __init__(
+        self,
+        limits: Limits | None = None,
+        fill: list[list[int]] = FLOOR,
+        rules: Rules | None = None,
+        resume_s: float = 0.0,
+        **changes: Any,
+    ) -> None:
         values: dict[str, Any] = {"origin": (0, 0, 0), "size": (1, 1, 1), "spawns": ((16.0, 16.0, 1.0),)}
-        self.game = Game(scene(fill, **(values | changes)), limits=limits, compiled=False)
+        limits = replace(limits or Limits(), resume_s=resume_s)
+        self.game = Game(scene(fill, **(values | changes)), limits=limits, compiled=False, rules=rules)
         self.now = 0.0
         self.tick_s = 1 / self.game.scene.tick_rate
 

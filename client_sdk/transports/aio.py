@@ -11,9 +11,9 @@ import asyncio
 import ssl
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from types import TracebackType
-from typing import cast
+from typing import Any, cast
 
 from client_sdk.core import EVENTS_MAX, Core
 from client_sdk.events import Event, Stats
@@ -109,6 +109,22 @@ class AsyncClient:
         number = self.core.edit(x, y, z, kind)
         self._pump(time.monotonic())
         return number
+
+    def command(self, name: str, data: Any = None) -> int:
+        """Asks the game's rules for something, as `Client.command`; the number by which it is `Answered`.
+
+        Raises:
+            RuntimeError: the client is not playing.
+            ValueError: the name or the data are too long, or no MessagePack.
+        """
+        number = self.core.command(name, data)
+        self._pump(time.monotonic())
+        return number
+
+    @property
+    def shared(self) -> Mapping[str, Any]:
+        """The values that the game shares with all clients."""
+        return self.core.shared
 
     def set_input_delay(self, ticks: int) -> None:
         """Shows the effect of inputs so many ticks (0 to 3) later, as `Client.set_input_delay`.

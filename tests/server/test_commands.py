@@ -77,7 +77,8 @@ def test_commands_are_bounded_in_number_and_rate() -> None:
     link = table.join()
     tick = table.tick_number
     link.say(*[order(n, tick + 2, 18, 16, 1 + n, 5) for n in range(1, 9)])
-    assert len(link.session.commands) == 4
+    assert link.session.player
+    assert len(link.session.player.commands) == 4
     table.tick(3)
     assert sorted(verdicts(link)) == list(range(1, 9))
     assert [verdicts(link)[n] for n in range(5, 9)] == [messages.TOO_MANY] * 4

@@ -45,7 +45,9 @@ def test_who_says_hello_is_welcomed_and_shown_the_world_in_the_next_tick(table: 
     assert (link.sent, len(table.game.world)) == ([], 0)
     table.tick()
     welcome, snapshot, terrain = link.sent[:3]
-    assert welcome == Welcome(1, 0, 1, table.game.scene.to_table())
+    assert isinstance(welcome, Welcome)
+    assert welcome == Welcome(1, 0, 1, table.game.scene.to_table(), welcome.resume)
+    assert len(welcome.resume) == messages.RESUME_BYTES
     assert isinstance(snapshot, Snapshot)
     assert isinstance(terrain, Terrain)
     assert (snapshot.tick, snapshot.newest, len(snapshot.fates), len(snapshot.segments)) == (1, -1, 1, 1)

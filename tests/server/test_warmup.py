@@ -10,7 +10,7 @@ from server.game import Game
 from server.session import Session
 from server.warmup import warm_up
 from shared import edits, kernels, messages
-from shared.messages import Command, Hello, Inputs, Resync, encode
+from shared.messages import Bye, Command, Hello, Inputs, Resync, encode
 from shared.scene import load_scene
 
 pytestmark = pytest.mark.skipif(not kernels.available(), reason="there is nothing to compile without Numba")
@@ -61,7 +61,7 @@ def play(game: Game, seed: int, ticks: int) -> None:
             game.receive(session, encode(Hello(messages.VERSION, {}, "")), now)
             players.append((session, DigAndPlace(rng), RunAndJump(rng)))
         if number % 70 == 0:
-            game.lost(players.pop(rng.randrange(len(players)))[0], now)
+            game.receive(players.pop(rng.randrange(len(players)))[0], encode(Bye(1001, "", -1.0)), now)
         now += 1 / game.scene.tick_rate
         game.tick(now, now)
         asker = players[0][0]

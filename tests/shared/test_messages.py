@@ -21,6 +21,7 @@ from shared.messages import (
     TICK_MAX,
     Bye,
     Command,
+    Happened,
     Hello,
     Inputs,
     Message,
@@ -28,6 +29,7 @@ from shared.messages import (
     Pong,
     ProtocolError,
     Resync,
+    Shared,
     Snapshot,
     Terrain,
     Welcome,
@@ -37,11 +39,11 @@ from shared.messages import (
     join_snapshot,
 )
 
-PART = [0, -1, 2, 7, bytes(33), bytes(4), bytes(3), 0]
+PART = [0, -1, 2, 7, bytes(33), bytes(4), bytes(3), 0, [1, {"name": "Ann"}]]
 BLANK = Snapshot(0, 0, b"", 0, b"", b"", b"", ())
 FROM_CLIENT: list[Message] = [
     Hello(1, {}, ""),
-    Hello(1 << 31, {f"field {i}": bytes(8) for i in range(32)}, "n" * 32),
+    Hello(1 << 31, {f"field {i}": bytes(8) for i in range(32)}, "n" * 32, "t" * 2048, bytes(16)),
     Inputs(0, -1, b""),
     Inputs(TICK_MAX - 64, TICK_MAX, bytes(range(192))),
     Ping(-0.5),
@@ -54,12 +56,14 @@ FROM_CLIENT: list[Message] = [
 ]
 FROM_SERVER: list[Message] = [
     Bye(1001, "going down", 2.0),
-    Welcome(1, -1, 1, {"name": "flat", "spawns": [[0.5, 1, 2]]}),
+    Welcome(1, -1, 1, {"name": "flat", "spawns": [[0.5, 1, 2]]}, bytes(16)),
     Snapshot(0, -1, b"", -1, b"", b"", b"", ()),
     Snapshot(TICK_MAX, TICK_MAX, bytes(512), TICK_MAX, bytes(256), bytes(640), bytes(12 * 4096), (PART, PART)),
     Terrain(-(1 << 23), 0, (1 << 23) - 1, 0, 1, b""),
     Terrain(0, 0, 0, 48 * 1024, 48 * 1024, bytes(48 * 1024)),
     Pong(1.5, 17.25),
+    Happened(TICK_MAX, "n" * 32, bytes(1024)),
+    Shared({"score": [1, None, "two", {"three": 3.0}]}),
 ]
 
 
@@ -103,6 +107,8 @@ OUT_OF_BOUNDS: list[tuple[Message, str, list[Any]]] = [
         [{str(i): b"" for i in range(33)}, {"a": bytes(9)}, {"a": "text"}, {b"a": b""}, [], None],
     ),
     (Hello(1, {}, ""), "name", ["n" * 33, b"name", None, []]),
+    (Hello(1, {}, ""), "token", ["t" * 2049, b"token", None]),
+    (Hello(1, {}, ""), "resume", [bytes(15), bytes(17), "resume", None]),
     (Inputs(0, 0, b""), "first", [-1, TICK_MAX - 63, False, 0.0]),
     (Inputs(0, 0, b""), "acked", [-2, TICK_MAX + 1, None]),
     (Inputs(0, 0, b""), "rows", [bytes(195), bytes(4), bytes(1), "abc", None, [0, 0, 0]]),
@@ -119,6 +125,11 @@ OUT_OF_BOUNDS: list[tuple[Message, str, list[Any]]] = [
     (Welcome(1, 0, 1, {}), "tick", [-2, TICK_MAX + 1]),
     (Welcome(1, 0, 1, {}), "entity", [0, -1, 1 << 31]),
     (Welcome(1, 0, 1, {}), "scene", [[], None, {str(i): 0 for i in range(65)}]),
+    (Welcome(1, 0, 1, {}), "resume", [bytes(1), None]),
+    (Happened(0, "", b""), "tick", [-2, TICK_MAX + 1]),
+    (Happened(0, "", b""), "name", ["n" * 33, None]),
+    (Happened(0, "", b""), "payload", [bytes(1025), "text"]),
+    (Shared({}), "values", [[], None, {b"name": 1}, {str(i): 0 for i in range(65)}]),
     (BLANK, "tick", [-2, TICK_MAX + 1, None]),
     (BLANK, "newest", [-2, TICK_MAX + 1]),
     (BLANK, "margins", [bytes(514), bytes(3), ""]),
@@ -224,7 +235,7 @@ def claims(size: int) -> bytes:
 
 
 def test_of_two_equal_keys_the_last_counts() -> None:
-    message = decode_from_client(b"\x94\x01\x01\x82\xa1a\xc4\x01\x01\xa1a\xc4\x01\x02\xa0")
+    message = decode_from_client(b"\x96\x01\x01\x82\xa1a\xc4\x01\x01\xa1a\xc4\x01\x02\xa0\xa0\xc4\x00")
     assert message == Hello(1, {"a": b"\x02"}, "")
 
 

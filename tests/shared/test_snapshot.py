@@ -47,7 +47,8 @@ def state_in(segment: Cell, inside: int, velocity: int, move: int, entity: int =
 def part_of(**fields: Any) -> list[Any]:
     """A legal part, with some fields changed."""
     row = encode_rows(np.array([state_in((0, 0, 0), 5, 6, 7)], np.int64))
-    values = {"x": 0, "y": 0, "z": 0, "since": 3, "rows": row, "gone": b"\x01\0\0\0", "edits": b"\0\0\x01", "check": 0}
+    values: dict[str, Any] = {"x": 0, "y": 0, "z": 0, "since": 3, "rows": row, "gone": b"\x01\0\0\0"}
+    values |= {"edits": b"\0\0\x01", "check": 0, "attributes": [1, {"name": "Ann"}]}
     return list((values | fields).values())
 
 
@@ -153,6 +154,8 @@ def test_a_checksum_is_of_all_a_segment_holds_and_of_nothing_else() -> None:
         {"rows": bytes(32)}, {"rows": ""}, {"rows": None}, {"rows": []}, {"rows": bytes(33 * 7000)},
         {"gone": bytes(3)}, {"gone": "gone"}, {"gone": [1]}, {"gone": bytes(4 * 60_000)},
         {"check": -1}, {"check": 1 << 32}, {"check": True}, {"check": None},
+        {"attributes": None}, {"attributes": [1]}, {"attributes": [0, {}]}, {"attributes": [1 << 31, {}]},
+        {"attributes": [True, {}]}, {"attributes": [1, []]}, {"attributes": [1, {b"name": 1}]},
         {"edits": bytes(4)}, {"edits": {}}, {"edits": b"\x00\x80\x01"}, {"edits": b"\xff\xff\x00"},
     ],
     ids=lambda fields: f"{fields}"[:30],

@@ -1,0 +1,50 @@
+"""Which entities touch: told once, when it begins.
+
+Boxes that share a face, an edge or a corner touch: whoever is stopped by another stands flush against it. Only what
+has changed is looked at, against all: sorted along x, so that the cost is what is near in x, computed in whole columns.
+"""
+
+import numpy as np
+
+from shared.layout import ID, TEMPLATE, Int64s, X
+from shared.world import World
+
+Pair = tuple[int, int]
+
+
+class Contacts:
+    """The pairs of a world that touch."""
+
+    def __init__(self, world: World) -> None:
+        self._world = world
+        boxes = np.array([template.row()[:6] for template in world.scene.templates], np.int64)
+        self._low, self._high = boxes[:, :3], boxes[:, :3] + boxes[:, 3:]
+        self._widest = int(boxes[:, 3].max())
+        self._touching: set[Pair] = set()
+
+    def begun(self) -> list[Pair]:
+        """The pairs (a < b, ascending) that touch since the latest step and did not before it."""
+        changed = np.unique(self._world.changed[:, ID])
+        if not len(changed):
+            return []
+        now = self._touched(self._world.states(), changed)
+        new = now - self._touching
+        moved = set(changed.tolist())
+        self._touching = now | {
+            pair for pair in self._touching if not moved.intersection(pair) and all(e in self._world for e in pair)
+        }
+        return sorted(new)
+
+    def _touched(self, states: Int64s, changed: Int64s) -> set[Pair]:
+        low = states[:, X : X + 3] + self._low[states[:, TEMPLATE]]
+        high = states[:, X : X + 3] + self._high[states[:, TEMPLATE]]
+        order = np.argsort(low[:, 0], kind="stable")
+        states, low, high = states[order], low[order], high[order]
+        mine = np.flatnonzero(np.isin(states[:, ID], changed))
+        first = np.searchsorted(low[:, 0], low[mine, 0] - self._widest)
+        count = np.searchsorted(low[:, 0], high[mine, 0], "right") - first
+        i = np.repeat(mine, count)
+        j = np.arange(len(i)) - np.repeat(np.cumsum(count) - count, count) + np.repeat(first, count)
+        touch = (i != j) & ((low[i] <= high[j]) & (low[j] <= high[i])).all(axis=1)
+        ids = np.sort(np.stack((states[i[touch], ID], states[j[touch], ID]), axis=1), axis=1)
+        return {(a, b) for a, b in ids.tolist()}

@@ -1,0 +1,348 @@
+"""What the rules of a game can do and see: `self.game` of `server.rules.Rules`.
+
+Everything here acts at once on the one world, ahead of the step of the coming tick, and through the same functions as
+everybody else; so it is sent, recorded and replayed like all that happens.
+"""
+
+import logging
+from collections.abc import Iterable, Mapping
+from random import Random
+from types import MappingProxyType
+from typing import Any
+
+from server.contacts import Contacts
+from server.counters import Counters
+from server.replication import ChangeLog
+from server.rewind import Past, Rewind
+from server.rules import Rules
+from server.session import Player, Session
+from shared import messages
+from shared.checks import SceneError, Vec
+from shared.edits import Edit
+from shared.inputs import Input, make_input
+from shared.layout import TEMPLATE
+from shared.messages import Command, Happened, ProtocolError, Shared, encode, pack_value, unpack_value
+from shared.scene import Scene
+from shared.world import World
+
+ATTRIBUTES_MAX = 32
+"""So many attributes an entity may have, and so many values the game may share,"""
+VALUE_BYTES_MAX = 256
+"""each of at most so many bytes as MessagePack."""
+FAILURES_LOGGED_MAX = 100
+"""Failures of rules beyond this many are counted only."""
+
+_FAILED = object()
+
+logger = logging.getLogger(__name__)
+
+
+class Stage:
+    """One running game, as its rules see it. Positions in blocks, velocities in blocks/s.
+
+    Methods that name an entity raise `KeyError` if there is none of that id; those that take values, `SceneError`.
+    """
+
+    def __init__(self, world: World, rewind: Rewind, counters: Counters, rules: Rules, seed: int = 0) -> None:
+        self.players: dict[int, Player] = {}
+        """Who plays, by entity, in the order in which they joined; also who is cut off and may come back."""
+        self.steered: dict[int, Input] = {}
+        self._attributes: dict[int, dict[str, Any]] = {}
+        self.log = ChangeLog(world, self._attributes)
+        self._world, self._rewind, self._counters, self._rules, self._seed = world, rewind, counters, rules, seed
+        self._shared: dict[str, Any] = {}
+        self._version = 0
+        self._shared_message = b""
+        self._random = (-1, Random())
+        self._seen = 0.0
+        self._outgoing: list[tuple[frozenset[int] | None, bytes]] = []
+        self._contacts = Contacts(world) if _overrides(rules, "on_contact") else None
+        self._started = False
+        rules.game = self
+
+    # -- the world -----------------------------------------------------------------------------------------
+
+    @property
+    def scene(self) -> Scene:
+        """The rules of the physics, and the templates."""
+        return self._world.scene
+
+    @property
+    def tick(self) -> int:
+        """The tick that is about to be computed."""
+        return self._world.tick + 1
+
+    def ticks(self, seconds: float) -> int:
+        """So many seconds in ticks, rounded."""
+        return round(seconds * self.scene.tick_rate)
+
+    @property
+    def random(self) -> Random:
+        """A source of randomness that is the same again in the same tick of a game with the same seed."""
+        if self._random[0] != self.tick:
+            self._random = (self.tick, Random((self._seed << 64) | self.tick))
+        return self._random[1]
+
+    def entities(self, template: str | None = None) -> list[int]:
+        """The ids of all entities, or of those of a template, ascending."""
+        states = self._world.states()
+        if template is not None:
+            states = states[states[:, TEMPLATE] == self._number(template)]
+        ids: list[int] = states[:, 0].tolist()
+        return ids
+
+    def __contains__(self, entity: int) -> bool:
+        return entity in self._world
+
+    def position(self, entity: int) -> Vec:
+        """Where an entity is."""
+        return self._world.position(entity)
+
+    def velocity(self, entity: int) -> Vec:
+        """How fast an entity is."""
+        return self._world.velocity(entity)
+
+    def template(self, entity: int) -> str:
+        """What an entity is."""
+        return self.scene.templates[self._world.state(entity)[TEMPLATE]].name
+
+    def spawn(self, template: str, position: Vec, velocity: Vec = (0.0, 0.0, 0.0), **attributes: Any) -> int:
+        """Adds an entity and returns its id.
+
+        Raises:
+            OverlapError: the place, and all near it, is taken.
+            SceneError: there is no such template, or a value is out of range.
+        """
+        for name, value in attributes.items():
+            _checked(name, value)
+        entity = self._world.spawn(template, position, velocity, push=True)
+        for name, value in attributes.items():
+            self.set(entity, name, value)
+        return entity
+
+    def remove(self, entity: int) -> None:
+        """Takes an entity out of the world.
+
+        Raises:
+            SceneError: it is a player's.
+        """
+        if entity in self.players:
+            raise SceneError(f"entity {entity}: is a player's, and stays until the player leaves")
+        self._remove(entity)
+
+    def place(self, entity: int, position: Vec) -> None:
+        """Puts an entity somewhere else, or as near to it as there is room within a block; its velocity stays.
+
+        Raises:
+            OverlapError: there is none.
+        """
+        self._world.place(entity, position, push=True)
+        self.log.note_act(entity)
+
+    def throw(self, entity: int, velocity: Vec) -> None:
+        """Sets how fast an entity is; one that walks keeps only the upward part beyond the next tick."""
+        self._world.set_velocity(entity, velocity)
+        self.log.note_act(entity)
+
+    def change(self, entity: int, template: str) -> None:
+        """Makes an entity one of another template, where it stands.
+
+        Raises:
+            OverlapError: its new box has no room there.
+        """
+        self._world.set_template(entity, template)
+        self.log.note_act(entity)
+
+    def steer(self, entity: int, x: float, y: float, *, jump: bool = False) -> None:
+        """What an entity that is no player's wishes from now on: a direction (east, north), and whether to jump.
+
+        Raises:
+            SceneError: it is a player's.
+        """
+        if entity in self.players:
+            raise SceneError(f"entity {entity}: is a player's, and goes where the player wants")
+        if entity not in self._world:
+            raise KeyError(entity)
+        self.steered[entity] = make_input(x, y, jump=jump)
+
+    def block(self, x: int, y: int, z: int) -> int:
+        """The kind of a block; 0: there is none."""
+        return self._world.blocks.get(x, y, z) or 0
+
+    def set_block(self, x: int, y: int, z: int, kind: int) -> None:
+        """Places (kind 1 to 255) or removes (0) a block.
+
+        Raises:
+            OverlapError: an entity is in the way.
+            SceneError: there is no such place, or kind.
+        """
+        self._world.set_block(x, y, z, kind)
+        self.log.note_edit(x, y, z)
+
+    def rewound(self, player: Player, seen: float | None = None) -> Past:
+        """The world as a player saw it, at most 250 ms ago: answers rays and boxes.
+
+        Args:
+            seen: the tick at which that client drew the others; None: what its command says, within `on_command`.
+        """
+        return self._rewind.at(self._seen if seen is None else seen, player.entity)
+
+    # -- what the players are told ---------------------------------------------------------------------------
+
+    def set(self, entity: int, name: str, value: Any) -> None:
+        """Says something of an entity to all who see it: a small MessagePack value. None: nothing any more.
+
+        Raises:
+            SceneError: more than 32 attributes, or more than 256 bytes.
+        """
+        if entity not in self._world:
+            raise KeyError(entity)
+        _checked(name, value)
+        before = self._attributes.get(entity, {})
+        if value == before.get(name) and type(value) is type(before.get(name)):
+            return
+        after = _with(before, name, value, f"entity {entity}")
+        self._attributes[entity] = after
+        self.log.note_attributes(entity)
+
+    def get(self, entity: int, name: str, default: Any = None) -> Any:
+        """What has been said of an entity."""
+        return self._attributes.get(entity, {}).get(name, default)
+
+    @property
+    def shared(self) -> Mapping[str, Any]:
+        """The values that all clients know."""
+        return MappingProxyType(self._shared)
+
+    def share(self, name: str, value: Any) -> None:
+        """Tells all clients, also those who join later, a value of the game: the time left, a score. None: no more.
+
+        Raises:
+            SceneError: more than 32 values, or more than 256 bytes.
+        """
+        _checked(name, value)
+        if value == self._shared.get(name) and type(value) is type(self._shared.get(name)):
+            return
+        self._shared = _with(self._shared, name, value, "the game")
+        self._version += 1
+        self._shared_message = encode(Shared(self._shared))
+
+    def send(self, name: str, data: Any = None, to: Player | Iterable[Player] | None = None) -> None:
+        """Tells one player, some or (None) all that something has happened: `Happened` in the client.
+
+        Raises:
+            SceneError: the name is longer than 32 characters, the data than 1,024 bytes as MessagePack.
+        """
+        try:
+            payload = pack_value(data)
+        except ValueError as error:
+            raise SceneError(f"send {name!r}: {error}") from error
+        _checked(name, None)
+        players = (to,) if isinstance(to, Player) else to
+        entities = None if players is None else frozenset(player.entity for player in players)
+        self._outgoing.append((entities, encode(Happened(self.tick, name, payload))))
+
+    # -- what the game calls -----------------------------------------------------------------------------------
+
+    def joined(self, player: Player) -> None:
+        """A player has an entity."""
+        if player.name:
+            self.set(player.entity, "name", player.name)
+        self._call(self._rules.on_join, player)
+
+    def left(self, player: Player) -> None:
+        """A player leaves, and the entity with it."""
+        self._call(self._rules.on_leave, player)
+        self._remove(player.entity)
+
+    def fell_out(self, entity: int) -> bool:
+        """Whether the rules have seen to an entity that is below the floor."""
+        return self._call(self._rules.on_fell_out, entity) is True or entity not in self._world
+
+    def command(self, player: Player, command: Command) -> int:
+        """Has the rules carry out a command; the verdict."""
+        try:
+            payload = unpack_value(command.payload)
+        except ProtocolError:
+            return messages.INVALID
+        self._seen = command.seen
+        if not _overrides(self._rules, "on_command"):
+            return messages.INVALID
+        done = self._call(self._rules.on_command, player, command.name, payload, failed=_FAILED)
+        if done is _FAILED:
+            return messages.FAILED
+        return messages.FORBIDDEN if done is False else messages.DONE
+
+    def may_edit(self, player: Player, edit: Edit) -> bool:
+        """Whether the rules allow an edit; not, if they fail."""
+        return self._call(self._rules.can_edit, player, *edit, failed=False) is not False
+
+    def act(self) -> None:
+        """The part of the rules in a tick that nobody asks for."""
+        if not self._started:
+            self._started = True
+            self._call(self._rules.on_start)
+        for a, b in self._contacts.begun() if self._contacts else ():
+            if a in self._world and b in self._world:
+                self._call(self._rules.on_contact, a, b)
+        self._call(self._rules.on_tick)
+
+    def tell(self, session: Session) -> None:
+        """Files what the rules have said since the last tick for a client."""
+        for entities, message in self._outgoing:
+            if entities is None or session.entity in entities:
+                session.outbox.append(message)
+        if session.shared != self._version:
+            session.shared = self._version
+            session.outbox.append(self._shared_message)
+
+    def told(self) -> None:
+        """Everybody has been told."""
+        self._outgoing.clear()
+
+    def _remove(self, entity: int) -> None:
+        self._world.remove(entity)
+        self._attributes.pop(entity, None)
+        self.steered.pop(entity, None)
+        self.log.note_removal(entity)
+
+    def _number(self, template: str) -> int:
+        try:
+            return self.scene.index_of[template]
+        except KeyError:
+            raise SceneError(f"template {template!r}: the scene has none of that name") from None
+
+    def _call(self, hook: Any, *arguments: Any, failed: Any = None) -> Any:
+        """Calls a hook; where it raises, that is counted, and `failed` is the answer."""
+        try:
+            return hook(*arguments)
+        except Exception:
+            self._counters.rules_failed += 1
+            if self._counters.rules_failed <= FAILURES_LOGGED_MAX:
+                logger.exception("the rules have failed in %s", hook.__qualname__)
+            return failed
+
+
+def _overrides(rules: Rules, name: str) -> bool:
+    return getattr(type(rules), name) is not getattr(Rules, name)
+
+
+def _checked(name: str, value: Any) -> None:
+    if not 0 < len(name) <= messages.NAME_MAX:
+        raise SceneError(f"name {name[:80]!r}: must be a text of 1 to {messages.NAME_MAX} characters")
+    try:
+        size = len(pack_value(value))
+    except ValueError as error:
+        raise SceneError(f"{name}: {error}") from error
+    if size > VALUE_BYTES_MAX:
+        raise SceneError(f"{name}: a value of {size} bytes; at most {VALUE_BYTES_MAX}")
+
+
+def _with(values: Mapping[str, Any], name: str, value: Any, whose: str) -> dict[str, Any]:
+    """A new table with one value more, another one, or (None) one less."""
+    after = {**values, name: value}
+    if value is None:
+        del after[name]
+    if len(after) > ATTRIBUTES_MAX:
+        raise SceneError(f"{whose}: more than {ATTRIBUTES_MAX} values")
+    return after

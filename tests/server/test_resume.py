@@ -1,0 +1,148 @@
+"""Who is cut off keeps the entity for a while, and goes on with the token of the latest welcome."""
+
+import pytest
+
+from server.session import SETTLED_MAX
+from shared import messages
+from shared.messages import Bye, Hello, Inputs, Snapshot, Welcome
+from tests.server.test_commands import verdicts
+from tests.tables import FakeLink, Table, ids, order
+
+KEPT_S = 2.0
+
+
+@pytest.fixture
+def table() -> Table:
+    return Table(resume_s=KEPT_S)
+
+
+def token(link: FakeLink) -> bytes:
+    resume: bytes = link.got(Welcome)[-1].resume
+    return resume
+
+
+def back(table: Table, resume: bytes) -> FakeLink:
+    link = table.connect(Hello(1, {}, "", resume=resume))
+    table.tick()
+    return link
+
+
+def heard(table: Table, link: FakeLink) -> None:
+    """The client has got its welcome: it acknowledges a snapshot."""
+    link.say(Inputs(table.tick_number + 1, table.tick_number, bytes(3)))
+
+
+def test_who_comes_back_in_time_goes_on_as_before(table: Table) -> None:
+    link = table.connect(Hello(1, {}, "Ann"))
+    table.tick()
+    me = link.session.entity
+    heard(table, link)
+    link.say(Inputs(table.tick_number + 2, table.tick_number, bytes((127, 0, 0)) * 3))
+    table.lose(link)
+    table.tick(20)
+    place = table.game.world.position(me)
+    assert place[0] > 16.5, "the inputs that had come were carried out"
+    again = back(table, token(link))
+    assert again.got(Welcome)[-1].entity == me
+    assert table.game.world.position(me) == place
+    assert me in ids(again.got(Snapshot)[0])
+    assert (table.game.counters.joined, table.game.counters.resumed, table.game.counters.left) == (1, 1, 0)
+    assert table.game.players[me].name == "Ann"
+    again.say(Inputs(table.tick_number + 1, table.tick_number, bytes((0, 127, 0))))
+    table.tick(2)
+    assert table.game.world.position(me)[1] > place[1]
+
+
+def test_who_comes_too_late_begins_anew(table: Table) -> None:
+    link = table.join()
+    table.lose(link)
+    table.tick(int(KEPT_S / table.tick_s) + 2)
+    assert len(table.game.world) == 0
+    again = back(table, token(link))
+    assert again.session.entity not in (0, link.got(Welcome)[0].entity)
+
+
+def test_a_token_is_good_once(table: Table) -> None:
+    link = table.join()
+    me, first = link.session.entity, token(link)
+    heard(table, link)
+    table.lose(link)
+    again = back(table, first)
+    heard(table, again)
+    table.lose(again)
+    table.tick()
+    assert back(table, first).session.entity not in (0, me)
+    assert back(table, token(again)).session.entity == me
+
+
+def test_a_welcome_that_was_lost_on_its_way_costs_nothing(table: Table) -> None:
+    link = table.join()
+    me, first = link.session.entity, token(link)
+    heard(table, link)
+    table.lose(link)
+    table.lose(back(table, first))  # cut off before it heard of its new token
+    table.tick()
+    assert back(table, first).session.entity == me
+
+
+def test_a_guessed_token_is_worth_nothing(table: Table) -> None:
+    link = table.join()
+    table.lose(link)
+    for guess in (bytes(16), b"\xff" * 16, bytes(reversed(token(link)))):
+        assert back(table, guess).session.entity != link.got(Welcome)[0].entity
+
+
+def test_who_comes_back_before_the_loss_is_noticed_takes_over(table: Table) -> None:
+    link = table.join()
+    me = link.session.entity
+    again = back(table, token(link))
+    assert link.refusal()[0] == messages.TAKEN_OVER
+    assert again.session.entity == me
+    table.lose(link)
+    table.tick(int(KEPT_S / table.tick_s) + 2)
+    assert me in table.game.world
+
+
+@pytest.mark.parametrize("said", [Bye(1000, "", -1.0), b"\xff"], ids=["goodbye", "a broken rule"])
+def test_who_leaves_for_good_frees_the_entity_at_once(table: Table, said: Bye | bytes) -> None:
+    link = table.join()
+    link.say(said)
+    table.lose(link)
+    table.tick()
+    assert len(table.game.world) == 0
+    assert back(table, token(link)).session.entity != link.session.entity
+
+
+def test_a_slow_connection_is_no_fault_of_the_player(table: Table) -> None:
+    link = table.join()
+    link.waiting = 1 << 20
+    while not link.closings:
+        link.say(messages.Ping(0.0))
+        table.tick()
+    assert link.closings[0][0] == messages.TOO_SLOW
+    table.lose(link)
+    table.tick()
+    assert back(table, token(link)).session.entity == 1
+
+
+def test_a_command_that_is_sent_again_is_done_once_and_answered_again(table: Table) -> None:
+    link = table.join()
+    table.tick(64)
+    heard(table, link)
+    link.say(order(1, 0, 18, 16, 1, 5))
+    table.tick()
+    table.lose(link)
+    again = back(table, token(link))
+    again.say(order(1, 0, 18, 16, 1, 5), order(2, 0, 18, 16, 1, 0))
+    table.tick(2)
+    assert verdicts(again) == {1: messages.DONE, 2: messages.DONE}
+    assert table.game.world.blocks.get(18, 16, 1) == 0
+
+
+def test_only_the_latest_verdicts_are_kept(table: Table) -> None:
+    link = table.join()
+    player = link.session.player
+    assert player
+    for number in range(SETTLED_MAX + 10):
+        player.settle(number, 0)
+    assert list(player.settled) == list(range(10, SETTLED_MAX + 10))

@@ -1,0 +1,313 @@
+"""A game on top: hooks, what they may do, what the players are told, and that a broken one stops nobody."""
+
+from typing import Any
+
+import msgpack
+import pytest
+
+from server.limits import Limits
+from server.rules import Rules, RulesError, load_rules
+from server.session import Player
+from server.stage import ATTRIBUTES_MAX
+from shared import messages
+from shared.checks import SceneError
+from shared.messages import Command, Happened, Hello, Shared, Snapshot
+from tests.tables import FakeLink, Table, order
+from tests.worlds import scene
+
+
+class Told(Rules):
+    """Writes down what it is told."""
+
+    def __init__(self) -> None:
+        self.told: list[tuple[Any, ...]] = []
+
+    def on_start(self) -> None:
+        self.told.append(("start",))
+
+    def on_join(self, player: Player) -> None:
+        self.told.append(("join", player.entity, player.name, player.entity in self.game))
+
+    def on_leave(self, player: Player) -> None:
+        self.told.append(("leave", player.entity, player.entity in self.game))
+
+    def on_command(self, player: Player, name: str, payload: Any) -> bool | None:
+        self.told.append(("command", player.entity, name, payload))
+        return name != "no"
+
+    def on_contact(self, a: int, b: int) -> None:
+        self.told.append(("contact", a, b, self.game.tick))
+
+    def on_fell_out(self, entity: int) -> bool | None:
+        self.told.append(("fell", entity))
+        return None
+
+    def can_edit(self, player: Player, x: int, y: int, z: int, kind: int) -> bool:
+        return kind != 7
+
+
+@pytest.fixture
+def rules() -> Told:
+    return Told()
+
+
+@pytest.fixture
+def table(rules: Told) -> Table:
+    return Table(rules=rules)
+
+
+def attributes(link: FakeLink) -> dict[int, Any]:
+    """What a client makes of all that it was told."""
+    known: dict[int, Any] = {}
+    for snapshot in link.got(Snapshot):
+        for part in snapshot.segments:
+            known.update(zip(part[8][::2], part[8][1::2], strict=True))
+    return known
+
+
+def verdict(link: FakeLink, number: int) -> int:
+    (found,) = (
+        snapshot.verdicts[at + 4]
+        for snapshot in link.got(Snapshot)
+        for at in range(0, len(snapshot.verdicts), 5)
+        if int.from_bytes(snapshot.verdicts[at : at + 4], "little") == number
+    )
+    return int(found)
+
+
+def test_joining_and_leaving_are_told_while_the_entity_is_there(table: Table, rules: Told) -> None:
+    link = table.connect(Hello(1, {}, "Ann"))
+    table.tick()
+    table.lose(link)
+    table.tick()
+    assert rules.told == [("join", 1, "Ann", True), ("start",), ("leave", 1, True)]
+
+
+def test_commands_come_with_their_data_and_are_answered(table: Table, rules: Told) -> None:
+    link = table.join()
+    data = {"at": [1, 2.5, None], "why": "because"}
+    link.say(
+        Command(1, 0, 0.0, "yes", msgpack.packb(data)),
+        Command(2, 0, 0.0, "no", msgpack.packb(None)),
+        Command(3, 0, 0.0, "yes", b"\xc1"),
+        order(4, 0, 18, 16, 1, 7),
+        order(5, 0, 18, 16, 1, 6),
+    )
+    table.tick()
+    assert [told for told in rules.told if told[0] == "command"] == [
+        ("command", 1, "yes", data),
+        ("command", 1, "no", None),
+    ]
+    answers = [messages.DONE, messages.FORBIDDEN, messages.INVALID, messages.FORBIDDEN, messages.DONE]
+    assert [verdict(link, number) for number in range(1, 6)] == answers
+    assert table.game.world.blocks.get(18, 16, 1) == 6
+
+
+def test_without_rules_a_command_is_not_possible() -> None:
+    table = Table()
+    link = table.join()
+    link.say(Command(1, 0, 0.0, "fly", msgpack.packb(None)))
+    table.tick()
+    assert verdict(link, 1) == messages.INVALID
+
+
+def test_contact_is_told_once_when_it_begins(table: Table, rules: Told) -> None:
+    game = table.game.stage
+    table.tick()
+    a, b = game.spawn("runner", (10.0, 16.0, 1.0)), game.spawn("runner", (12.0, 16.0, 1.0))
+    table.tick(2)
+    assert not [told for told in rules.told if told[0] == "contact"]
+    game.steer(a, 1, 0)
+    table.tick(40)  # walks against the other and presses on
+    ((_, *pair, begun),) = [told for told in rules.told if told[0] == "contact"]
+    assert pair == [a, b]
+    assert game.position(a)[0] == 11.375
+    game.steer(a, -1, 0)
+    table.tick(10)
+    game.steer(a, 1, 0)
+    table.tick(20)
+    contacts = [told for told in rules.told if told[0] == "contact"]
+    assert len(contacts) == 2
+    assert contacts[1][3] > begun + 10
+
+
+def test_who_falls_out_is_the_rules_affair_or_comes_back(table: Table, rules: Told) -> None:
+    link = table.join()
+    table.game.world.place(link.session.entity, (16.0, 16.0, -3.0))
+    table.tick(2)
+    assert ("fell", 1) in rules.told
+    assert table.game.world.position(1)[2] >= 1.0
+
+
+def test_what_is_said_of_an_entity_reaches_all_who_see_it_and_changes(table: Table) -> None:
+    early = table.connect(Hello(1, {}, "Ann"))
+    table.tick()
+    game = table.game.stage
+    npc = game.spawn("runner", (10.0, 16.0, 1.0), mood="calm")
+    table.tick()
+    late = table.connect(Hello(1, {}, ""))
+    table.tick()
+    assert attributes(early) == attributes(late) == {1: {"name": "Ann"}, npc: {"mood": "calm"}}
+    count = len(early.got(Snapshot))
+    game.set(npc, "mood", "calm")  # no news
+    table.tick()
+    assert not any(part[8] for snapshot in early.got(Snapshot)[count:] for part in snapshot.segments)
+    game.set(npc, "mood", None)
+    game.set(npc, "hunger", 0.5)
+    table.tick()
+    assert attributes(early)[npc] == attributes(late)[npc] == {"hunger": 0.5}
+    assert (game.get(npc, "hunger"), game.get(npc, "mood", "none")) == (0.5, "none")
+
+
+def test_who_comes_into_sight_brings_along_what_is_said_of_it() -> None:
+    table = Table(size=(4, 1, 1), fill=[[0, 0, 0, 128, 32, 1, 1]], spawns=((16.0, 16.0, 1.0),))
+    link = table.join()
+    game = table.game.stage
+    far = game.spawn("runner", (112.0, 16.0, 1.0), team="red")
+    table.tick(2)
+    assert far not in attributes(link)
+    game.place(far, (63.0, 16.0, 1.0))
+    table.tick()
+    assert attributes(link)[far] == {"team": "red"}
+
+
+def test_events_go_to_whom_they_are_for_once(table: Table) -> None:
+    ann, bob = table.join(), table.join()
+    game = table.game.stage
+    game.send("all", {"n": 1})
+    game.send("ann", [2], to=game.players[ann.session.entity])
+    game.send("none", to=[])
+    table.tick(3)
+    tick = table.tick_number - 2
+    assert ann.got(Happened) == [
+        Happened(tick, "all", msgpack.packb({"n": 1})),
+        Happened(tick, "ann", msgpack.packb([2])),
+    ]
+    assert bob.got(Happened) == [Happened(tick, "all", msgpack.packb({"n": 1}))]
+
+
+def test_events_wait_for_who_is_slow_and_not_for_ever() -> None:
+    table = Table(Limits(outbox_max=5), rules=Rules())
+    link = table.join()
+    link.waiting = 1 << 20
+    for n in range(5):
+        table.game.stage.send("n", n)
+        table.tick()
+    assert not link.got(Happened)
+    link.waiting = 0
+    table.tick()
+    assert [msgpack.unpackb(happened.payload) for happened in link.got(Happened)] == list(range(5))
+    link.waiting = 1 << 20
+    for n in range(6):
+        table.game.stage.send("n", n)
+    table.tick()
+    assert link.refusal() == (messages.TOO_SLOW, "6 messages behind")
+
+
+def test_shared_values_reach_all_also_who_comes_later(table: Table) -> None:
+    early = table.join()
+    game = table.game.stage
+    game.share("left_s", 60)
+    game.share("winner", "Ann")
+    table.tick()
+    game.share("left_s", 59)
+    game.share("winner", None)
+    table.tick()
+    game.share("left_s", 59)
+    table.tick()
+    late = table.join()
+    assert early.got(Shared) == [Shared({"left_s": 60, "winner": "Ann"}), Shared({"left_s": 59})]
+    assert late.got(Shared) == [Shared({"left_s": 59})]
+    assert dict(game.shared) == {"left_s": 59}
+
+
+def test_what_is_too_much_is_refused_by_name(table: Table) -> None:
+    game = table.game.stage
+    npc = game.spawn("runner", (10.0, 16.0, 1.0))
+    for value, why in (("x" * 300, "bytes"), (object(), "MessagePack"), ({1: 2}, "MessagePack")):
+        with pytest.raises(SceneError, match=f"mood.*{why}"):
+            game.set(npc, "mood", value)
+    for n in range(ATTRIBUTES_MAX):
+        game.set(npc, f"a{n}", n)
+    with pytest.raises(SceneError, match="32 values"):
+        game.set(npc, "one more", 1)
+    with pytest.raises(SceneError, match="name"):
+        game.share("n" * 33, 1)
+    with pytest.raises(SceneError, match="send"):
+        game.send("big", "x" * 2000)
+    with pytest.raises(KeyError):
+        game.set(99, "mood", 1)
+    before = len(table.game.world)
+    with pytest.raises(SceneError, match="mood"):
+        game.spawn("runner", (20.0, 16.0, 1.0), mood=object())
+    assert len(table.game.world) == before
+
+
+def test_players_are_not_the_rules_to_steer_or_remove(table: Table) -> None:
+    table.join()
+    with pytest.raises(SceneError, match="player"):
+        table.game.stage.steer(1, 1, 0)
+    with pytest.raises(SceneError, match="player"):
+        table.game.stage.remove(1)
+
+
+class Broken(Rules):
+    def on_join(self, player: Player) -> None:
+        raise RuntimeError("on purpose")
+
+    on_leave = on_tick = on_start = on_command = on_contact = on_fell_out = can_edit = on_join  # type: ignore[assignment]
+
+
+def test_rules_that_raise_are_counted_and_told_and_stop_nobody(caplog: pytest.LogCaptureFixture) -> None:
+    table = Table(rules=Broken())
+    link = table.join()
+    table.tick(10)
+    link.say(Command(1, 0, 0.0, "any", msgpack.packb(None)), order(2, 0, 18, 16, 1, 5))
+    table.tick()
+    assert (verdict(link, 1), verdict(link, 2)) == (messages.FAILED, messages.FORBIDDEN)
+    table.lose(link)
+    table.tick()
+    assert len(table.game.world) == 0
+    assert table.game.counters.rules_failed == len(caplog.records) > 12
+    assert "on purpose" in caplog.text
+
+
+def test_randomness_is_the_same_in_the_same_tick() -> None:
+    drawn = []
+    for ticks in (5, 5, 6):
+        table = Table()
+        table.tick(ticks)
+        drawn.append([table.game.stage.random.random() for _ in range(3)])
+    assert drawn[0] == drawn[1] != drawn[2]
+
+
+def test_a_scene_gets_a_template_more() -> None:
+    before = scene()
+    after = before.with_template("frozen", walk_speed=0.0, jump_speed=0.0)
+    assert [template.name for template in after.templates] == [*(t.name for t in before.templates), "frozen"]
+    assert after.templates[-1].box_size == before.templates[before.index_of[before.player]].box_size
+    for like, changes, why in (
+        ("nobody", {}, "like"),
+        (None, {"speed": 1}, "speed"),
+        (None, {"walk_speed": -1}, "walk"),
+    ):
+        with pytest.raises(SceneError, match=why):
+            before.with_template("frozen", like, **changes)
+    with pytest.raises(SceneError, match="same name"):
+        after.with_template("frozen")
+
+
+@pytest.mark.parametrize(
+    ("name", "why"),
+    [
+        ("tag", "module:Class"), ("no_such_module:Tag", "No module"), ("server.rules:", "module:Class"),
+        ("tests.server.test_rules:Nobody", "no attribute"), ("tests.server.test_rules:Table", "subclass"),
+    ],
+)  # fmt: skip
+def test_rules_that_cannot_be_loaded_say_why(name: str, why: str) -> None:
+    with pytest.raises(RulesError, match=why):
+        load_rules(name)
+
+
+def test_rules_are_loaded_by_name() -> None:
+    assert type(load_rules("server.rules:Rules")) is Rules
