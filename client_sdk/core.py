@@ -188,7 +188,7 @@ class Core:
         if self.state == "closed" or not self._open:
             return
         if self.clock.due(now):
-            self._send(Ping(now))
+            self._send(Ping(now, self.stats.corrections))
             self._pings.append(now)
         if self.state == "joining":
             self._try_to_join(now)

@@ -28,6 +28,8 @@ class Counters:
     closed: dict[int, int] = field(default_factory=dict)
     """Clients told to go, by close code."""
     rules_failed: int = 0
+    corrections: int = 0
+    """As the clients report them."""
 
     def add(self, queue: InputQueue) -> None:
         """Counts in how one player's inputs have fared."""

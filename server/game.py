@@ -128,6 +128,8 @@ class Game:
         elif isinstance(message, Ping):
             tick = self.world.tick + 1 - self._ticks_left(now)
             session.send(encode(Pong(message.sent, tick)))
+            self.counters.corrections += max(message.corrections - session.corrections, 0)
+            session.corrections = max(message.corrections, session.corrections)
         elif isinstance(message, Hello) and not session.entity and session.hello is None:
             self._hello(session, message, now)
         elif isinstance(message, Command) and session.entity:

@@ -32,6 +32,9 @@ COUNTERS = {
     "skipped_s": "Seconds that no tick stands for.",
     "joined": "Players that have come in.",
     "left": "Players that have left.",
+    "resumed": "Players that have come back after a lost connection.",
+    "corrections": "Corrections of their prediction that clients have reported.",
+    "rules_failed": "Exceptions of the game's rules.",
     "malformed": "Messages that were none.",
     "kicked": "Clients closed for what they did, or did not do.",
     "snapshots_sent": "Snapshots sent.",
@@ -43,7 +46,7 @@ COUNTERS = {
     "internal_errors": "Exceptions that cost a client, a command, a page or a tick.",
 }
 FATES = ("used", "late", "substituted", "refused")
-"""Of inputs. Corrections are not in the protocol: each client counts its own (`client.stats`)."""
+"""Of inputs."""
 LABELLED = {
     "refused_at_door": ("door_refusals", "reason", "Connections and requests refused before a WebSocket opened."),
     "closed": ("closed", "code", "Clients told to go, by close code."),

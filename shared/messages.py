@@ -6,7 +6,7 @@ travels as packed little-endian records in a MessagePack `bin`.
     client -> server                                     server -> client
       1 Hello    version scene name token resume           17 Welcome   version tick entity scene resume
       2 Inputs   first acked rows                          18 Snapshot  tick newest margins first fates verdicts
-      3 Ping     sent                                                   drops segment*
+      3 Ping     sent corrections                                       drops segment*
       4 Bye      code reason wait                          19 Terrain   x y z offset total chunk
       5 Command  number tick seen name payload             20 Pong      sent tick
       6 Resync                                             21 Happened  tick name payload
@@ -25,6 +25,7 @@ travels as packed little-endian records in a MessagePack `bin`.
                    `Welcome`, to go on as the player that one was about.
     Happened       something that the game's rules tell, once. Its payload is MessagePack, as a command's.
     Shared         values of the game that all clients know, by name: a score, the time left. All of them, each time.
+    Ping           `corrections`: how often the client has corrected its prediction so far, for the operator.
     Pong.tick      the server's time in ticks when it answered: 17.25 is a quarter of a tick after tick 17.
 
 `decode(any bytes)` gives a message whose every field has been checked, or raises `ProtocolError`.
@@ -120,6 +121,7 @@ class Ping(NamedTuple):
     """Asks for the server's time; `sent` is any number of the client's and comes back."""
 
     sent: float
+    corrections: int = 0
 
 
 class Command(NamedTuple):
@@ -249,7 +251,7 @@ KINDS: dict[int, tuple[type[Any], tuple[Check, ...]]] = {
         Inputs,
         (_first, _tick, _rows),
     ),
-    3: (Ping, (_finite,)),
+    3: (Ping, (_finite, _whole(0, COMMAND_MAX))),
     4: (Bye, (_whole(0, 4999), _text(REASON_MAX), _finite)),
     5: (Command, (_whole(0, COMMAND_MAX), _tick, _finite, _text(NAME_MAX), _bytes(PAYLOAD_MAX))),
     6: (Resync, ()),

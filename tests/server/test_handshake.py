@@ -121,6 +121,14 @@ def test_a_ping_is_answered_with_the_time_before_and_after_joining(table: Table)
     assert link.sent == [Pong(0.5, 3.0), Pong(-7, 3.25)]
 
 
+def test_reported_corrections_are_summed_up_over_clients_and_never_fall(table: Table) -> None:
+    first, second = table.connect(), table.connect()
+    for link, counts in ((first, (2, 5, 5, 1)), (second, (0, 3))):
+        for count in counts:
+            link.say(Ping(0.0, count))
+    assert table.game.counters.corrections == 8
+
+
 # -- limits --------------------------------------------------------------------------------------------------
 
 
