@@ -9,6 +9,7 @@ with Client.connect("ws://localhost:8765", name="Ann") as client:
         draw(client.view())
 """
 
+import ssl
 import time
 from collections.abc import Mapping
 from types import TracebackType
@@ -52,7 +53,15 @@ class Client:
         self._transport = transport
 
     @classmethod
-    def connect(cls, url: str, *, name: str = "", scene: Scene | None = None, timeout: float = 5.0) -> "Client":
+    def connect(
+        cls,
+        url: str,
+        *,
+        name: str = "",
+        scene: Scene | None = None,
+        timeout: float = 5.0,
+        tls: ssl.SSLContext | None = None,
+    ) -> "Client":
         """Connects to a server, and returns once it has answered; joining goes on in `poll` and `update`.
 
         Args:
@@ -60,12 +69,13 @@ class Client:
             name: shown to others, up to 32 characters.
             scene: the scene this program was built for; another one on the server ends in `Left`. None: take its.
             timeout: the longest that this may block, in seconds.
+            tls: whom to trust for wss://; None: whom the system trusts.
 
         Raises:
             ConnectError: there is no connection; the text says why and what to do.
         """
         core = Core(name, scene)
-        return cls(core, PollingTransport(Connection(url, core), timeout))
+        return cls(core, PollingTransport(Connection(url, core), timeout, tls))
 
     @property
     def joining(self) -> bool:

@@ -2,7 +2,12 @@
 
 import sys
 
-from server.app import main
+try:
+    from server.app import main
+except ModuleNotFoundError as error:
+    if (error.name or "").partition(".")[0] in ("server", "shared"):
+        raise
+    sys.exit(f"error: the server needs {error.name} as well: pip install 'sovereign-netcode[server]'")
 
 if __name__ == "__main__":
     sys.exit(main())

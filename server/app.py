@@ -4,9 +4,9 @@ import asyncio
 import contextlib
 import dataclasses
 import gc
-import logging
 import os
 import signal
+import ssl
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -14,6 +14,10 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
+import structlog
+
+from server import check, log, tokens
+from server.access import authenticator, tls_context
 from server.database import StoreError
 from server.door import Door
 from server.faults import Faults
@@ -28,23 +32,28 @@ from server.settings import Settings, parse
 from server.store import Store
 from server.ticker import Ticker, best_alarm
 from server.warmup import warm_up
+from server.watchdog import Watchdog
 from shared.checks import SceneError
 from shared.scene import Scene, load_scene
 
 READY_S = 1.0
 """Ready is who has begun a tick within so long."""
+COMMANDS = {"token": tokens.main, "check": check.main}
 STOP_S = CLOSE_S + 0.25
 """The end waits no longer than this for peers to finish closing."""
 
-logger = logging.getLogger("server")
+logger = structlog.stdlib.get_logger("server")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Runs until a signal; returns the exit code."""
+    """Runs until a signal, or one of the other commands; returns the exit code."""
     for number in _signals():
         signal.signal(number, _leave)  # until the event loop takes over
+    arguments = sys.argv[1:] if arguments is None else arguments
     try:
-        settings = parse(sys.argv[1:] if arguments is None else arguments)
+        if arguments and arguments[0] in COMMANDS:
+            return COMMANDS[arguments[0]](arguments[1:])
+        settings = parse(arguments)
         if isinstance(settings, str):
             print(settings, end="")
             return 0
@@ -59,12 +68,10 @@ def run(settings: Settings) -> int:
 
     Raises:
         SceneError: the scene cannot be used.
-        SettingsError: nor can the address, or the file to record into.
+        SettingsError: nor can the address, or one of the files.
         StoreError: nor can what was saved.
     """
-    logging.basicConfig(
-        stream=sys.stderr, level=settings.log_level.upper(), format="%(asctime)s %(levelname)s %(name)s: %(message)s"
-    )
+    log.set_up(settings.log_level, settings.log_format, sys.stderr)
     scene = load_scene(settings.scene)
     if settings.tick_rate is not None:
         scene = dataclasses.replace(scene, tick_rate=settings.tick_rate)
@@ -100,6 +107,7 @@ class Server:
         )
         self.gateway = Gateway(game, self.door, self.faults)
         self.ticker: Ticker | None = None
+        self.watchdog: Watchdog | None = None
         self.draining = False
         self.started = time.monotonic()
         self._stop: asyncio.Future[tuple[str, int]] | None = None
@@ -110,20 +118,23 @@ class Server:
         loop.set_exception_handler(self._loop_failed)
         self._stop = loop.create_future()
         with _on_signals(loop, lambda name: self._end(name, 0)):
-            host, port = await self._listen()
+            host, port = await self._listen(tls_context(self.settings))
             rate = self.game.scene.tick_rate
             if self.store is not None:
                 self.store.start(lambda: None)
             self.ticker = Ticker(rate, self.game.tick, self._broken, lambda ring: best_alarm(loop, ring))
+            self.watchdog = Watchdog(loop)
             freeze()
             kind = type(loop).__module__.partition(".")[0]
-            logger.info("started: scene %s, %d ticks/s, %s", self.game.scene.name, rate, kind)
+            logger.info("started", scene=self.game.scene.name, tick_rate=rate, loop=kind, auth=self.settings.auth)
+            scheme = "ws" if self.settings.tls_cert is None else "wss"
             shown = f"[{host}]" if ":" in host else host
-            print(f"listening on ws://{shown}:{port}", flush=True)
+            print(f"listening on {scheme}://{shown}:{port}", flush=True)
             reason, code = await self._stop
-        logger.info("stopping: %s, %d connection(s)", reason, len(self.gateway.connections))
+        self.watchdog.stop()
+        logger.info("stopping", reason=reason, connections=len(self.gateway.connections))
         await self._drain()
-        logger.info("stopped after %.0f s", time.monotonic() - self.started)
+        logger.info("stopped", after_s=round(time.monotonic() - self.started))
         return code
 
     async def _drain(self) -> None:
@@ -157,6 +168,7 @@ class Server:
             "connections": len(self.gateway.connections),
             "refused_at_door": dict(self.door.refused),
             "internal_errors": self.faults.total + figures.get("ticks_failed", 0),
+            "stalls": 0 if self.watchdog is None else self.watchdog.stalls,
             "ready": not self.unready(),
             "uptime_s": round(time.monotonic() - self.started, 3),
             "cpu_s": round(time.process_time(), 3),
@@ -169,10 +181,10 @@ class Server:
             return {}
         return {"tick_lateness_seconds": self.ticker.lateness, "tick_work_seconds": self.ticker.work}
 
-    async def _listen(self) -> tuple[str, int]:
+    async def _listen(self, tls: ssl.SSLContext | None) -> tuple[str, int]:
         host, port = self.settings.host, self.settings.port
         try:
-            return await self.gateway.listen(host, port)
+            return await self.gateway.listen(host, port, tls)
         except (OSError, UnicodeError) as error:  # UnicodeError: a host that is no host name at all
             reason = getattr(error, "strerror", None) or str(error)
             raise SettingsError(f"host = {host!r}, port = {port}: cannot listen ({reason})") from error
@@ -188,7 +200,7 @@ class Server:
         """An exception that reached the event loop, or trouble of its own, such as no file descriptor left."""
         error = context.get("exception")
         self.faults.total += 1
-        logger.error("%s", context["message"], exc_info=None if isinstance(error, OSError) else error)
+        logger.error(context["message"], error=repr(error), exc_info=None if isinstance(error, OSError) else error)
 
 
 @contextlib.contextmanager
@@ -199,7 +211,8 @@ def saved(scene: Scene, directory: str, *, power: bool) -> Iterator[Store]:
         StoreError: what is there cannot be used.
     """
     store = Store(directory, scene, power=power)
-    logger.info("%s: at tick %d, state hash %s", directory, *store.restored)
+    tick, state_hash = store.restored
+    logger.info("restored", directory=directory, tick=tick, state_hash=state_hash)
     try:
         yield store
     finally:
@@ -223,7 +236,7 @@ def recorded(scene: Scene, path: str, world: RecordedWorld | None = None) -> Ite
         world = RecordedWorld(scene)
         world.load_terrain()
     try:
-        world.record(file, lambda error: logger.error("recording into %s has ended: %s", path, error))
+        world.record(file, lambda error: logger.error("recording has ended", path=path, error=str(error)))
         yield world
         world.end_recording()
     finally:

@@ -30,6 +30,7 @@ COUNTERS = {
     "ticks_late": "Ticks that began more than one tick late.",
     "ticks_failed": "Ticks that raised.",
     "skipped_s": "Seconds that no tick stands for.",
+    "stalls": "Times that the event loop did nothing for more than half a second.",
     "joined": "Players that have come in.",
     "left": "Players that have left.",
     "resumed": "Players that have come back after a lost connection.",

@@ -9,8 +9,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NoReturn
 
+from server.door import is_loopback
 from server.kinds import Kind, SettingsError, checked, kinds_of, setting, to_toml
 from server.limits import Limits
+from server.log import FORMATS
+from server.tokens import KEY_VARIABLE
 from shared.checks import SceneError
 from shared.scene import SCENES, TICK_RATE_MAX, load_scene
 
@@ -18,6 +21,7 @@ ENV_PREFIX = "SOVEREIGN_"
 LOG_LEVELS = ("debug", "info", "warning", "error")
 
 EPILOG = f"""\
+Other commands: `python -m server token --help` (issue tokens), `python -m server check --help` (is it ready?).
 Each setting can also come from the environment ({ENV_PREFIX}PORT=9000) or from a TOML file (port = 9000; see
 --print-config). A flag wins over the environment, that over the file, and that over the default.
 The server prints one line, "listening on ws://HOST:PORT", when it is ready, and answers GET /healthz, /readyz,
@@ -35,6 +39,14 @@ class Settings:
     tick_rate: int | None = setting(
         None, Kind(int, "ticks per second, instead of the scene's own", "HZ", 1, TICK_RATE_MAX)
     )
+    auth: str = setting(
+        "none", Kind(str, "who may play: none (anyone), token (see `token --help`), or MODULE:NAME of your own", "AUTH")
+    )
+    auth_key_file: str | None = setting(
+        None, Kind(str, f"file with the key of the tokens; or the key itself in {KEY_VARIABLE}", "FILE")
+    )
+    tls_cert: str | None = setting(None, Kind(str, "file with the certificate (chain) for wss://, PEM", "FILE"))
+    tls_key: str | None = setting(None, Kind(str, "file with the certificate's key, PEM", "FILE"))
     figures: str = setting(
         "private", Kind(str, "whose addresses get /stats and /metrics", choices=("none", "loopback", "private", "all"))
     )
@@ -43,6 +55,7 @@ class Settings:
     )
     restart_s: float = setting(2.0, Kind(float, "when the server ends, clients come back after so long", "S", 0, 3600))
     log_level: str = setting("info", Kind(str, "what goes to stderr", choices=LOG_LEVELS))
+    log_format: str = setting("pretty", Kind(str, "how it looks", choices=FORMATS))
     record: str | None = setting(None, Kind(str, "record every change of the world into a new file", "FILE"))
     data: str | None = setting(None, Kind(str, "save the world there, and go on with the one that is there", "DIR"))
     durability: str = setting(
@@ -98,7 +111,26 @@ def load(flags: Mapping[str, str], environment: Mapping[str, str], config: str |
     for name, value in flags.items():
         take(name, value, "--" + name.replace("_", "-"))
     limits = Limits(**{name: values.pop(name) for name in SECTIONS["limits"] if name in values})
-    return Settings(**values, limits=limits, origins=origins)
+    settings = Settings(**values, limits=limits, origins=origins)
+    _check_together(settings)
+    return settings
+
+
+def _check_together(settings: Settings) -> None:
+    """What only makes sense together."""
+    host = settings.host
+    if "auth" not in settings.origins and not (host == "localhost" or is_loopback(host)):
+        raise SettingsError(
+            f"host = {host!r} (from {settings.origins['host']}): others can reach it, so say who may play: "
+            "--auth token, or --auth none for anyone"
+        )
+    if settings.auth not in ("none", "token") and not all(settings.auth.partition(":")):
+        raise SettingsError(
+            f"auth = {settings.auth!r} (from {settings.origins['auth']}): must be none, token, or MODULE:NAME"
+        )
+    if (settings.tls_cert is None) != (settings.tls_key is None):
+        given, missing = ("tls_cert", "tls_key") if settings.tls_key is None else ("tls_key", "tls_cert")
+        raise SettingsError(f"{given} (from {settings.origins[given]}): needs {missing} as well")
 
 
 def _entries(config: str) -> Iterator[tuple[str, object]]:

@@ -59,6 +59,7 @@ class AsyncClient:
         name: str = "",
         scene: Scene | None = None,
         timeout: float = 5.0,
+        tls: ssl.SSLContext | None = None,
         before_update: Callable[[Core], None] | None = None,
     ) -> "AsyncClient":
         """As `Client.connect`; does not block.
@@ -72,7 +73,7 @@ class AsyncClient:
         try:
             async with asyncio.timeout(timeout):
                 await client._loop.create_connection(
-                    lambda: _Stream(client), uri.host, uri.port, ssl=True if uri.secure else None
+                    lambda: _Stream(client), uri.host, uri.port, ssl=(tls or True) if uri.secure else None
                 )
                 await client._answered
         except ConnectError:

@@ -19,17 +19,18 @@ class PollingTransport:
 
     Args:
         timeout: seconds that the handshake may take altogether; until then this blocks.
+        tls: whom to trust for wss://; None: whom the system trusts.
 
     Raises:
         ConnectError: there is no connection; the text says why.
     """
 
-    def __init__(self, connection: Connection, timeout: float) -> None:
+    def __init__(self, connection: Connection, timeout: float, tls: ssl.SSLContext | None = None) -> None:
         self._connection = connection
         self._buffer = memoryview(bytearray(READ_BYTES))
         self._unsent = bytearray()
         deadline = time.monotonic() + timeout
-        self._socket: socket.socket | None = _connected(connection, timeout)
+        self._socket: socket.socket | None = _connected(connection, timeout, tls)
         try:
             self._socket.setblocking(False)
             self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
@@ -121,14 +122,15 @@ class PollingTransport:
         self._unsent.clear()
 
 
-def _connected(connection: Connection, timeout: float) -> socket.socket:
+def _connected(connection: Connection, timeout: float, tls: ssl.SSLContext | None) -> socket.socket:
     """A stream to the server: TCP, in TLS if the address says so."""
     uri = connection.uri
     with contextlib.ExitStack() as undo:
         try:
             sock = undo.enter_context(socket.create_connection((uri.host, uri.port), timeout))
             if uri.secure:
-                sock = ssl.create_default_context().wrap_socket(sock, server_hostname=uri.host)
+                tls = tls or ssl.create_default_context()
+                sock = undo.enter_context(tls.wrap_socket(sock, server_hostname=uri.host))
         except ssl.SSLError as error:
             raise ConnectError(f"{connection.url}: no secure connection ({error.reason or error})") from error
         except OSError as error:

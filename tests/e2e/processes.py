@@ -32,7 +32,7 @@ class ServerProcess:
         self.process = subprocess.Popen(
             [sys.executable, "-m", "server", *arguments],
             cwd=ROOT,
-            env=clean | environment,
+            env=clean | {"SOVEREIGN_LOG_FORMAT": "json"} | environment,
             stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
@@ -60,7 +60,7 @@ class ServerProcess:
     def address(self) -> tuple[str, int]:
         """Waits for the line that says it is ready."""
         line = self.out.get(timeout=START_S)
-        found = re.fullmatch(r"listening on ws://(\[[^]]+\]|[^:]+):(\d+)\n", line or "")
+        found = re.fullmatch(r"listening on wss?://(\[[^]]+\]|[^:]+):(\d+)\n", line or "")
         assert found, (line, self.errors)
         return found[1].strip("[]"), int(found[2])
 
@@ -72,6 +72,11 @@ class ServerProcess:
         for reader in self._readers:
             reader.join(END_S)
         return code
+
+    def log(self, *, but: str = "") -> list[dict[str, Any]]:
+        """What it has logged so far, but for what is of one level."""
+        entries = [json.loads(line) for line in self.errors]
+        return [entry for entry in entries if entry["level"] != but]
 
     def rest(self) -> list[str]:
         """The lines on stdout that nobody has read yet."""

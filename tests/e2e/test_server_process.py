@@ -8,18 +8,22 @@ import signal
 import socket
 import sys
 import time
+import urllib.error
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
-from websockets.exceptions import ConnectionClosed
+from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import ClientConnection, connect
 
+from client_sdk.client import Client
 from shared.messages import VERSION, Bye, Hello, Inputs, Message, Welcome, decode_from_server, encode
 from tests.e2e.processes import END_S, START_S, UPGRADE, ServerProcess, page, running, stats, until
 
 pytestmark = pytest.mark.e2e
+
+SUSPENDED_S = 3.0
 
 
 @contextmanager
@@ -66,7 +70,9 @@ def test_serves_and_tells_its_clients_when_it_ends() -> None:
         assert server.end() == 0
         assert time.monotonic() - asked < 4
         assert server.rest() == []
-        assert [line.split()[2] for line in server.errors] == ["INFO"] * 3, server.errors
+        assert [(entry["level"], entry["event"]) for entry in server.log()] == [
+            ("info", "started"), ("info", "stopping"), ("info", "stopped"),
+        ]  # fmt: skip
 
 
 @contextmanager
@@ -87,6 +93,61 @@ def test_a_client_that_does_not_answer_does_not_keep_it(number: signal.Signals) 
             asked = time.monotonic()
             assert server.end(number) == 0
             assert time.monotonic() - asked < 4
+
+
+def status(address: tuple[str, int], path: str) -> tuple[int, str]:
+    try:
+        return 200, page(address, path)
+    except urllib.error.HTTPError as error:
+        with error:
+            return error.code, error.read().decode()
+
+
+def test_while_it_goes_down_it_says_so_and_nobody_comes_in() -> None:
+    with running("--port", "0", "--scene", "flat", "--restart-s", "7") as server:
+        address = server.address()
+        with mute(address):  # its closing is waited for
+            until(lambda: status(address, "/readyz") == (200, "ready\n"))
+            server.process.send_signal(signal.SIGTERM)
+            until(lambda: status(address, "/readyz") == (503, "not ready: draining\n"))
+            with pytest.raises(InvalidStatus) as refused:
+                connect(f"ws://{address[0]}:{address[1]}")
+            assert refused.value.response.status_code == 503
+            assert refused.value.response.headers["Retry-After"] == "7"
+            assert server.end() == 0
+
+
+@pytest.mark.skipif(os.name == "nt", reason="there is no such signal")
+def test_a_suspended_server_goes_on_and_so_do_its_clients() -> None:
+    """3 s without a turn: a few ticks are made up for, the rest is given up, and nobody has to come back."""
+    with running("--port", "0", "--scene", "flat") as server:
+        address = server.address()
+        with Client.connect("ws://{}:{}".format(*address), name="Ann") as client:
+
+            def runs(seconds: float = 0.0, snapshots: int = 0) -> None:
+                """Plays for so long and until so many more snapshots have come."""
+                until, wanted = time.monotonic() + seconds, client.stats.snapshots + snapshots
+                give_up = until + END_S
+                while time.monotonic() < until or client.stats.snapshots < wanted:
+                    assert time.monotonic() < give_up
+                    client.poll()
+                    client.set_input(1, 0)
+                    client.update()
+                    time.sleep(0.005)
+
+            runs(snapshots=32)
+            before = stats(address)
+            server.process.send_signal(signal.SIGSTOP)
+            runs(seconds=SUSPENDED_S)
+            server.process.send_signal(signal.SIGCONT)
+            runs(snapshots=64)
+            assert client.playing
+            assert client.stats.divergences == 0
+            after = stats(address)
+            assert after["skipped_s"] - before["skipped_s"] >= SUSPENDED_S - 1
+            assert (after["clients"], after["kicked"], after["internal_errors"]) == (1, 0, 0)
+        assert server.end(signal.SIGTERM) == 0
+        assert "the process was suspended, or got no CPU" in [entry["event"] for entry in server.log(but="info")]
 
 
 @pytest.mark.skipif(os.name == "nt", reason="a signal ends a process there")
@@ -146,6 +207,9 @@ def test_bad_settings(tmp_path: Path) -> None:
     assert fails("--port", "x") == "error: port = 'x' (from --port): must be a whole number from 0 to 65535\n"
     assert "--prot" in fails("--prot", "1")
     assert "tick_rate = 0 (from SOVEREIGN_TICK_RATE)" in fails(SOVEREIGN_TICK_RATE="0")
+    assert "auth_key_file is not set" in fails("--auth", "token")
+    assert "auth = 'no.such:thing': cannot be used" in fails("--auth", "no.such:thing")
+    assert "tls_cert = 'nowhere'" in fails("--tls-cert", "nowhere", "--tls-key", "nowhere")
     assert "no_such" in fails("--config", broken(tmp_path, "no_such = 1"))
 
 
@@ -165,6 +229,26 @@ def test_bad_addresses() -> None:
         assert "in use" in line
     assert "no.such.host.invalid" in fails("--scene", "flat", "--host", "no.such.host.invalid")
     assert "a..b" in fails("--scene", "flat", "--host", "a..b")
+
+
+def other(*arguments: str) -> tuple[int, list[str]]:
+    """Exit code and output of one of the other commands."""
+    with running(*arguments) as command:
+        return command.end(), command.rest()
+
+
+def test_check_says_whether_a_server_is_ready() -> None:
+    with running("--port", "0", "--scene", "flat") as server:
+        port = server.address()[1]
+        url = f"http://127.0.0.1:{port}/readyz"
+        until(lambda: stats(("127.0.0.1", port))["ready"])
+        assert other("check", "--url", url) == (0, ["ready\n"])
+        assert other("check", "--url", f"http://127.0.0.1:{port}/x") == (1, ["/x: no such page\n"])
+        assert server.end(signal.SIGTERM) == 0
+    code, lines = other("check", "--url", url)
+    assert (code, len(lines)) == (1, 1)
+    assert "no answer" in lines[0]
+    assert "must begin with http" in fails("check", "--url", "ws://x")
 
 
 async def storm(address: tuple[str, int]) -> None:
@@ -202,4 +286,4 @@ def test_rubbish_leaves_no_trace_and_the_ticks_go_on() -> None:
             assert stats(address)["internal_errors"] == 0
             assert stats(address)["clients"] == 1
         assert server.end(signal.SIGTERM) == 0
-        assert [line for line in server.errors if " INFO " not in line] == []
+        assert server.log(but="info") == []

@@ -32,13 +32,14 @@ def test_defaults() -> None:
 
 def test_each_source_wins_over_the_one_before(tmp_path: Path) -> None:
     path = config(tmp_path, 'host = "a"\nport = 1\nscene = "flat"\ntick_rate = 10')
-    environment = {"SOVEREIGN_PORT": "2", "SOVEREIGN_SCENE": "arena", "UNRELATED": "x"}
+    environment = {"SOVEREIGN_PORT": "2", "SOVEREIGN_SCENE": "arena", "SOVEREIGN_AUTH": "none", "UNRELATED": "x"}
     found = settings(["--config", path, "--scene", "topdown"], environment)
     assert (found.host, found.port, found.scene, found.tick_rate) == ("a", 2, "topdown", 10)
     assert found.origins == {
         "host": f"file {path}",
         "port": "SOVEREIGN_PORT",
         "scene": "--scene",
+        "auth": "SOVEREIGN_AUTH",
         "tick_rate": f"file {path}",
     }
 
@@ -141,6 +142,34 @@ def test_a_flag_of_truth_needs_no_value() -> None:
     environment = {"SOVEREIGN_LOOPBACK_EXEMPT": "no"}
     assert settings(["--loopback-exempt", "--port", "1"], environment).limits.loopback_exempt is True
     assert settings(["--loopback-exempt", "false"]).limits.loopback_exempt is False
+
+
+@pytest.mark.parametrize("host", ["0.0.0.0", "::", "192.168.1.1", "play.example"])
+def test_who_may_play_is_said_where_others_can_reach_it(host: str) -> None:
+    with pytest.raises(SettingsError, match="say who may play"):
+        parse(["--host", host], {})
+    assert settings(["--host", host, "--auth", "none"]).auth == "none"
+    assert settings(["--host", host], {"SOVEREIGN_AUTH": "token"}).auth == "token"
+
+
+@pytest.mark.parametrize("host", ["127.0.0.1", "127.9.9.9", "::1", "localhost"])
+def test_anyone_may_play_where_only_this_machine_is(host: str) -> None:
+    assert settings(["--host", host]).auth == "none"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--auth", "x"], "auth = 'x' (from --auth): must be none, token, or MODULE:NAME"),
+        (["--auth", ":x"], "auth = ':x' (from --auth): must be none, token, or MODULE:NAME"),
+        (["--tls-cert", "c"], "tls_cert (from --tls-cert): needs tls_key as well"),
+        (["--tls-key", "k"], "tls_key (from --tls-key): needs tls_cert as well"),
+    ],
+)
+def test_what_only_makes_sense_together(arguments: list[str], message: str) -> None:
+    with pytest.raises(SettingsError) as error:
+        parse(arguments, {})
+    assert str(error.value) == message
 
 
 def test_limits_stand_in_a_table_of_their_own(tmp_path: Path) -> None:

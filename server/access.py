@@ -1,0 +1,46 @@
+"""From settings to what decides on players, and to what speaks TLS for the server."""
+
+import importlib
+import os
+import ssl
+
+from server import tokens
+from server.auth import Authenticator
+from server.kinds import SettingsError
+from server.settings import Settings
+
+
+def authenticator(settings: Settings) -> Authenticator | None:
+    """What decides on players, as the settings say; None: whoever comes may play.
+
+    Raises:
+        SettingsError: there is no key, or no such object.
+    """
+    if settings.auth == "none":
+        return None
+    if settings.auth == "token":
+        return tokens.Tokens(tokens.read_key(settings.auth_key_file, os.environ))
+    module, _, name = settings.auth.partition(":")
+    try:
+        found: Authenticator = getattr(importlib.import_module(module), name)
+    except (ImportError, AttributeError) as error:
+        raise SettingsError(f"auth = {settings.auth!r}: cannot be used ({error})") from error
+    return found
+
+
+def tls_context(settings: Settings) -> ssl.SSLContext | None:
+    """What speaks TLS for the server; None: nothing does.
+
+    Raises:
+        SettingsError: a file cannot be used.
+    """
+    if settings.tls_cert is None or settings.tls_key is None:
+        return None
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+    context.minimum_version = ssl.TLSVersion.TLSv1_2
+    try:
+        context.load_cert_chain(settings.tls_cert, settings.tls_key)
+    except OSError as error:  # an SSLError is one
+        files = f"tls_cert = {settings.tls_cert!r}, tls_key = {settings.tls_key!r}"
+        raise SettingsError(f"{files}: cannot be used ({error.strerror or error})") from error
+    return context

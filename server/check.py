@@ -1,0 +1,45 @@
+"""`python -m server check`: whether a server is ready, as an exit code, for containers and service managers."""
+
+import argparse
+import http.client
+import os
+import ssl
+import urllib.error
+import urllib.request
+from collections.abc import Mapping, Sequence
+
+from server.kinds import SettingsError
+
+TIME_OUT_S = 3.0
+
+
+def main(arguments: Sequence[str], environment: Mapping[str, str] = os.environ) -> int:
+    """Asks a server's `/readyz`; 0 if it is ready, else 1. Prints what it says.
+
+    Raises:
+        SettingsError: the address is none.
+    """
+    port = environment.get("SOVEREIGN_PORT", "8765")
+    scheme = "https" if "SOVEREIGN_TLS_CERT" in environment else "http"
+    parser = argparse.ArgumentParser(
+        prog="python -m server check", description="Exit code 0 if the server is ready for players.", allow_abbrev=False
+    )
+    default = f"{scheme}://127.0.0.1:{port}/readyz"
+    parser.add_argument("--url", default=default, help=f"what to ask (default: {default})")
+    url = parser.parse_args(arguments).url
+    if not url.startswith(("http://", "https://")):
+        raise SettingsError(f"url = {url!r}: must begin with http:// or https://")
+    # It asks whether the server works, often by another name than the one in its certificate: nothing is kept secret.
+    trusting = ssl.create_default_context()
+    trusting.check_hostname, trusting.verify_mode = False, ssl.CERT_NONE
+    opener = urllib.request.build_opener(urllib.request.ProxyHandler({}), urllib.request.HTTPSHandler(context=trusting))
+    try:
+        with opener.open(url, timeout=TIME_OUT_S) as answer:
+            print(answer.read(1000).decode(errors="replace").strip())
+        return 0
+    except urllib.error.HTTPError as error:
+        with error:
+            print(error.read(1000).decode(errors="replace").strip() or error.code)
+    except (OSError, ValueError, http.client.HTTPException) as error:
+        print(f"no answer from {url} ({getattr(error, 'reason', None) or error})")
+    return 1

@@ -1,0 +1,86 @@
+"""Lines for people and for machines, and what is never in one."""
+
+import io
+import json
+import logging
+from collections.abc import Iterator
+
+import pytest
+import structlog
+
+from server import log
+from server.tokens import issue
+
+TOKEN = issue(b"k" * 32, "ann", 3600, 1.8e9)
+
+
+@pytest.fixture(autouse=True)
+def _as_before() -> Iterator[None]:
+    root = logging.getLogger()
+    handlers, level = root.handlers[:], root.level
+    yield
+    root.handlers[:] = handlers
+    root.setLevel(level)
+    logging.captureWarnings(capture=False)
+    structlog.reset_defaults()
+
+
+def lines(form: str, level: str = "info") -> io.StringIO:
+    stream = io.StringIO()
+    log.set_up(level, form, stream)
+    return stream
+
+
+def test_both_kinds_of_loggers_give_one_line_of_json_each() -> None:
+    stream = lines("json")
+    structlog.stdlib.get_logger("server").info("started", scene="flat", tick_rate=32)
+    logging.getLogger("server.gateway").warning("internal error in %s", "open")
+    logging.getLogger("server").debug("not this")
+    first, second = map(json.loads, stream.getvalue().splitlines())
+    assert first.pop("timestamp").endswith("Z")
+    assert first == {"event": "started", "scene": "flat", "tick_rate": 32, "level": "info", "logger": "server"}
+    assert (second["event"], second["level"]) == ("internal error in open", "warning")
+
+
+def test_a_stack_is_one_field_of_one_line() -> None:
+    stream = lines("json")
+    try:
+        _ = 1 // 0
+    except ZeroDivisionError:
+        logging.getLogger("a").exception("broken")
+        structlog.stdlib.get_logger("b").exception("broken")
+    found = [json.loads(line) for line in stream.getvalue().splitlines()]
+    assert ["ZeroDivisionError" in entry["exception"] for entry in found] == [True, True]
+
+
+def test_people_read_the_same() -> None:
+    stream = lines("pretty")
+    structlog.stdlib.get_logger("server").info("started", scene="flat")
+    logging.getLogger("x").error("cannot %s", "read")
+    first, second = stream.getvalue().splitlines()
+    assert "started" in first
+    assert "scene=flat" in first
+    assert "\033" not in first, "no colours where nobody sees them"
+    assert "error" in second
+    assert "cannot read" in second
+
+
+@pytest.mark.parametrize("form", log.FORMATS)
+def test_no_token_is_in_any_line(form: str) -> None:
+    stream = lines(form)
+    logger = structlog.stdlib.get_logger("server")
+    hidden_in_a_local_variable = TOKEN
+    logger.info("joined", token=TOKEN, resume=b"opaque", name="ann")
+    logger.info("joined", hello={"token": TOKEN})
+    logger.info(f"asked for /?token={TOKEN}")
+    logging.getLogger("x").warning("request %r", f"GET /?t={TOKEN} HTTP/1.1")
+    try:
+        raise ValueError(f"token {hidden_in_a_local_variable}")
+    except ValueError:
+        logger.exception("broken")
+        logging.getLogger("x").exception("broken")
+    text = stream.getvalue()
+    assert not any(part in text for part in TOKEN.split("."))
+    assert "opaque" not in text
+    assert text.count(log.HIDDEN) >= 7
+    assert "name" in text

@@ -1,0 +1,114 @@
+"""A loop that stalls, and what is said about it. Nothing here depends on how fast the machine is."""
+
+import asyncio
+import threading
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import pytest
+
+from server import watchdog as module
+from server.watchdog import Watchdog
+
+TIME_OUT_S = 10.0
+STALL_S = 0.02
+
+
+class Ears:
+    """What the watchdog says, from its thread."""
+
+    def __init__(self) -> None:
+        self.said: list[tuple[str, dict[str, Any]]] = []
+        self._heard = threading.Condition()
+
+    def warning(self, event: str, **values: Any) -> None:
+        with self._heard:
+            self.said.append((event, values))
+            self._heard.notify_all()
+
+    def wait_for(self, event: str) -> dict[str, Any]:
+        """Blocks whoever calls, until that has been said."""
+        with self._heard:
+            assert self._heard.wait_for(lambda: self._found(event) is not None, TIME_OUT_S), self.said
+            found = self._found(event)
+        assert found is not None
+        return found
+
+    def _found(self, event: str) -> dict[str, Any] | None:
+        return next((values for said, values in self.said if said == event), None)
+
+
+@pytest.fixture
+def ears(monkeypatch: pytest.MonkeyPatch) -> Ears:
+    ears = Ears()
+    monkeypatch.setattr(module, "logger", ears)
+    return ears
+
+
+@pytest.fixture
+def watch(ears: Ears) -> Iterator[Callable[..., Watchdog]]:
+    """Makes watchdogs, which end with the test. A thread that gets no CPU on a busy machine is not its subject."""
+    made: list[Watchdog] = []
+
+    def make(**options: float) -> Watchdog:
+        made.append(Watchdog(asyncio.get_running_loop(), **{"asleep_s": 60.0, **options}))
+        return made[-1]
+
+    yield make
+    for watchdog in made:
+        watchdog.stop()
+
+
+Watch = Callable[..., Watchdog]
+
+
+async def test_a_stalled_loop_is_told_of_with_its_stack_and_so_is_its_end(ears: Ears, watch: Watch) -> None:
+    watchdog = watch(stall_s=STALL_S, beat_s=STALL_S / 4)
+
+    def this_holds_up_the_loop() -> dict[str, Any]:
+        return ears.wait_for("the event loop has stalled")
+
+    values = this_holds_up_the_loop()
+    assert "this_holds_up_the_loop" in values["stack"]
+    assert values["for_s"] >= STALL_S
+    values = await asyncio.to_thread(ears.wait_for, "the event loop goes on")
+    assert values["stalled_s"] > STALL_S
+    assert watchdog.stalls >= 1
+
+
+async def test_stacks_are_not_repeated_but_stalls_are_counted(ears: Ears, watch: Watch) -> None:
+    watchdog = watch(stall_s=STALL_S, beat_s=STALL_S / 4)
+    for n in range(3):
+        pause, counted = threading.Event(), watchdog.stalls
+        for _ in range(500):
+            if watchdog.stalls > counted:
+                break
+            pause.wait(STALL_S)  # without a turn for the loop
+        assert watchdog.stalls > counted, n
+        latest = watchdog._latest
+        while watchdog._latest == latest:  # noqa: ASYNC110 - the loop's turn
+            await asyncio.sleep(0.001)
+    assert [event for event, _ in ears.said].count("the event loop has stalled") == 1
+
+
+async def test_a_loop_that_has_its_turns_is_left_alone(ears: Ears, watch: Watch) -> None:
+    watchdog = watch(stall_s=60.0, beat_s=0.001)
+    for _ in range(100):
+        await asyncio.sleep(0.001)
+    watchdog.stop()
+    watchdog.stop()
+    assert (ears.said, watchdog.stalls) == ([], 0)
+
+
+@pytest.mark.parametrize(
+    ("cpu_s", "said"),
+    [
+        (0.0, "the process was suspended, or got no CPU"),
+        (2.9, "code that held the interpreter has stalled the event loop"),
+    ],
+)
+async def test_where_the_thread_had_no_turn_either_cpu_time_tells_why(
+    ears: Ears, watch: Watch, cpu_s: float, said: str
+) -> None:
+    watch(stall_s=60.0)._say_asleep(3.0, cpu_s)
+    assert ears.said == [(said, {"for_s": 3.0})]
