@@ -72,6 +72,8 @@ def run(settings: Settings) -> int:
         StoreError: nor can what was saved.
     """
     log.set_up(settings.log_level, settings.log_format, sys.stderr)
+    if authenticator(settings) is not None:
+        raise SettingsError(f"auth = {settings.auth!r}: clients of this version cannot show tokens")
     scene = load_scene(settings.scene)
     if settings.tick_rate is not None:
         scene = dataclasses.replace(scene, tick_rate=settings.tick_rate)

@@ -32,7 +32,11 @@ def set_up(level: str, form: str, stream: TextIO) -> None:
     else:
         last = structlog.dev.ConsoleRenderer(colors=stream.isatty())
     structlog.configure(
-        processors=[structlog.stdlib.PositionalArgumentsFormatter(), *first, structlog.stdlib.ProcessorFormatter.wrap_for_formatter],
+        processors=[
+            structlog.stdlib.PositionalArgumentsFormatter(),
+            *first,
+            structlog.stdlib.ProcessorFormatter.wrap_for_formatter,
+        ],
         logger_factory=structlog.stdlib.LoggerFactory(),
         wrapper_class=structlog.stdlib.BoundLogger,
     )
