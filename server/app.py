@@ -72,8 +72,7 @@ def run(settings: Settings) -> int:
         StoreError: nor can what was saved.
     """
     log.set_up(settings.log_level, settings.log_format, sys.stderr)
-    if authenticator(settings) is not None:
-        raise SettingsError(f"auth = {settings.auth!r}: clients of this version cannot show tokens")
+    authenticate = authenticator(settings)
     scene = load_scene(settings.scene)
     if settings.tick_rate is not None:
         scene = dataclasses.replace(scene, tick_rate=settings.tick_rate)
@@ -85,7 +84,8 @@ def run(settings: Settings) -> int:
             world = store.world
         if settings.record is not None:
             world = stack.enter_context(recorded(scene, settings.record, world))
-        return runner.run(Server(settings, Game(scene, limits=settings.limits, world=world), store).serve())
+        game = Game(scene, limits=settings.limits, world=world, authenticate=authenticate)
+        return runner.run(Server(settings, game, store).serve())
 
 
 class Server:

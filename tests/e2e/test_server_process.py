@@ -18,7 +18,8 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import ClientConnection, connect
 
 from client_sdk.client import Client
-from shared.messages import VERSION, Bye, Hello, Inputs, Message, Welcome, decode_from_server, encode
+from server.tokens import issue
+from shared.messages import UNAUTHORISED, VERSION, Bye, Hello, Inputs, Message, Welcome, decode_from_server, encode
 from tests.e2e.processes import END_S, START_S, UPGRADE, ServerProcess, page, running, stats, until
 
 pytestmark = pytest.mark.e2e
@@ -93,6 +94,38 @@ def test_a_client_that_does_not_answer_does_not_keep_it(number: signal.Signals) 
             asked = time.monotonic()
             assert server.end(number) == 0
             assert time.monotonic() - asked < 4
+
+
+def test_players_show_tokens_which_are_in_no_log(tmp_path: Path) -> None:
+    key = tmp_path / "key"
+    key.write_text("k" * 32)
+    code, lines = other("token", "--subject", "ann", "--hours", "1", "--auth-key-file", str(key))
+    assert code == 0
+    good = lines[0].strip()
+    forged = issue(b"o" * 32, "ann", 3600, time.time())
+    with running(
+        "--port", "0", "--scene", "flat", "--auth", "token", "--auth-key-file", str(key), "--log-level", "debug"
+    ) as server:
+        address = server.address()
+        assert says(address, Hello(VERSION, {}, "ann", good)) is Welcome
+        for token, reason in (("", "asks for a token"), (forged, "another key"), (good[:-4] + "AAAA", "another key")):
+            bye = says(address, Hello(VERSION, {}, "eve", token))
+            assert isinstance(bye, Bye)
+            assert bye.code == UNAUTHORISED
+            assert reason in bye.reason
+        assert page(address, f"/healthz?token={good}") == "ok\n"
+        assert server.end(signal.SIGTERM) == 0
+        text = "".join(server.errors)
+        assert not [part for token in (good, forged) for part in token.split(".")[1:] if part in text]
+        assert server.log(), "there is a log to look at"
+
+
+def says(address: tuple[str, int], hello: Hello) -> type[Welcome] | Message:
+    """The last word of a server before it closes; `Welcome` if it is one."""
+    with connect(f"ws://{address[0]}:{address[1]}", compression=None, max_queue=None) as link:
+        link.send(encode(hello))
+        answer = decode_from_server(link.recv(END_S, decode=False))
+        return Welcome if isinstance(answer, Welcome) else answer
 
 
 def status(address: tuple[str, int], path: str) -> tuple[int, str]:
