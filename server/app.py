@@ -28,6 +28,7 @@ from server.kinds import SettingsError
 from server.metrics import metrics_page
 from server.pages import Pages, json_page, ready_page
 from server.recorder import RecordedWorld
+from server.rules import Rules, RulesError, load_rules
 from server.settings import Settings, parse
 from server.store import Store
 from server.ticker import Ticker, best_alarm
@@ -58,7 +59,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             print(settings, end="")
             return 0
         return run(settings)
-    except (SettingsError, SceneError, StoreError) as error:
+    except (SettingsError, SceneError, StoreError, RulesError) as error:
         print("error:", *str(error).split(), file=sys.stderr)
         return 2
 
@@ -67,15 +68,18 @@ def run(settings: Settings) -> int:
     """Serves one world; returns the exit code.
 
     Raises:
-        SceneError: the scene cannot be used.
+        RulesError: the game cannot be used.
+        SceneError: nor can the scene.
         SettingsError: nor can the address, or one of the files.
         StoreError: nor can what was saved.
     """
     log.set_up(settings.log_level, settings.log_format, sys.stderr)
     authenticate = authenticator(settings)
-    scene = load_scene(settings.scene)
+    rules = Rules() if settings.game is None else load_rules(settings.game)
+    scene = load_scene(settings.scene if "scene" in settings.origins else rules.scene or settings.scene)
     if settings.tick_rate is not None:
         scene = dataclasses.replace(scene, tick_rate=settings.tick_rate)
+    scene = rules.prepare(scene)
     warm_up(scene)
     with asyncio.Runner(loop_factory=_loop_factory()) as runner, contextlib.ExitStack() as stack:
         store = world = None
@@ -84,7 +88,15 @@ def run(settings: Settings) -> int:
             world = store.world
         if settings.record is not None:
             world = stack.enter_context(recorded(scene, settings.record, world))
-        game = Game(scene, limits=settings.limits, world=world, authenticate=authenticate)
+        game = Game(
+            scene,
+            limits=settings.limits,
+            world=world,
+            saves=store,
+            rules=rules,
+            seed=settings.seed,
+            authenticate=authenticate,
+        )
         return runner.run(Server(settings, game, store).serve())
 
 
@@ -123,7 +135,7 @@ class Server:
             host, port = await self._listen(tls_context(self.settings))
             rate = self.game.scene.tick_rate
             if self.store is not None:
-                self.store.start(lambda: None)
+                self.store.start(self.game.keep)
             self.ticker = Ticker(rate, self.game.tick, self._broken, lambda ring: best_alarm(loop, ring))
             self.watchdog = Watchdog(loop)
             freeze()

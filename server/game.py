@@ -10,15 +10,17 @@ through.
 
 import dataclasses
 import hashlib
+import math
 import secrets
 from collections.abc import Callable, Iterator
 from itertools import count
 from typing import Any
 
+from server import keeping
 from server.counters import Counters
 from server.delivery import Delivery
 from server.limits import Limits
-from server.recorder import RecordedWorld
+from server.recorder import RecordedWorld, Saves
 from server.rewind import Past, Rewind
 from server.rules import Rules
 from server.session import Link, Player, Session
@@ -57,7 +59,9 @@ class Game:
         limits: bounds.
         compiled: as for `World`.
         world: to be played in, with its blocks; by default a new one.
+        saves: where that world is saved, if it is: the game goes on with what was kept beside it.
         rules: what happens beyond moving and editing.
+        seed: of their randomness.
         authenticate: gives the subject of the token that a client shows; a `ValueError` of it refuses the client,
             with its text. None: whoever comes may play.
     """
@@ -69,7 +73,9 @@ class Game:
         limits: Limits | None = None,
         compiled: bool | None = None,
         world: RecordedWorld | None = None,
+        saves: Saves | None = None,
         rules: Rules | None = None,
+        seed: int = 0,
         authenticate: Callable[[str], str] | None = None,
     ) -> None:
         self.scene = scene
@@ -80,7 +86,10 @@ class Game:
         self.world = world
         self.rewind = Rewind(self.world)
         self.counters = Counters()
-        self.stage = Stage(self.world, self.rewind, self.counters, rules or Rules())
+        kept = None
+        if saves is not None and self.world.tick > 0:
+            kept = keeping.restored([*(saves.kept or ()), *(value for _, value in saves.notes)])
+        self.stage = Stage(self.world, self.rewind, self.counters, rules or Rules(), kept=kept, seed=seed)
         self.log = self.stage.log
         self.delivery = Delivery(self.world, self.log, self.limits, self.counters)
         self.sessions: list[Session] = []
@@ -164,6 +173,10 @@ class Game:
                 session.send(encode(Bye(messages.GOING_AWAY, reason, wait)))
                 session.close(messages.GOING_AWAY, reason)
 
+    def keep(self) -> list[list[Any]]:
+        """What belongs to the game and is not in its world, for a checkpoint."""
+        return keeping.whole(self.stage.kept)
+
     def rewound(self, session: Session, seen: float) -> Past:
         """The world as a client saw it; ask between two ticks, or for a command within one.
 
@@ -195,6 +208,9 @@ class Game:
         self._check_clocks(now)
 
     def _leave(self, now: float) -> None:
+        for player in self.players.values():
+            if player.session is None and player.away_until == math.inf:  # the server has been away
+                player.away_until = now + self.limits.resume_s
         self._leaving += [player for player in self.players.values() if now >= player.away_until]
         for player in self._leaving:
             if self.players.pop(player.entity, None) is not None:
@@ -222,6 +238,7 @@ class Game:
                 session.seat(player)
             token = secrets.token_bytes(messages.RESUME_BYTES)
             player.tokens.append(_digest(token))
+            self.world.note(keeping.note_of(player))
             session.send(encode(Welcome(messages.VERSION, self.world.tick, player.entity, self._rules, token)))
 
     def _returning(self, session: Session, hello: Hello) -> Player | None:
@@ -255,7 +272,9 @@ class Game:
                 if player.session is not None and player.session.closed:
                     break
                 command = player.commands.popleft()
-                player.settle(command.number, self._carry_out(player, command))
+                verdict = self._carry_out(player, command)
+                player.settle(command.number, verdict)
+                self.world.note([keeping.ANSWERED, player.entity, command.number, verdict])
 
     def _carry_out(self, player: Player, command: Command) -> int:
         if command.name != edits.NAME:

@@ -47,10 +47,13 @@ class Saves(Protocol):
 
     kept: Any
     """What the game's `keep()` returned for the checkpoint that was loaded; None for a new world."""
-    notes: Sequence[tuple[int, Any]]
-    """What was noted since then, in order, each with the tick that came next."""
     trouble: str
     """Why nothing can be saved just now; empty if all is well. Commands are refused while it lasts."""
+
+    @property
+    def notes(self) -> Sequence[tuple[int, Any]]:
+        """What was noted since then, in order, each with the tick that came next."""
+        ...
 
     @property
     def durable_tick(self) -> int:

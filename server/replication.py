@@ -63,7 +63,11 @@ class ChangeLog:
         self._said: set[int] = set()
         self._ticks: Ring[_Tick] = Ring(HISTORY)
         self._now = _Tick()
-        self._home: dict[int, Cell] = {}
+        states = world.states()
+        homes = (states[:, X : X + 3] >> (BLOCK_SHIFT + SEGMENT_SHIFT)).tolist()
+        self._home: dict[int, Cell] = {
+            entity: (x, y, z) for entity, (x, y, z) in zip(states[:, ID].tolist(), homes, strict=True)
+        }
         self._changed: dict[int, set[Cell] | None] = {}
         self._parts: dict[int, _Parts] = {}
         self._packed: dict[Cell, tuple[int, bytes]] = {}

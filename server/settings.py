@@ -56,6 +56,8 @@ class Settings:
     restart_s: float = setting(2.0, Kind(float, "when the server ends, clients come back after so long", "S", 0, 3600))
     log_level: str = setting("info", Kind(str, "what goes to stderr", choices=LOG_LEVELS))
     log_format: str = setting("pretty", Kind(str, "how it looks", choices=FORMATS))
+    game: str | None = setting(None, Kind(str, "the rules of a game: a module and a class in it", "MODULE:CLASS"))
+    seed: int = setting(0, Kind(int, "of the randomness of those rules", "N", 0, (1 << 63) - 1))
     record: str | None = setting(None, Kind(str, "record every change of the world into a new file", "FILE"))
     data: str | None = setting(None, Kind(str, "save the world there, and go on with the one that is there", "DIR"))
     durability: str = setting(

@@ -12,6 +12,8 @@ from typing import Any
 
 from server.contacts import Contacts
 from server.counters import Counters
+from server.keeping import LEFT, SAID, SHARED, Kept
+from server.recorder import RecordedWorld
 from server.replication import ChangeLog
 from server.rewind import Past, Rewind
 from server.rules import Rules
@@ -23,7 +25,6 @@ from shared.inputs import Input, make_input
 from shared.layout import TEMPLATE
 from shared.messages import Command, Happened, ProtocolError, Shared, encode, pack_value, unpack_value
 from shared.scene import Scene
-from shared.world import World
 
 ATTRIBUTES_MAX = 32
 """So many attributes an entity may have, and so many values the game may share,"""
@@ -43,21 +44,31 @@ class Stage:
     Methods that name an entity raise `KeyError` if there is none of that id; those that take values, `SceneError`.
     """
 
-    def __init__(self, world: World, rewind: Rewind, counters: Counters, rules: Rules, seed: int = 0) -> None:
-        self.players: dict[int, Player] = {}
+    def __init__(
+        self,
+        world: RecordedWorld,
+        rewind: Rewind,
+        counters: Counters,
+        rules: Rules,
+        *,
+        kept: Kept | None = None,
+        seed: int = 0,
+    ) -> None:
+        self.kept = kept or Kept({}, {}, {})
+        self.players = self.kept.players
         """Who plays, by entity, in the order in which they joined; also who is cut off and may come back."""
         self.steered: dict[int, Input] = {}
-        self._attributes: dict[int, dict[str, Any]] = {}
+        self._attributes = self.kept.attributes
         self.log = ChangeLog(world, self._attributes)
         self._world, self._rewind, self._counters, self._rules, self._seed = world, rewind, counters, rules, seed
-        self._shared: dict[str, Any] = {}
-        self._version = 0
-        self._shared_message = b""
+        self._shared = self.kept.shared
+        self._version = int(bool(self._shared))
+        self._shared_message = encode(Shared(self._shared))
         self._random = (-1, Random())
         self._seen = 0.0
         self._outgoing: list[tuple[frozenset[int] | None, bytes]] = []
         self._contacts = Contacts(world) if _overrides(rules, "on_contact") else None
-        self._started = False
+        self._started = kept is not None
         rules.game = self
 
     # -- the world -----------------------------------------------------------------------------------------
@@ -204,6 +215,7 @@ class Stage:
         after = _with(before, name, value, f"entity {entity}")
         self._attributes[entity] = after
         self.log.note_attributes(entity)
+        self._world.note([SAID, entity, after])
 
     def get(self, entity: int, name: str, default: Any = None) -> Any:
         """What has been said of an entity."""
@@ -223,7 +235,10 @@ class Stage:
         _checked(name, value)
         if value == self._shared.get(name) and type(value) is type(self._shared.get(name)):
             return
-        self._shared = _with(self._shared, name, value, "the game")
+        after = _with(self._shared, name, value, "the game")
+        self._shared.clear()
+        self._shared.update(after)
+        self._world.note([SHARED, after])
         self._version += 1
         self._shared_message = encode(Shared(self._shared))
 
@@ -302,6 +317,7 @@ class Stage:
 
     def _remove(self, entity: int) -> None:
         self._world.remove(entity)
+        self._world.note([LEFT, entity])
         self._attributes.pop(entity, None)
         self.steered.pop(entity, None)
         self.log.note_removal(entity)

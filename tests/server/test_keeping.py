@@ -1,0 +1,117 @@
+"""After a restart the game goes on: the same players, with their tokens, and all that the rules have said."""
+
+from pathlib import Path
+from typing import Any
+
+from server.game import Game
+from server.keeping import restored, whole
+from server.limits import Limits
+from server.rules import Rules
+from server.store import Store
+from shared import messages
+from shared.messages import Hello, Inputs, Shared, Welcome
+from tests.server.test_rules import Told, attributes
+from tests.tables import FakeLink, Table, gone, order
+
+
+class Stored(Table):
+    """A table whose world is kept in a directory."""
+
+    def __init__(self, directory: Path, rules: Rules | None = None) -> None:
+        super().__init__(rules=rules, resume_s=2.0)
+        self.store = Store(directory, self.game.scene, power=False, compiled=False)
+        self.game = Game(
+            self.game.scene,
+            limits=Limits(resume_s=2.0),
+            compiled=False,
+            world=self.store.world,
+            saves=self.store,
+            rules=rules,
+        )
+        self.store.start(self.game.keep)
+
+    def stop(self) -> None:
+        assert self.store.close()
+
+
+def played(table: Stored) -> tuple[FakeLink, bytes]:
+    """Somebody joins, walks and edits, and the rules say this and that; the link and the token."""
+    link = table.connect(Hello(1, {}, "Ann"))
+    table.tick(64)
+    link.say(Inputs(table.tick_number + 1, table.tick_number, bytes((127, 0, 0)) * 8), order(7, 0, 18, 16, 1, 5))
+    game = table.game.stage
+    npc = game.spawn("stone", (10.0, 10.0, 1.0), mood="calm")
+    game.set(npc, "mood", "cross")
+    game.share("score", [1, 2])
+    gone = game.spawn("stone", (5.0, 5.0, 1.0), mood="gone")
+    table.tick(20)
+    game.remove(gone)
+    table.tick(20)
+    return link, link.got(Welcome)[-1].resume
+
+
+def goes_on(table: Stored, before: FakeLink, token: bytes, rules: Told) -> None:
+    """All is as it was."""
+    assert rules.told == []
+    assert table.game.world.blocks.get(18, 16, 1) == 5
+    link = table.connect(Hello(1, {}, "", resume=token))
+    table.tick()
+    me = link.session.entity
+    assert me == before.session.entity
+    assert attributes(link) == {me: {"name": "Ann"}, 2: {"mood": "cross"}}
+    assert link.got(Shared) == [Shared({"score": [1, 2]})]
+    table.game.stage.remove(2)
+    table.tick()
+    assert 2 in [entity for snapshot in link.got(messages.Snapshot) for entity in gone(snapshot)]
+    # An order that had been answered is answered again, and not carried out again.
+    link.say(order(7, 0, 18, 16, 1, 0))
+    table.tick(2)
+    assert table.game.world.blocks.get(18, 16, 1) == 5
+
+
+def test_after_a_stop_the_game_goes_on(tmp_path: Path) -> None:
+    first = Stored(tmp_path)
+    link, token = played(first)
+    hashed = first.game.world.state_hash()
+    first.stop()
+    rules = Told()
+    again = Stored(tmp_path, rules)
+    assert again.game.world.state_hash() == hashed
+    goes_on(again, link, token, rules)
+    again.stop()
+
+
+def test_who_does_not_come_back_after_a_restart_leaves(tmp_path: Path) -> None:
+    first = Stored(tmp_path)
+    link, _ = played(first)
+    first.stop()
+    again = Stored(tmp_path)
+    again.now = 1000.0
+    again.tick(int(1.9 / again.tick_s))
+    assert link.session.entity in again.game.world
+    again.tick(int(0.2 / again.tick_s))
+    assert link.session.entity not in again.game.world
+    again.stop()
+
+
+def test_a_new_world_begins_and_an_old_one_does_not_begin_again(tmp_path: Path) -> None:
+    for expected in ([("start",)], []):
+        rules = Told()
+        table = Stored(tmp_path, rules)
+        table.tick(3)
+        assert rules.told == expected
+        table.stop()
+
+
+def test_notes_come_to_what_they_were_made_of() -> None:
+    notes: list[list[Any]] = [
+        ["player", 1, "Ann", "ann@x", [b"1"]], ["said", 1, {"a": 1}], ["shared", {"x": 1}], ["answered", 1, 4, 0],
+        ["player", 2, "", "", [b"2"]], ["answered", 1, 9, 2], ["said", 1, {"b": 2}], ["left", 2],
+        ["player", 1, "Ann", "ann@x", [b"1", b"3"]], ["shared", {}], ["said", 5, {}], ["left", 5],
+    ]  # fmt: skip
+    kept = restored(notes)
+    ann = kept.players[1]
+    assert (list(kept.players), kept.attributes, kept.shared) == ([1], {1: {"b": 2}}, {})
+    assert (ann.name, ann.subject, ann.tokens, ann.settled) == ("Ann", "ann@x", [b"1", b"3"], {4: 0, 9: 2})
+    assert (ann.command, ann.verdicts) == (9, [])
+    assert whole(restored(whole(kept))) == whole(kept)
