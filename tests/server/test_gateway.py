@@ -507,7 +507,8 @@ def outcome(chunks: list[bytes], *, plain: bool) -> tuple[list[bytes], list[int]
 @given(st.lists(st.one_of(DATA, DATA, CONTROL, ODD), max_size=12), st.lists(st.integers(0, 2000), max_size=8))
 def test_cut_here_or_parsed_by_websockets_comes_to_the_same(frames: list[bytes | int], cuts: list[int]) -> None:
     whole = [binary(bytes(frame)) if isinstance(frame, int) else frame for frame in frames]
-    stream = b"".join(whole)[:20_000]
+    while len(stream := b"".join(whole)) > 20_000:  # whole frames: of half a one, who sees less of it judges later
+        whole.pop()
     ends = sorted({min(cut, len(stream)) for cut in cuts} | {len(stream)})
     chunks = [stream[a:b] for a, b in zip([0, *ends], ends, strict=False)]
     # Byte by byte, websockets hands out each frame before it sees the next, as is the case here.
