@@ -9,7 +9,7 @@ was early: its margin. The timeline's phase at that moment minus the margin is t
 the input's *need*. It does not depend on where the timeline was, only on the path; so the client's own corrections
 cancel out of the measurement, exactly and at once, and the loop cannot oscillate however long the round trip is.
 
-`QuantileLead` splits a need into the *base*, which is the path as it is now, and the *excess* of this one input:
+`PricedLead` splits a need into the *base*, which is the path as it is now, and the *excess* of this one input:
 
     need    |\      |\     ____                 base     morphological opening: raised only by what holds for longer
             | \     | \   |    |    |\                  than a retransmission takes, i.e. a spike, a queue, a new route
@@ -18,16 +18,20 @@ cancel out of the measurement, exactly and at once, and the loop cannot oscillat
 
 The base is followed, up and down alike, at up to 10 % faster or slower than real time. No lead chosen in advance
 should pay for a rare second of it, and it lasts long enough to be followed. A retransmission is over before anybody
-knows of it: it can only be covered in advance, and whether that is worth it is a matter of how often. So the excesses
-of the last minute are kept, and covered but for a stated share of them: the least lead with which no more than that
-share of the minute's inputs would have come late. That is the *oracle* of the last minute; one stall within it, of
-however many inputs, is ignored as long as they are fewer than the share allows. Cover rises at once and falls by 1 %.
+knows of it: it can only be covered in advance, and whether that is worth it is a matter of how often and of how much.
+So a late input has a price in ticks of lead, and of the excesses of the last minutes those are covered that are worth
+it: the cover is the lead with the least sum of itself and the price of what comes late. A stated share of late inputs
+in its place (0.5 %, as it was) cuts a bounded jitter off that costs next to nothing to cover, and pays nine ticks on a
+bad path for the last third of a percent, whose retransmissions are lost as well. Cover rises at once and falls slowly.
 """
 
 import math
+from array import array
 from bisect import bisect_left, insort
 from collections import deque
 from typing import Protocol
+
+import numpy as np
 
 PINGS = 5
 PING_FIRST_S = 0.1
@@ -103,8 +107,12 @@ SLOWER_S = 2.0
 """Cover that is not needed any more is given up with this time constant."""
 LATELY = 3
 """So many inputs in a row that came late are no stall: the last ones of a stall come in its burst, and early."""
-SAFETY = 0.15
-"""Ticks on top of what was needed."""
+PRICE = 200.0
+"""What it is worth that no input comes late, in ticks of lead: half a percent of them is worth one."""
+SAFETY = 0.03
+"""Ticks on top of what was needed,"""
+SURPRISE = 0.15
+"""and, at most, on top of what a rising path needs that was not foreseen."""
 STALL_S = 0.25
 """With two round trips on top: the longest stall that a loss makes, and the shortest change of the path."""
 CALM_S = 5.0
@@ -112,21 +120,23 @@ SHIFT = 0.5
 """The base is the least need of so many seconds, unless that of a stall's length is so many ticks higher."""
 MEMORY_S = 120.0
 FIRST_S = 20.0
-"""Until there have been inputs for so long, the share is taken of this."""
+"""Until there have been inputs for so long, shares are of this; the fewer there were, the more is kept for safety."""
 FIRST_INPUTS = 16
+REVIEW = 8
+"""The cover is thought over after so many inputs."""
 
 
-class QuantileLead:
-    """The least lead with which all but a share of the last minute's inputs would have been on time.
+class PricedLead:
+    """The lead that would have been the best of the last two minutes, late inputs having a price.
 
     Args:
-        late_share: share of the inputs that may come late.
+        price: of all inputs being late, in ticks of lead.
         safety: ticks on top of the cover.
         stall_s: see `STALL_S`.
     """
 
-    def __init__(self, late_share: float = 0.005, safety: float = SAFETY, stall_s: float = STALL_S) -> None:
-        self._late_share = late_share
+    def __init__(self, price: float = PRICE, safety: float = SAFETY, stall_s: float = STALL_S) -> None:
+        self._price = price
         self._safety = safety
         self._stall_s = stall_s
         self._rate = 0.0
@@ -134,8 +144,10 @@ class QuantileLead:
         self._needs: list[float] = []  # the newest ones, as phases
         self._least: list[float] = []  # of each of these and the stall before it
         self._excess: deque[float] = deque()
-        self._ordered: list[float] = []
+        self._ordered = array("d")
         self._base = 0.0
+        self._level = 0.0
+        self._review = 0
         self._cover: float | None = None
 
     def start(self, clock: ServerClock, now: float) -> float:
@@ -162,14 +174,17 @@ class QuantileLead:
         self._measure(clock)
         if len(self._excess) < FIRST_INPUTS:
             return phase
+        known = len(self._excess) / (FIRST_S * self._rate)
+        safety = self._safety + min(SAFETY / known, SURPRISE)
         if self._cover is None:
-            self._cover = phase - self._base - self._safety
-        level = self._level()
+            self._cover = phase - self._base - safety
+        level = self._level
         self._cover = max(level, level + (self._cover - level) * (1 - elapsed / (SLOWER_S * self._rate)))
         now_needed = min(self._needs[-LATELY:])
-        target = max(self._base + self._cover + self._safety, now_needed + min(self._safety, SAFETY))
+        surprise = max(now_needed - self._base - self._cover, 0.0)
+        target = self._base + self._cover + safety + surprise + min(surprise, SURPRISE)
         way = target - phase
-        if self._base + self._safety - phase > JUMP or way < -JUMP:
+        if self._base + safety - phase > JUMP or way < -JUMP:
             return target
         fastest = HURRY if now_needed > phase else FASTER
         return phase + max(-FASTER * elapsed, min(way, fastest * elapsed))
@@ -182,10 +197,16 @@ class QuantileLead:
         insort(self._ordered, excess)
         if len(self._excess) > MEMORY_S * self._rate:
             del self._ordered[bisect_left(self._ordered, self._excess.popleft())]
+        self._review -= 1
+        if self._review < 0:
+            self._review = REVIEW if len(self._excess) > FIRST_INPUTS else 0
+            self._level = self._best()
 
-    def _level(self) -> float:
-        allowed = int(self._late_share * max(len(self._ordered), FIRST_S * self._rate))
-        return self._ordered[max(len(self._ordered) - 1 - allowed, 0)]
+    def _best(self) -> float:
+        """The excess that is best covered: with it, those above are late."""
+        falling = np.frombuffer(self._ordered)[::-1]
+        late = np.arange(len(falling)) / max(len(falling), FIRST_S * self._rate)
+        return float(falling[np.argmin(falling + self._price * late)])
 
 
 class Timeline:

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from client_sdk.clock import LeadController, QuantileLead, ServerClock, Timeline
+from client_sdk.clock import LeadController, PricedLead, ServerClock, Timeline
 from client_sdk.events import (
     Answered,
     Corrected,
@@ -94,7 +94,7 @@ class Core:
         self.prediction: Prediction | None = None
         self.timeline: Timeline | None = None
         self._compiled = compiled
-        self._lead = lead or QuantileLead()
+        self._lead = lead or PricedLead()
         self.wish = NEUTRAL
         self._out: list[bytes] = []
         self._events: deque[Event] = deque(maxlen=EVENTS_MAX)

@@ -2,7 +2,8 @@
 
 Each is fed with what that system knows, and nothing else: pings at its own interval, the snapshots' ticks as they
 arrive, or the margins that the server reports. The rules are theirs, the code is ours; the files named are where
-each project states its rule. Times in seconds, timelines in ticks (`client_sdk.clock`).
+each project states its rule. Times in seconds, timelines in ticks (`client_sdk.clock`). Where a rule keeps a distance
+for safety, that is a parameter here, so that the league can ask what the rule could do with a better one.
 """
 
 import math
@@ -12,13 +13,23 @@ from client_sdk.clock import ServerClock
 
 
 class Rival:
-    """What a controller may react to; by default to nothing."""
+    """What a controller may react to; by default to nothing.
+
+    Args:
+        rate: ticks per second.
+        more: ticks on top of the rule's own safety.
+        spread: the rule's multiple of the jitter, times this.
+    """
 
     ping_s = 1.0
     """Pings are so far apart, once there have been five of them."""
+    spreads: tuple[float, ...] = (1.0,)
+    """What to try for `spread`; none: the rule keeps no distance, so there is nothing to set."""
 
-    def __init__(self, rate: float) -> None:
+    def __init__(self, rate: float, more: float = 0.0, spread: float = 1.0) -> None:
         self.rate = rate
+        self.more = more
+        self.spread = spread
 
     def answered(self, rtt_s: float, phase: float, now: float) -> None:
         """A ping came back: the round trip, and the server's phase if both ways took the same time."""
@@ -48,8 +59,8 @@ class UnityN4E(Rival):
 
     SLACK = 2.0
 
-    def __init__(self, rate: float) -> None:
-        super().__init__(rate)
+    def __init__(self, rate: float, more: float = 0.0, spread: float = 1.0) -> None:
+        super().__init__(rate, more, spread)
         self._age = 0.0
         self._newest = -1
         self._tick = -1
@@ -59,7 +70,7 @@ class UnityN4E(Rival):
 
     def start(self, clock: ServerClock, now: float) -> float:
         """The estimate of the newest snapshot plus round trip and slack is half a round trip ahead of the server."""
-        return super().start(clock, now) + self.SLACK
+        return super().start(clock, now) + self.SLACK + self.more
 
     def observe(self, tick: int, margin: float, phase: float, now: float) -> None:
         """When the command arrived on the server, in ticks: what the server averages by itself."""
@@ -83,7 +94,7 @@ class UnityN4E(Rival):
             self._corrections.popleft()
         if self._told is None:
             return phase
-        off = self._told + self.SLACK - sum(change for _, change in self._corrections)
+        off = self._told + self.SLACK + self.more - sum(change for _, change in self._corrections)
         if abs(off) >= 10:
             self._corrections.clear()
             target = self.start(clock, now)
@@ -102,9 +113,10 @@ class Lightyear(Rival):
     """
 
     ping_s = 0.1
+    spreads = (0.5, 1.0)
 
-    def __init__(self, rate: float) -> None:
-        super().__init__(rate)
+    def __init__(self, rate: float, more: float = 0.0, spread: float = 1.0) -> None:
+        super().__init__(rate, more, spread)
         self._rtt: float | None = None
         self._deviation = 0.0
         self._remote: float | None = None
@@ -133,7 +145,7 @@ class Lightyear(Rival):
     def _target(self, clock: ServerClock) -> float:
         rtt = clock.rtt_s if self._rtt is None else self._rtt
         remote = clock.phase if self._remote is None else self._remote
-        return remote + (rtt / 2 + 4 * self._deviation / 2) * self.rate + 3.0
+        return remote + (rtt / 2 + self.spread * 4 * self._deviation / 2) * self.rate + 3.0 + self.more
 
     def start(self, clock: ServerClock, now: float) -> float:
         """At the objective."""
@@ -162,8 +174,10 @@ class Naia(Rival):
     speed; beyond, 20 ms more double or halve it, and so on up to tenfold.
     """
 
-    def __init__(self, rate: float) -> None:
-        super().__init__(rate)
+    spreads = (0.5, 1.0)
+
+    def __init__(self, rate: float, more: float = 0.0, spread: float = 1.0) -> None:
+        super().__init__(rate, more, spread)
         self._raw: tuple[float, float] | None = None
         self._mean = (0.0, 0.0)
         self._var = [0.0, 0.0]
@@ -187,7 +201,7 @@ class Naia(Rival):
     def start(self, clock: ServerClock, now: float) -> float:
         """At the target."""
         jitter = math.sqrt(self._var[0]) / 2
-        return (self._mean[1] + self._mean[0] / 2 + 3 * jitter) * self.rate + 5.0
+        return (self._mean[1] + self._mean[0] / 2 + self.spread * 3 * jitter) * self.rate + 5.0 + self.more
 
     def steer(self, phase: float, elapsed: float, clock: ServerClock, now: float) -> float:
         """Speed by distance, never beyond the target."""
@@ -208,9 +222,10 @@ class Netfox(Rival):
     """
 
     ping_s = 0.25
+    spreads = ()
 
-    def __init__(self, rate: float) -> None:
-        super().__init__(rate)
+    def __init__(self, rate: float, more: float = 0.0, spread: float = 1.0) -> None:
+        super().__init__(rate, more, spread)
         self._samples: deque[tuple[float, float]] = deque(maxlen=8)
         self._phase: float | None = None
 
@@ -242,8 +257,8 @@ class DDNet(Rival):
 
     MARGIN_S = 0.010
 
-    def __init__(self, rate: float) -> None:
-        super().__init__(rate)
+    def __init__(self, rate: float, more: float = 0.0, spread: float = 1.0) -> None:
+        super().__init__(rate, more, spread)
         self._up = 0.3
         self._spikes = 0
         self._target: float | None = None
@@ -261,11 +276,11 @@ class DDNet(Rival):
         else:
             self._spikes = max(self._spikes - 1, 0)
             self._up = max(self._up * 0.95, 2.0)
-        self._target = phase - margin + self.MARGIN_S * self.rate
+        self._target = phase - margin + self.MARGIN_S * self.rate + self.more
 
     def start(self, clock: ServerClock, now: float) -> float:
         """Half a round trip and the margin ahead."""
-        return super().start(clock, now) + self.MARGIN_S * self.rate
+        return super().start(clock, now) + self.MARGIN_S * self.rate + self.more
 
     def steer(self, phase: float, elapsed: float, clock: ServerClock, now: float) -> float:
         """A share of the way."""
@@ -284,9 +299,10 @@ class Mirror(Rival):
     """
 
     ping_s = 0.1
+    spreads = ()
 
-    def __init__(self, rate: float) -> None:
-        super().__init__(rate)
+    def __init__(self, rate: float, more: float = 0.0, spread: float = 1.0) -> None:
+        super().__init__(rate, more, spread)
         self._ahead: float | None = None
 
     def answered(self, rtt_s: float, phase: float, now: float) -> None:

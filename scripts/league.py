@@ -8,8 +8,12 @@ constant lead that would have met the same share of late inputs, from the run's 
     added latency   mean lead of an input over the server's true time when it was made, minus half the round trip
     fair            without what no controller can know beforehand: spikes and the 250 ms after, a dip's first second
     above           of the fair ones, what is added beyond the oracle
-    ours then       what ours adds at the other's late share: on the curve of ours at various settings
+    it needs        what the other would add at our late share, with the safety that is best for it on this very run
+    ours then       what ours adds at the other's late share, likewise with other settings
     front           no other controller is both less late and less ahead
+
+Ours is compared at its default, which is the same on every link. A setting found on the run that it is judged by is
+more than anybody has in practice: both columns favour the one that is set.
 """
 
 import argparse
@@ -31,7 +35,7 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from client_sdk.clock import SAFETY, STALL_S, LeadController, QuantileLead, ServerClock, Timeline
+from client_sdk.clock import PRICE, SAFETY, STALL_S, LeadController, PricedLead, ServerClock, Timeline
 from controllers import RIVALS, Rival
 from tests.links import PRESETS, Weather, Wire
 
@@ -50,6 +54,8 @@ SHARE_MAX = 0.5
 """Who is late more often does not steer for his inputs to be on time, and is left out of the comparison."""
 LONG_S = 4.0
 """A longest stall that takes the presets' spikes for stalls, and covers them."""
+SEARCH = 8
+"""Trials per search for a rival's setting."""
 
 Row = dict[str, Any]
 
@@ -224,8 +230,8 @@ class Trial:
 
 
 def trial(preset: str, controller: str, minutes: float, seed: int, setting: tuple[float, ...] = ()) -> Row:
-    """One controller by name; ours with a setting, if one is given."""
-    lead: LeadController = QuantileLead(*setting) if controller == OURS else RIVALS[controller](RATE)
+    """One controller by name, with a setting, if one is given: of `PricedLead`, or of a `Rival` after its rate."""
+    lead: LeadController = PricedLead(*setting) if controller == OURS else RIVALS[controller](RATE, *setting)
     run = Trial(preset, lead, seed)
     run.run(60 * minutes)
     return run.row(preset, controller, seed)
@@ -234,16 +240,21 @@ def trial(preset: str, controller: str, minutes: float, seed: int, setting: tupl
 def run(preset: str, minutes: float, seed: int) -> list[Row]:
     """Every controller on one link, ours first: rows as of `Trial.row`, and for each
 
-    equal_latency_ms    what ours adds at this one's late share, from the curve; None beyond the curve
+    its_latency_ms      what it would add at our late share; None: it cannot, or there is nothing to set
+    first               ours adds less than that, or the same within `TIE_MS`
+    equal_latency_ms    what ours would add at its late share; None beyond the curve
     beaten              ours adds less at that share, or the same within `TIE_MS`
     on_front            no other controller is both less late and less ahead
     """
     rows = [trial(preset, name, minutes, seed) for name in (OURS, *RIVALS)]
-    points = [point(rows[0])]
-    points += [point(trial(preset, OURS, minutes, seed, setting)) for setting in settings(rows[0], rows[1:])]
+    ours = rows[0]
+    points = [point(ours)] + [point(trial(preset, OURS, minutes, seed, setting)) for setting in settings(preset)]
     for row in rows:
         late, added = point(row)
+        its = added if row is ours else set_to(row, ours, minutes)
         equal = curve(points, late)
+        row["its_latency_ms"] = its
+        row["first"] = its is None or ours["added_latency_ms"] <= its + TIE_MS
         row["equal_latency_ms"] = equal
         row["beaten"] = equal is not None and equal <= added + TIE_MS
         row["on_front"] = not any(
@@ -252,21 +263,28 @@ def run(preset: str, minutes: float, seed: int) -> list[Row]:
     return rows
 
 
-def settings(ours: Row, rivals: list[Row]) -> list[tuple[float, float, float]]:
-    """Late share, safety in ticks, longest stall in seconds: with these, ours should be as late as the rivals are."""
-    found: set[tuple[float, float]] = set()
-    for rival in rivals:
-        share = rival["late_inputs_share"]
-        if 0.2 <= share < SHARE_MAX:
-            found.add((round(share, 2), 0.0))
-        elif share < SHARE_MAX:
-            found |= {(round(more * share, 5), 0.0) for more in (0.7, 0.85, 1.0, 1.15)}
-            found |= {(round(share, 5), SAFETY), (round(2 * share, 5), 2 * SAFETY), (round(2 * share, 5), 3 * SAFETY)}
-        if share < 0.001:  # two minutes have too few of those to count them: a margin, as far ahead as the rival
-            more = max((rival["added_latency_ms"] - ours["added_latency_ms"]) / TICK_MS, 0.0)
-            found |= {(0.005, round(SAFETY + more + extra, 2)) for extra in (0.0, 0.4)}
-    stalls = (STALL_S, LONG_S) if PRESETS[ours["preset"]].spike else (STALL_S,)
-    return [(*one, stall_s) for one in sorted(found) for stall_s in stalls]
+def set_to(row: Row, ours: Row, minutes: float) -> float | None:
+    """What a rival adds with the least safety that makes it no later than ours, for one who may switch between two."""
+    best: list[float] = []
+    for spread in RIVALS[row["controller"]].spreads:
+        points = [point(row)]
+        least = -row["added_latency_ms"] / TICK_MS
+        most = least + 2 * ours["added_latency_ms"] / TICK_MS + 2.0
+        for _ in range(SEARCH):
+            more = (least + most) / 2
+            points.append(point(trial(row["preset"], row["controller"], minutes, row["seed"], (more, spread))))
+            least, most = (least, more) if points[-1][0] <= ours["late_inputs_share"] else (more, most)
+        found = curve(points, ours["late_inputs_share"])
+        best += [] if found is None else [found]
+    return min(best, default=None)
+
+
+def settings(preset: str) -> list[tuple[float, float, float]]:
+    """Price in ticks, safety in ticks, longest stall in seconds: what ours is tried with, from careless to careful."""
+    found = [(price, SAFETY) for price in (3.0, 10.0, 30.0, 80.0, 600.0, 2000.0)]
+    found += [(PRICE, 0.08), (PRICE, 0.15)] + [(2000.0, safety) for safety in (0.3, 0.6, 1.0, 1.5, 2.0)]
+    stalls = (STALL_S, LONG_S) if PRESETS[preset].spike else (STALL_S,)
+    return [(*one, stall_s) for one in found for stall_s in stalls]
 
 
 def curve(points: list[tuple[float, float]], late: float) -> float | None:
@@ -289,18 +307,19 @@ def table(rows: list[Row]) -> Table:
     result = Table(title="Lead controllers: late inputs against added latency (ms)", box=box.SIMPLE_HEAD)
     for column in ("preset", "controller"):
         result.add_column(column, no_wrap=True)
-    for column in ("late %", "added", "p99", "oracle", "ours then", "fair %", "above", "front"):
+    for column in ("late %", "added", "p99", "oracle", "it needs", "ours then", "fair %", "above", "front"):
         result.add_column(column, justify="right", no_wrap=True)
     preset = ""
     for row in rows:
         if preset != row["preset"]:
             result.add_section()
-        equal, ours = row["equal_latency_ms"], row["controller"] == OURS
+        its, equal, ours = row["its_latency_ms"], row["equal_latency_ms"], row["controller"] == OURS
         result.add_row(
             "" if preset == row["preset"] else row["preset"],
             row["controller"],
             f"{100 * row['late_inputs_share']:.2f}",
             *(f"{row[name]:.1f}" for name in ("added_latency_ms", "added_latency_p99_ms", "oracle_latency_ms")),
+            "" if ours or its is None else f"{its:.1f} {'>' if row['first'] else '<'}",
             "" if ours or equal is None else f"{equal:.1f} {'<' if row['beaten'] else '>'}",
             f"{100 * row['fair_late_share']:.2f}",
             f"{row['fair_latency_ms'] - row['fair_oracle_ms']:.1f}",
@@ -322,7 +341,10 @@ def main() -> int:
     with ProcessPoolExecutor() as pool:
         done = [pool.submit(run, name, chosen.minutes, chosen.seed) for name in names]
         rows = [row for job in done for row in job.result()]
-    Console().print(table(rows), f"seed {chosen.seed}, {chosen.minutes:g} minutes each")
+    console = Console()
+    if not console.is_terminal:
+        console = Console(width=160)
+    console.print(table(rows), f"seed {chosen.seed}, {chosen.minutes:g} minutes each")
     if chosen.json:
         chosen.json.write_text(json.dumps({"seed": chosen.seed, "league": rows}, indent=1) + "\n")
     return 0

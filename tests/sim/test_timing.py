@@ -12,7 +12,7 @@ from pathlib import Path as File
 
 import pytest
 
-from client_sdk.clock import QuantileLead
+from client_sdk.clock import PricedLead
 from client_sdk.core import Core
 from shared.inputs import Input
 from shared.scene import load_scene
@@ -62,7 +62,7 @@ def test_must_hold(preset: str, late: float, added_ticks: float, above_ticks: fl
 
 @pytest.mark.parametrize("seed", SEEDS)
 def test_after_a_spike_all_is_well_within_250_ms(seed: int) -> None:
-    run = league.Trial("wifi", QuantileLead(), seed)
+    run = league.Trial("wifi", PricedLead(), seed)
     run.run(300)
     ends = [end for _, end, _ in run.weather.spikes if end < 295]
     assert len(ends) > 20
@@ -82,7 +82,7 @@ def test_the_nearest_rivals_are_not_both_less_late_and_less_ahead(name: str, pre
 
 @pytest.mark.parametrize("ppm", [-200, 0, 200])
 def test_the_clock_drifts_without_harm(ppm: int) -> None:
-    run = league.Trial("regional", QuantileLead(), 3)
+    run = league.Trial("regional", PricedLead(), 3)
     run._drift = ppm * 1e-6
     run.run(300)
     row = run.row("regional", league.OURS, 3)
@@ -91,7 +91,7 @@ def test_the_clock_drifts_without_harm(ppm: int) -> None:
 
 
 def test_the_oracle_is_the_least_constant_lead_with_that_share() -> None:
-    run = league.Trial("typical", QuantileLead(), 2)
+    run = league.Trial("typical", PricedLead(), 2)
     run.run(120)
     late, _, _, oracle = run.figures(run.margins)
     lead = oracle + PRESETS["typical"].rtt_s / 2 * league.RATE
@@ -134,17 +134,11 @@ def test_a_match_is_as_late_as_the_league_says(preset: str, most: float) -> None
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", [21])
-@pytest.mark.parametrize("preset", ["typical"])
-def test_least_latency_at_equal_late_share(preset: str, seed: int) -> None:
-    """Ours, set to be as late as each of the others is, adds less than it, or the same within a tenth of a tick.
-
-    One exception a run is allowed: a setting aims at a share and does not hit it, and on wifi, near no late input at
-    all, the two ticks of slack of N4E happen to fit the spikes (77 ms; ours needs 79 to 82).
-    """
-    rows = league.run(preset, 10, seed)
+@pytest.mark.parametrize("preset", ["typical", "far"])
+def test_least_latency_at_equal_late_share(preset: str) -> None:
+    """No other rule adds less, by more than a tenth of a tick, at our late share, whatever safety it is given."""
+    rows = league.run(preset, MINUTES, 21)
     assert rows[0]["on_front"]
-    compared = [row for row in rows[1:] if row["late_inputs_share"] < league.SHARE_MAX]
-    worse = [row["controller"] for row in compared if not row["beaten"]]
-    figures = [(row["controller"], *league.point(row), row["equal_latency_ms"]) for row in compared]
-    assert len(worse) <= 1, figures
+    figures = [(row["controller"], *league.point(row), row["its_latency_ms"]) for row in rows]
+    assert all(row["first"] for row in rows), figures
+    assert sum(row["its_latency_ms"] is not None for row in rows) == 5
