@@ -196,14 +196,14 @@ class Prediction:
 
     def step(self) -> None:
         """Predicts one tick."""
-        tick = self.predicted.tick + 1
+        world = self.predicted
+        tick = world.tick + 1
         for due, edit in self._edits.values():
             # One that is due but has no verdict yet is carried out as soon as the replay begins.
             if due == tick or (due < tick and tick == self.confirmed.tick + 1):
-                edits.apply(self.predicted, self.entity, edit)
-        known = self.entity in self.predicted
-        self.predicted.step({self.entity: self._wish(tick)} if known else None)
-        self._states.put(tick, self.predicted.states())
+                edits.apply(world, self.entity, edit)
+        world.step({self.entity: self._wish(tick)} if self.entity in world else None)
+        self._states.put(tick, world.states())
 
     def _wish(self, tick: int) -> Input:
         """The own input of a tick; where none was sent, what the server puts in its place."""

@@ -28,6 +28,20 @@ def lent(array: np.ndarray[Any, Any], to_compiled: bool) -> Any:
     return flat if to_compiled else memoryview(flat)  # type: ignore[arg-type]
 
 
+def direct(function: Any, *arguments: Any) -> Any:
+    """A kernel function for arguments of these types, without Numba's look at each array of `Arrays` in every call.
+
+    That takes 2 us, more than a client's whole step. Hold the kernel as long as the function.
+    """
+    if not hasattr(function, "overloads"):
+        return function
+    from numba import typeof
+
+    types = tuple(map(typeof, arguments))
+    function.compile(types)
+    return function.overloads[types].entry_point
+
+
 @functools.cache
 def compiled() -> ModuleType:
     """The compiled kernel.

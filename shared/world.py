@@ -66,6 +66,9 @@ class World:
         self._changed = self._fell = np.zeros(0, np.int64)
         self._allocate(8)
         self._bind()
+        some = self._lent(self._inputs)
+        self._step = kernels.direct(self._kernel.step, self._arrays, some, 0, 0)
+        self._store = kernels.direct(self._kernel.store, self._arrays, some, some, 0, 0)
 
     # -- reading -------------------------------------------------------------------------------------------
 
@@ -97,7 +100,7 @@ class World:
         """The whole states of all entities, [n, 12], ascending by id: equal worlds have equal ones. A copy."""
         if self.compiled and self._rows <= COLLECT_MAX:
             out = np.empty((self._rows, STATES), np.int64)
-            return out[: self._kernel.collect(self._entities.reshape(-1), self._rows, out.reshape(-1))]
+            return out[: self._kernel.collect(self._arrays.entities, self._rows, out.reshape(-1))]
         rows: layout.Int64s = self._entities[: self._rows, :STATES]
         rows = rows[rows[:, ID] != 0]
         rows = rows[np.argsort(rows[:, ID])]
@@ -370,7 +373,7 @@ class World:
         ids = new[:, ID].tolist()
         known = list(map(self._row_of.get, ids))
         rows = np.array([self._row(entity) for entity in ids] if None in known else known, np.int64)
-        self._kernel.store(self._arrays, self._lent(rows), self._lent(new), len(rows), self._tick + 1)
+        self._store(self._arrays, self._lent(rows), self._lent(new), len(rows), self._tick + 1)
 
     def write_blocks(self, segment: Cell, offsets: Iterable[int], kinds: Iterable[int]) -> None:
         """Changes blocks of a loaded segment (by index z << 10 | y << 5 | x): what a snapshot says, verbatim."""
@@ -418,7 +421,7 @@ class World:
             self._inputs[: len(told)] = told
         self._tick += 1
         self.edited, self.editing = self.editing, {}
-        self._kernel.step(self._arrays, self._lent(self._inputs), n, self._tick)
+        self._step(self._arrays, self._lent(self._inputs), n, self._tick)
         if self._limbo:
             self._free += self._limbo
             self._limbo.clear()
