@@ -8,6 +8,7 @@
 """
 
 import math
+import struct
 from collections import deque
 from typing import Any
 
@@ -296,7 +297,8 @@ class Core:
         if self.stats.snapshots > 1:
             self.stats.snapshots_skipped += snapshot.tick - prediction.confirmed.tick - 1
         self._late |= self._fates(snapshot, now)
-        for number, verdict in np.frombuffer(snapshot.verdicts, VERDICT).tolist():
+        verdicts = np.frombuffer(snapshot.verdicts, VERDICT).tolist() if snapshot.verdicts else ()
+        for number, verdict in verdicts:
             prediction.settle(number, verdict == messages.DONE)
             text = messages.VERDICT_TEXTS[min(verdict, len(messages.VERDICT_TEXTS) - 1)]
             self._events.append(Answered(number, verdict == messages.DONE, text))
@@ -325,9 +327,8 @@ class Core:
 
     def _fates(self, snapshot: Snapshot, now: float) -> bool:
         """How the inputs up to `newest` fared: feeds the lead; whether any of the told ticks lacked its input."""
-        margins = np.frombuffer(snapshot.margins, "<i2").tolist()
-        for i, margin in enumerate(margins):
-            tick = snapshot.newest - len(margins) + 1 + i
+        margins = struct.unpack(f"<{len(snapshot.margins) // 2}h", snapshot.margins)
+        for tick, margin in enumerate(margins, snapshot.newest + 1 - len(margins)):
             phase = self._phases.get(tick)
             if phase is None:
                 continue  # a tick that was left out
@@ -335,9 +336,10 @@ class Core:
             self.stats.inputs_late += MARGIN_REFUSED < margin < 0
             if margin != MARGIN_REFUSED:
                 self._lead.observe(tick, margin / MARGIN_ONE, phase, now)
-        missing = sum(fate in (REPEATED, NEUTRALISED) for fate in snapshot.fates)
+        neutralised = snapshot.fates.count(NEUTRALISED)
+        missing = snapshot.fates.count(REPEATED) + neutralised
         self.stats.inputs_substituted += missing
-        self.stats.inputs_neutralised += snapshot.fates.count(NEUTRALISED)
+        self.stats.inputs_neutralised += neutralised
         return missing > 0
 
     def _corrected(self, correction: Corrected) -> None:

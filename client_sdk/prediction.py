@@ -303,11 +303,14 @@ class Prediction:
 
 def _offsets(before: Int64s, after: Int64s) -> dict[int, Place]:
     """How far each entity that is in both has jumped back, in blocks."""
-    _, i, j = np.intersect1d(before[:, ID], after[:, ID], assume_unique=True, return_indices=True)
-    ways = (before[i, X : X + 3] - after[j, X : X + 3]) / BLOCK
-    moved = ways.any(axis=1)
-    ids = after[j[moved], ID].tolist()
-    return {entity: (x, y, z) for entity, (x, y, z) in zip(ids, ways[moved].tolist(), strict=True)}
+    was = dict(zip(before[:, ID].tolist(), before[:, X : X + 3].tolist(), strict=True))
+    offsets: dict[int, Place] = {}
+    for entity, place in zip(after[:, ID].tolist(), after[:, X : X + 3].tolist(), strict=True):
+        old = was.get(entity, place)
+        if old != place:
+            x, y, z = ((a - b) / BLOCK for a, b in zip(old, place, strict=True))
+            offsets[entity] = (x, y, z)
+    return offsets
 
 
 def check_scene(table: object) -> Scene:

@@ -79,14 +79,14 @@ class SegmentPart(NamedTuple):
 
 def encode_rows(rows: Int64s, acted: Collection[int] = ()) -> bytes:
     """Entities ([n, >= 12] state columns), each in the segment of its position, as packed rows; `acted` flagged."""
-    packed = np.empty(len(rows), ROW)
-    for column, name in enumerate(FIELDS):
-        packed[name] = rows[:, column]
-    packed["flags"] &= FALLING
+    packed = np.empty(len(rows), ROW_BY_SIZE)
+    for columns, name in COLUMNS_BY_SIZE:
+        packed[name] = rows[:, columns]
+    flags = packed["kind"][:, 1]
+    flags &= FALLING
     if acted:
-        packed["flags"] |= np.where(np.isin(packed["id"], list(acted)), ACTED, 0).astype(np.uint8)
-    for axis, name in enumerate("xyz"):
-        packed[name] = rows[:, X + axis] & (SIDE - 1)
+        flags |= np.where(np.isin(packed["id"], list(acted)), ACTED, 0).astype(np.uint8)
+    packed["place"][:, :3] &= SIDE - 1
     return packed.tobytes()
 
 

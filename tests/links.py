@@ -152,6 +152,7 @@ class Wire:
         self._time, self._weather, self._path, self._deliver = time, weather, weather.path, deliver
         self._rng = random.Random(seed)
         self._waiting: deque[_Packet] = deque()  # in order of the stream; the first has not arrived
+        self._flying: deque[_Packet] = deque()  # in order of arrival, which is that of transmission
         self._missing: list[_Packet] = []  # lost, not yet sent again
         self._free = 0.0  # when the line is
         self._last = 0.0  # when the newest transmission arrives
@@ -193,7 +194,8 @@ class Wire:
             return
         extra = weather.extra(gone)
         self._last = max(self._last, gone + path.delay_s + self._rng.random() * path.jitter_s + extra)
-        self._time.at(self._last, lambda: self._arrive(packet))
+        self._flying.append(packet)
+        self._time.at(self._last, self._arrive)
         if self._missing and self._rng.random() >= path.loss:  # its acknowledgement tells of the missing
             told = self._last + path.delay_s + path.jitter_s / 2 + extra + path.rtt_s / 4 + TIMER_S
             self._time.at(told, lambda: self._find_missing(now))
@@ -214,8 +216,8 @@ class Wire:
         self.resent += 1
         self._transmit(packet)
 
-    def _arrive(self, packet: _Packet) -> None:
-        packet.arrived = True
+    def _arrive(self) -> None:
+        self._flying.popleft().arrived = True
         back = self._time.now + self._path.delay_s + self._path.jitter_s / 2
         while self._waiting and self._waiting[0].arrived:
             first = self._waiting.popleft()

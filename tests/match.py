@@ -5,8 +5,9 @@ by simulated time. The wires are those of `tests.links`: TCP, nothing lost or re
 """
 
 import heapq
+import math
 import random
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from itertools import count
 
 from client_sdk.core import Core
@@ -96,8 +97,9 @@ class Player:
             self._update()
 
     def _read(self) -> None:
+        now = self.local
         for message in self._inbox:
-            self.core.receive(message, self.local)
+            self.core.receive(message, now)
         self._inbox.clear()
         self._flush()
 
@@ -110,14 +112,15 @@ class Player:
         if core.state == "playing" and core.prediction and core.prediction.predicted.tick != self._acted:
             self._acted = core.prediction.predicted.tick
             core.set_input(self.policy(core, self.rng))
-        core.update(self.local)
+        now = self.local
+        core.update(now)
         self._flush()
         if self.frame_s:
             self.match.at(self.match.now + self.frame_s, self._update, key=self)
         elif core.state != "closed":
-            due = core.next_update(self.local)
-            if due < float("inf"):
-                when = self.match.now + max(due - self.local, 1e-4) / (1 + self.drift)
+            due = core.next_update(now)
+            if due < math.inf:
+                when = self.match.now + max(due - now, 1e-4) / (1 + self.drift)
                 self.match.at(when, self._update, key=self)
 
     def _flush(self) -> None:
@@ -167,25 +170,29 @@ class Match:
     def run(self, seconds: float) -> None:
         """Lets time pass."""
         until = self.now + seconds
-        for _ in self._entries(until):
+        while self._advance(until):
             pass
         self.now = until
 
     def run_until(self, condition: Callable[[], bool], seconds: float) -> None:
         """Lets time pass until a condition holds; fails if it does not within so many simulated seconds."""
-        for _ in self._entries(self.now + seconds):
+        until = self.now + seconds
+        while self._advance(until):
             if condition():
                 return
         raise AssertionError(f"seed {self.seed}: not within {seconds} simulated seconds")
 
-    def _entries(self, until: float) -> Iterator[None]:
-        while self._queue and self._queue[0][0] <= until:
-            when, number, act, key = heapq.heappop(self._queue)
-            if key is not None and self._latest.get(key) != number:
-                continue
-            self.now = max(self.now, when)
-            act()
-            yield
+    def _advance(self, until: float) -> bool:
+        """Does what comes next, unless that is after `until`; whether it did."""
+        queue = self._queue
+        while queue and queue[0][0] <= until:
+            when, number, act, key = heapq.heappop(queue)
+            if key is None or self._latest[key] == number:
+                if when > self.now:
+                    self.now = when
+                act()
+                return True
+        return False
 
     def _tick(self) -> None:
         self.game.tick(self.now, self.now)
