@@ -141,7 +141,8 @@ class Prediction:
         if here:
             world.put(states)
         for part in parts:
-            self.attributes.update((entity, said) for entity, said in part.attributes if entity in world)
+            if part.attributes:
+                self.attributes.update((entity, said) for entity, said in part.attributes if entity in world)
         for segment in drops:
             self._early.pop(segment, None)
             if segment in world.blocks and not len(world.in_segment(segment)):

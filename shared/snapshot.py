@@ -63,6 +63,7 @@ STATE_HIGH = np.array(
     [ENTITY_MAX, 255, FALLING | ACTED, SIDE - 1, SIDE - 1, SIDE - 1, 1 << 30, 1 << 30, 1 << 30, 127, 127, 255], np.int64
 )
 """The bounds of a state on the wire: nothing a peer sends may take the kernel out of its tables."""
+BOUNDS = {compiled: [kernels.lent(bound, compiled) for bound in (STATE_LOW, STATE_HIGH)] for compiled in (False, True)}
 
 
 class SegmentPart(NamedTuple):
@@ -138,25 +139,22 @@ def decode_parts(
     Raises:
         ProtocolError: anything is not as drawn above.
     """
-    parts = [_decode_part(segment) for segment in segments]
+    corners: list[int] = []
+    parts = [_decode_part(segment, corners) for segment in segments]
     packed = np.frombuffer(b"".join([segment[4] for segment in segments]), ROW_BY_SIZE)
     states = np.empty((len(packed), CELL), np.int64)
     if len(packed):
         for columns, name in COLUMNS_BY_SIZE:
             states[:, columns] = packed[name]
-        told: list[int] = []
-        for (x, y, z), _, entities, *_ in parts:
-            told += (x * SIDE, y * SIDE, z * SIDE, entities)
         kernel = kernels.compiled() if compiled else kernels.PLAIN
-        flat, corners, low, high = (
-            kernels.lent(array, compiled) for array in (states, np.array(told, np.int64), STATE_LOW, STATE_HIGH)
-        )
-        if not kernel.admit(flat, corners, len(parts), low, high, templates):
+        flat, of_parts = kernels.lent(states, compiled), kernels.lent(np.array(corners, np.int64), compiled)
+        if not kernel.admit(flat, of_parts, len(parts), *BOUNDS[compiled], templates):
             raise ProtocolError("segment.rows: a value is out of range")
     return parts, states
 
 
-def _decode_part(part: Any) -> SegmentPart:
+def _decode_part(part: Any, corners: list[int]) -> SegmentPart:
+    """One part; its low corner in grid steps and its number of rows go to the `corners`."""
     if type(part) is not list or len(part) != 9:
         raise ProtocolError("segment: not nine fields")
     x, y, z, since, rows, gone, edits, check, attributes = part
@@ -175,7 +173,9 @@ def _decode_part(part: Any) -> SegmentPart:
         raise ProtocolError("segment.edits: a block is out of range")
     left = np.frombuffer(gone, "<u4").tolist() if gone else []
     said = _decode_attributes(attributes) if attributes != [] else []
-    return SegmentPart((x, y, z), since, len(rows) // ROW_BYTES, left, edited, check, said)
+    entities = len(rows) // ROW_BYTES
+    corners += (x * SIDE, y * SIDE, z * SIDE, entities)
+    return SegmentPart((x, y, z), since, entities, left, edited, check, said)
 
 
 def _decode_attributes(attributes: Any) -> list[tuple[int, dict[str, Any]]]:

@@ -66,9 +66,9 @@ class World:
         self._changed = self._fell = np.zeros(0, np.int64)
         self._allocate(8)
         self._bind()
-        some = self._lent(self._inputs)
-        self._step = kernels.direct(self._kernel.step, self._arrays, some, 0, 0)
-        self._store = kernels.direct(self._kernel.store, self._arrays, some, some, 0, 0)
+        told = self._told = self._lent(self._inputs)
+        self._step = kernels.direct(self._kernel.step, self._arrays, told, 0, 0)
+        self._store = kernels.direct(self._kernel.store, self._arrays, told, told, 0, 0)
 
     # -- reading -------------------------------------------------------------------------------------------
 
@@ -418,10 +418,11 @@ class World:
                 told += (self._row_of[entity], *wish)
             if len(told) > len(self._inputs):
                 self._inputs = np.zeros(2 * len(told), np.int64)
+                self._told = self._lent(self._inputs)
             self._inputs[: len(told)] = told
         self._tick += 1
         self.edited, self.editing = self.editing, {}
-        self._step(self._arrays, self._lent(self._inputs), n, self._tick)
+        self._step(self._arrays, self._told, n, self._tick)
         if self._limbo:
             self._free += self._limbo
             self._limbo.clear()
@@ -436,7 +437,8 @@ class World:
         """Becomes equal to `other`, a world of the same scene; cheap where little differs."""
         cells = self._entities[: self._rows, layout.CELL]
         self.blocks.heads[cells[cells >= 0]] = -1
-        if len(self._entities) != len(other._entities):
+        moved = len(self._entities) != len(other._entities)
+        if moved:
             self._allocate(len(other._entities))
         self.editing, self.edited = dict(other.editing), dict(other.edited)
         self._tick, self._next_id, self._rows = other._tick, other._next_id, other._rows
@@ -448,11 +450,12 @@ class World:
         for name, length in LISTS:
             count = int(self._lengths[length])
             getattr(self, name)[:count] = getattr(other, name)[:count]
-        self.blocks.restore(other.blocks)
+        moved |= self.blocks.restore(other.blocks)
         rows = self._entities[:n]
         first = np.flatnonzero((rows[:, layout.CELL] >= 0) & (rows[:, PREV] < 0) & (rows[:, ID] != 0))
         self.blocks.heads[rows[first, layout.CELL]] = first
-        self._bind()
+        if moved:
+            self._bind()
 
     # -- inside --------------------------------------------------------------------------------------------
 
