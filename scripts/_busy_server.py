@@ -17,6 +17,7 @@ import msgpack
 
 from server import app
 from server.delivery import Delivery
+from server.faults import Faults
 from server.game import Game
 from server.gateway import Connection
 from server.replication import ChangeLog
@@ -35,6 +36,7 @@ class Echo:
     def __init__(self, scene: str, size: int) -> None:
         self.scene = load_scene(scene)
         self.size = size
+        self.faults = Faults()
         self.links: dict[int, tuple[Link, bool]] = {}
         self.ticks = 0
         self._made = 0

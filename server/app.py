@@ -20,7 +20,6 @@ from server import check, log, tokens
 from server.access import authenticator, tls_context
 from server.database import StoreError
 from server.door import Door
-from server.faults import Faults
 from server.game import Game
 from server.gateway import CLOSE_S, Gateway
 from server.histogram import Histogram
@@ -107,7 +106,7 @@ class Server:
         self.settings = settings
         self.game = game
         self.store = store
-        self.faults = Faults()
+        self.faults = game.faults
         self.door = Door(
             settings.limits,
             Pages(
@@ -136,7 +135,7 @@ class Server:
             rate = self.game.scene.tick_rate
             if self.store is not None:
                 self.store.start(self.game.keep)
-            self.ticker = Ticker(rate, self.game.tick, self._broken, lambda ring: best_alarm(loop, ring))
+            self.ticker = Ticker(rate, self.game.tick, self._broken, lambda ring: best_alarm(loop, ring), self.faults)
             self.watchdog = Watchdog(loop)
             freeze()
             kind = type(loop).__module__.partition(".")[0]
@@ -181,7 +180,7 @@ class Server:
             **({} if self.store is None else self.store.stats()),
             "connections": len(self.gateway.connections),
             "refused_at_door": dict(self.door.refused),
-            "internal_errors": self.faults.total + figures.get("ticks_failed", 0),
+            "internal_errors": self.faults.total,
             "stalls": 0 if self.watchdog is None else self.watchdog.stalls,
             "ready": not self.unready(),
             "uptime_s": round(time.monotonic() - self.started, 3),

@@ -19,6 +19,7 @@ from typing import Any
 from server import keeping
 from server.counters import Counters
 from server.delivery import Delivery
+from server.faults import Faults
 from server.limits import Limits
 from server.recorder import RecordedWorld, Saves
 from server.rewind import Past, Rewind
@@ -47,6 +48,8 @@ from shared.world import OverlapError
 
 RESYNC_S = 1.0
 """A client may ask for everything anew so often."""
+AWAY_S = 1.0
+"""A tick that begins so late says nothing about the clients."""
 SPAWN_RINGS = 24
 """Where a spawn is taken, others are tried in rings around it, two blocks apart."""
 
@@ -90,7 +93,9 @@ class Game:
         if saves is not None and self.world.tick > 0:
             kept = keeping.restored([*(saves.kept or ()), *(value for _, value in saves.notes)])
         self.stage = Stage(self.world, self.rewind, self.counters, rules or Rules(), kept=kept, seed=seed)
+        self.faults = Faults()
         self.log = self.stage.log
+        self.log.faults = self.faults
         self.delivery = Delivery(self.world, self.log, self.limits, self.counters)
         self.sessions: list[Session] = []
         self.players: dict[int, Player] = self.stage.players
@@ -170,8 +175,7 @@ class Game:
         """Tells every client, with the seconds after which to come back, and closes the connections."""
         for session in tuple(self.sessions):
             if not session.closed:
-                session.send(encode(Bye(messages.GOING_AWAY, reason, wait)))
-                session.close(messages.GOING_AWAY, reason)
+                self._end(session, messages.GOING_AWAY, reason, wait)
 
     def keep(self) -> list[list[Any]]:
         """What belongs to the game and is not in its world, for a checkpoint."""
@@ -194,6 +198,7 @@ class Game:
     def tick(self, deadline: float, now: float) -> None:
         """One tick. `deadline`: the time it was due, by the same clock as `now`; it ends tick T at `deadline`."""
         self._deadline = deadline
+        self._excuse(deadline, now)
         self._leave(now)
         self._join()
         self._revive()
@@ -206,6 +211,12 @@ class Game:
         self._fell_out()
         self._send(now)
         self._check_clocks(now)
+
+    def _excuse(self, deadline: float, now: float) -> None:
+        """Whoever was not heard of while the server itself had no turn (it was suspended) is not to blame."""
+        if now - deadline > AWAY_S:
+            for session in self.sessions:
+                session.opened = session.heard = session.sent_at = now
 
     def _leave(self, now: float) -> None:
         for player in self.players.values():
@@ -222,24 +233,30 @@ class Game:
     def _join(self) -> None:
         joining = [session for session in self.sessions if session.hello is not None and not session.closed]
         for session in joining[: self.limits.joins_per_tick]:
-            assert session.hello is not None
-            player = self._returning(session, session.hello)
-            if player is None:
-                entity = self._spawn()
-                if entity is None:
-                    self._refuse(session, messages.FULL, "no room to spawn")
-                    continue
-                player = self.players[entity] = Player(entity, session.hello.name, session.subject)
-                self.counters.joined += 1
-                session.seat(player)
-                self.stage.joined(player)
-            else:
-                self.counters.resumed += 1
-                session.seat(player)
-            token = secrets.token_bytes(messages.RESUME_BYTES)
-            player.tokens.append(_digest(token))
-            self.world.note(keeping.note_of(player))
-            session.send(encode(Welcome(messages.VERSION, self.world.tick, player.entity, self._rules, token)))
+            try:
+                self._welcome(session)
+            except Exception:
+                self._break(session, "a join")
+
+    def _welcome(self, session: Session) -> None:
+        assert session.hello is not None
+        player = self._returning(session, session.hello)
+        if player is None:
+            entity = self._spawn()
+            if entity is None:
+                self._refuse(session, messages.FULL, "no room to spawn")
+                return
+            player = self.players[entity] = Player(entity, session.hello.name, session.subject)
+            self.counters.joined += 1
+            session.seat(player)
+            self.stage.joined(player)
+        else:
+            self.counters.resumed += 1
+            session.seat(player)
+        token = secrets.token_bytes(messages.RESUME_BYTES)
+        player.tokens.append(_digest(token))
+        self.world.note(keeping.note_of(player))
+        session.send(encode(Welcome(messages.VERSION, self.world.tick, player.entity, self._rules, token)))
 
     def _returning(self, session: Session, hello: Hello) -> Player | None:
         """The player that this is, if it was here before and still is; a connection that it still has is closed."""
@@ -272,7 +289,11 @@ class Game:
                 if player.session is not None and player.session.closed:
                     break
                 command = player.commands.popleft()
-                verdict = self._carry_out(player, command)
+                try:
+                    verdict = self._carry_out(player, command)
+                except Exception:
+                    self.faults.report("a command")
+                    verdict = messages.FAILED
                 player.settle(command.number, verdict)
                 self.world.note([keeping.ANSWERED, player.entity, command.number, verdict])
 
@@ -309,8 +330,11 @@ class Game:
             if session.allowance < 0:
                 session.allowance = min(session.allowance + self.limits.messages_per_tick, 0.0)
             if session.entity and not session.closed:
-                self.stage.tell(session)
-                self.delivery.serve(session, now)
+                try:
+                    self.stage.tell(session)
+                    self.delivery.serve(session, now)
+                except Exception:
+                    self._break(session, "serving a client")
         self.stage.told()
 
     def _check_clocks(self, now: float) -> None:
@@ -381,17 +405,29 @@ class Game:
             self._leave_for_good(session)
         self._end(session, code, reason)
 
+    def _break(self, session: Session, what: str) -> None:
+        """An exception of ours has hit one client: it is let go without a word, may come back, and the tick goes on."""
+        self.faults.report(what)
+        try:
+            session.close(messages.INTERNAL, "internal error")
+        except Exception:
+            self.faults.report("closing a link")
+        self.lost(session, session.heard)
+
     def _leave_for_good(self, session: Session) -> None:
         """The player of this connection is not kept for a return."""
         if session.player is not None and session.player.session is session:
             session.player.session = None
             self._leaving.append(session.player)
 
-    def _end(self, session: Session, code: int, reason: str) -> None:
+    def _end(self, session: Session, code: int, reason: str, wait: float = -1.0) -> None:
         reason = reason[: messages.REASON_MAX]
         self.counters.closed[code] = self.counters.closed.get(code, 0) + 1
-        session.send(encode(Bye(code, reason, -1.0)))
-        session.close(code, reason)
+        try:
+            session.send(encode(Bye(code, reason, wait)))
+            session.close(code, reason)
+        except Exception:
+            self._break(session, "saying goodbye")
 
     def _spawn(self) -> int | None:
         for place in self._places():

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from server.faults import Faults
 from shared.blocks import offset_of, pack, segment_of
 from shared.checks import Cell
 from shared.layout import ID, X
@@ -46,7 +47,12 @@ class _Parts(dict[Cell, bytes]):
         self._log, self._since = log, since
 
     def __missing__(self, segment: Cell) -> bytes:
-        part = self[segment] = self._log.encode(segment, self._since)
+        try:
+            part = self._log.encode(segment, self._since)
+        except Exception:  # a mistake of ours about one segment leaves that one out; its checksum will find it missing
+            self._log.faults.report(f"encoding segment {segment}")
+            part = b""
+        self[segment] = part
         return part
 
 
@@ -55,9 +61,16 @@ class ChangeLog:
 
     Args:
         attributes: what the game's rules say of entities, by id; whoever changes it calls `note_attributes`.
+        faults: told of a segment that could not be encoded.
     """
 
-    def __init__(self, world: World, attributes: Mapping[int, Mapping[str, Any]] | None = None) -> None:
+    def __init__(
+        self,
+        world: World,
+        attributes: Mapping[int, Mapping[str, Any]] | None = None,
+        faults: Faults | None = None,
+    ) -> None:
+        self.faults = faults or Faults()
         self._world = world
         self._attributes = {} if attributes is None else attributes
         self._said: set[int] = set()

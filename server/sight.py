@@ -62,7 +62,7 @@ class Sight:
                 return plain
         special = self._behind | dict.fromkeys(self._fresh, KEYFRAME)
         due = special | {segment: self._tick for segment in self.sees - special.keys() if known[segment]}
-        parts = {segment: log.since(since)[segment] for segment, since in due.items()}
+        parts = {segment: part for segment, since in due.items() if (part := log.since(since)[segment])}
         if sum(map(len, parts.values())) > room:
             parts = self._urgent(parts, due, tick, room)
         if self._fresh or self.drops:

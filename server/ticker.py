@@ -10,7 +10,6 @@ than about `CATCH_UP_MAX` ticks of work behind, and says so in `skipped_s`.
 
 import asyncio
 import ctypes
-import logging
 import math
 import os
 import sys
@@ -18,14 +17,13 @@ import time
 from collections.abc import Callable
 from typing import Any, Protocol
 
+from server.faults import Faults
 from server.histogram import Histogram
 
 CATCH_UP_MAX = 4
 """Ticks that run in a row before the schedule gives up what it has missed."""
 FAILURES_MAX = 10
 """So many ticks that raise in a row break the ticker."""
-
-logger = logging.getLogger(__name__)
 
 
 class Schedule:
@@ -158,6 +156,7 @@ class Ticker:
     Args:
         broken: called once when `FAILURES_MAX` ticks in a row have raised; no tick runs after that.
         alarm: makes an alarm that calls the function handed to it.
+        faults: told of ticks that raise.
     """
 
     def __init__(
@@ -166,6 +165,7 @@ class Ticker:
         tick: Callable[[float, float], None],
         broken: Callable[[], None],
         alarm: Callable[[Callable[[], None]], Alarm],
+        faults: Faults | None = None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self.lateness = Histogram()
@@ -177,6 +177,7 @@ class Ticker:
         """When the latest tick began."""
         self._tick = tick
         self._broken = broken
+        self._faults = faults or Faults()
         self._clock = clock
         self._failures_in_a_row = 0
         self._stopped = False
@@ -234,7 +235,7 @@ class Ticker:
     def _failed(self) -> None:
         self.failures += 1
         self._failures_in_a_row += 1
-        logger.exception("a tick failed (%d in a row)", self._failures_in_a_row)
+        self._faults.report("a tick")
         if self._failures_in_a_row == FAILURES_MAX:
             self.stop()
             self._broken()
