@@ -15,7 +15,6 @@ A client that lost some ticks that way gets their union in its next snapshot: la
 """
 
 import math
-from collections import deque
 
 RATE_WINDOW_S = 1.0
 """The rate is the best of the last second,"""
@@ -39,10 +38,10 @@ class Pacing:
         self.sent_bytes = 0
         """All that has been handed to the transport."""
         self._measure_at = -math.inf
-        self._acked: deque[tuple[float, int]] = deque()  # time, bytes acknowledged by then
+        self._acked: list[tuple[float, int]] = []  # time, bytes acknowledged by then
         # Time and value; whatever a later one beats is dropped, so the best is in front.
-        self._rates: deque[tuple[float, float]] = deque()
-        self._rtts: deque[tuple[float, float]] = deque()
+        self._rates: list[tuple[float, float]] = []
+        self._rtts: list[tuple[float, float]] = []
         self._full_at = -math.inf
         self._pauses = False
         self._carries = LEAST_BYTES
@@ -64,7 +63,7 @@ class Pacing:
         if self._rtts and rtt_s >= self._rtts[-1][1] and now - self._rtts[-1][0] < RTT_SPAN_S:
             return
         while self._rtts and (self._rtts[0][0] < now - RTT_WINDOW_S):
-            self._rtts.popleft()
+            self._rtts.pop(0)
         while self._rtts and self._rtts[-1][1] >= rtt_s:
             self._rtts.pop()
         self._rtts.append((now, rtt_s))
@@ -86,7 +85,7 @@ class Pacing:
         acked = self.sent_bytes - outstanding
         self._acked.append((now, acked))
         while len(self._acked) > 1 and self._acked[1][0] <= now - RATE_SPAN_S:
-            self._acked.popleft()
+            self._acked.pop(0)
         since, before = self._acked[0]
         if now - since >= RATE_SPAN_S:
             rate = (acked - before) / (now - since)
@@ -94,7 +93,7 @@ class Pacing:
                 self._rates.pop()
             self._rates.append((now, rate))
         while self._rates and self._rates[0][0] < now - RATE_WINDOW_S:
-            self._rates.popleft()
+            self._rates.pop(0)
         rtt_s = self.least_rtt_s
         hold_s = min(STALL_RTTS * rtt_s, max(HOLD_S_MAX, 1.5 * rtt_s)) + tick_s
         self._carries = max(LEAST_BYTES, int(self.rate * hold_s))
