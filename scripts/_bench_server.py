@@ -36,19 +36,22 @@ JOIN_S = 5.0
 PATIENCE_S = 30.0
 START_S = 120.0
 
+ECHO_PICOWS = "echo_picows"
+"""The kind of server that shows what another library's sockets would gain."""
+
 Figures = dict[str, Any]
 
 
-def scene_toml(capacity: int) -> str:
+def scene_toml(capacity: int, per_segment: int = PER_SEGMENT) -> str:
     """`hills`, as large as that many players need, with a spawn for each, segment by segment."""
     hills = (ROOT / "shared" / "scenes" / "hills.toml").read_text("utf-8")
     rest = "\n".join(line for line in hills.splitlines() if not line.startswith(("#", "size", "spawns")))
-    side = math.ceil(math.sqrt(capacity / PER_SEGMENT))
+    side = math.ceil(math.sqrt(capacity / per_segment))
     rng = random.Random(1)
     spawns = [
         [32 * x + rng.randrange(1, 31), 32 * y + rng.randrange(1, 31), 27]
         for x, y in sorted(((x, y) for x in range(side) for y in range(side)), key=lambda at: (max(at), at))
-        for _ in range(PER_SEGMENT)
+        for _ in range(per_segment)
     ]
     return f"tick_rate = {RATE}\nsize = [{side}, {side}, 1]\nspawns = {spawns}\n{rest}\n"
 
@@ -57,7 +60,8 @@ class Rig:
     """A server and a generator of load, both processes of their own."""
 
     def __init__(self, kind: str, scene: Path, *more: str, seed: int = 1) -> None:
-        self._server = self._start("_busy_server.py", kind, str(scene), *more)
+        script = ("_echo_picows.py",) if kind == ECHO_PICOWS else ("_busy_server.py", kind)
+        self._server = self._start(*script, str(scene), *more)
         assert self._server.stdout is not None
         line = self._server.stdout.readline()
         if not line.startswith("listening on "):
@@ -102,6 +106,7 @@ class Rig:
             "tick_lateness_ms": lateness,
             "ticks_share": ticks / RATE / (after["uptime_s"] - before["uptime_s"]),
             "snapshots_share_worst": figures["snapshots_worst"] / expected,
+            "snapshots_share_best": figures["snapshots_best"] / expected,
             "server_cpu_share": cpu_s / (after["uptime_s"] - before["uptime_s"]),
             "cpu_us_per_client_tick": cpu_s * 1e6 / ticks / clients,
             "lost": figures["gone"] - gone,
@@ -164,10 +169,12 @@ class Rig:
 
 
 @contextlib.contextmanager
-def rig(kind: str, *more: str, seed: int = 1, capacity: int = CAPACITY) -> Iterator[Rig]:
+def rig(
+    kind: str, *more: str, seed: int = 1, capacity: int = CAPACITY, per_segment: int = PER_SEGMENT
+) -> Iterator[Rig]:
     with tempfile.TemporaryDirectory() as folder:
         scene = Path(folder) / "wide.toml"
-        scene.write_text(scene_toml(capacity), "utf-8")
+        scene.write_text(scene_toml(capacity, per_segment), "utf-8")
         running = Rig(kind, scene, *more, seed=seed)
         try:
             yield running
@@ -197,6 +204,15 @@ def search(
         if bad - good <= resolution * good or n == good:
             break
     return stages
+
+
+def packed(stage: Figures) -> Figures:
+    """A crowd's stage by the names of the report; `fairness` is the least served over the best served."""
+    return stage | {
+        "entities_in_view": stage["rows_per_snapshot"],
+        "bytes_per_client_per_s": stage["bytes_down_per_client_per_s"],
+        "fairness": stage["snapshots_share_worst"] / max(stage["snapshots_share_best"], 1e-9),
+    }
 
 
 def most(stages: list[Figures]) -> Figures | None:

@@ -288,6 +288,7 @@ class Swarm:
             "stuck": self.stuck,
             "snapshots_worst": counts[0],
             "snapshots_p50": counts[len(counts) // 2],
+            "snapshots_best": counts[-1],
             "snapshot_age_ms": quantiles(self.ages_ms),
             "inputs_per_client_per_s": self.inputs / n / seconds,
             "bytes_down_per_client_per_s": self.bytes_down / n / seconds,

@@ -6,6 +6,8 @@ same hash. A figure is the median of repeated runs, its range beside it. Two bus
 `server` looks for the most clients that one server process holds at 30 Hz, all wandering over hills with some 50
 entities in view, beside what the same gateway holds without a game. It needs the machine for itself: while others
 work, ticks are late for their sake. The CPU time per client and tick is told as well, and what it comes to.
+`server --crowd` puts 300 players (or N) into one segment instead, each seeing all: the fairness is what the worst
+served of them gets of what the best served gets.
 """
 
 import argparse
@@ -126,6 +128,9 @@ def run_server(args: argparse.Namespace, console: Console) -> int:
     seconds, resolution, steps, searches = (1.5, 0.2, 3, 1) if args.quick else (5.0, 0.04, 9, 3)
     cores = os.cpu_count() or 1
     runs: list[dict[str, Any]] = []
+    bounds: list[dict[str, Any]] = []
+    if args.crowd:
+        return run_crowd(args, console, seconds)
 
     def report(stage: dict[str, Any]) -> None:
         console.print(
@@ -150,19 +155,18 @@ def run_server(args: argparse.Namespace, console: Console) -> int:
         console.print(f"  the same gateway without a game, {size} bytes a tick")
         with server.rig("echo", str(size), seed=number + 1) as running:
             first = int(0.5 * min(1e6 / server.RATE / cpu_us, server.CAPACITY)) if args.quick else 1000
-            echoed = server.search(running, first, seconds, resolution, 2 if args.quick else steps, report)
-        echo = server.most(echoed)
-        echo_us = statistics.median(stage["cpu_us_per_client_tick"] for stage in echoed)
+            echoed = server.search(running, first, seconds, resolution, 1 if args.quick else steps, report)
+        console.print("  the same on picows, which no game is played over: what another library could gain")
+        with server.rig(server.ECHO_PICOWS, str(size), seed=number + 1) as running:
+            picows = server.search(running, first, seconds, resolution, 1 if args.quick else steps, report)
         shares = server.profile(max(50, by["clients"] // 2), seconds)
         runs.append(
             {
                 "gateway": "websockets",
                 "max_clients": best["clients"] if best else 0,
-                "echo_bound_clients": echo["clients"] if echo else 0,
                 "cpu_us_per_client_tick": cpu_us,
-                "echo_cpu_us_per_client_tick": echo_us,
                 "clients_by_cpu": int(1e6 / server.RATE / cpu_us),
-                "echo_clients_by_cpu": int(1e6 / server.RATE / echo_us),
+                **bound(echoed),
                 "parts": {name: share * cpu_us for name, share in shares.items()},
                 "entities_in_view": by["rows_per_snapshot"],
                 "bytes_per_client_per_s": by["bytes_down_per_client_per_s"],
@@ -174,16 +178,54 @@ def run_server(args: argparse.Namespace, console: Console) -> int:
                 "echo_stages": echoed,
             }
         )
-    console.print(capacity_table(runs))
+        bounds.append({"gateway": "picows", "max_clients": None, "load_before": load, **bound(picows)})
+    console.print(capacity_table(runs, bounds))
     if max(run["load_before"] for run in runs) > cores / 2:
         console.print("other processes were at work: the numbers of clients are too low, go by the CPU time")
     if args.json:
-        report_ = {"quick": args.quick, "rate": server.RATE, "cores": cores, "runs": runs}
+        report_ = {"quick": args.quick, "rate": server.RATE, "cores": cores, "runs": runs + bounds}
         args.json.write_text(json.dumps(report_, indent=1) + "\n", encoding="utf-8")
     return 0
 
 
-def capacity_table(runs: list[dict[str, Any]]) -> Table:
+def bound(stages: list[dict[str, Any]]) -> dict[str, Any]:
+    """What a server that only echoes comes to."""
+    most = server.most(stages)
+    cpu_us = statistics.median(stage["cpu_us_per_client_tick"] for stage in stages)
+    return {
+        "echo_bound_clients": most["clients"] if most else 0,
+        "echo_cpu_us_per_client_tick": cpu_us,
+        "echo_clients_by_cpu": int(1e6 / server.RATE / cpu_us),
+    }
+
+
+def run_crowd(args: argparse.Namespace, console: Console, seconds: float) -> int:
+    """So many players in one segment, each seeing all."""
+    with server.rig("game", capacity=args.crowd, per_segment=args.crowd) as running:
+        stage = server.packed(running.hold(args.crowd, seconds))
+    made = Table("figure", title=f"server: {args.crowd} players in one segment, 30 Hz")
+    made.add_column("", justify="right")
+    for name, form in (
+        ("held", "{}"),
+        ("entities_in_view", "{:.0f}"),
+        ("cpu_us_per_client_tick", "{:.1f}"),
+        ("server_cpu_share", "{:.0%}"),
+        ("ticks_share", "{:.1%}"),
+        ("snapshots_share_worst", "{:.1%}"),
+        ("fairness", "{:.3f}"),
+        ("bytes_per_client_per_s", "{:,.0f}"),
+        ("generator_cpu_share", "{:.0%}"),
+    ):
+        made.add_row(name, "" if stage[name] is None else form.format(stage[name]))
+    console.print(made)
+    if args.json:
+        args.json.write_text(
+            json.dumps({"quick": args.quick, "rate": server.RATE, "crowd": stage}, indent=1) + "\n", "utf-8"
+        )
+    return 0
+
+
+def capacity_table(runs: list[dict[str, Any]], bounds: list[dict[str, Any]]) -> Table:
     made = Table("figure", title="server: 30 Hz, one process; each search apart")
     for number in range(len(runs)):
         made.add_column(f"search {number + 1}", justify="right")
@@ -199,6 +241,8 @@ def capacity_table(runs: list[dict[str, Any]]) -> Table:
         ("generator_cpu_share", "{:.0%}"),
     ):
         made.add_row(name, *("" if run[name] is None else form.format(run[name]) for run in runs))
+    for name, form in (("echo_cpu_us_per_client_tick", "{:.1f}"), ("echo_clients_by_cpu", "{:,}")):
+        made.add_row(f"picows: {name}", *(form.format(run[name]) for run in bounds))
     made.add_section()
     for part in sorted(runs[0]["parts"], key=lambda part: -runs[0]["parts"][part]):
         made.add_row(f"us in {part}", *(f"{run['parts'][part]:.2f}" for run in runs))
@@ -227,6 +271,9 @@ def main(argv: list[str] | None = None) -> int:
     command = commands.add_parser("server", help="clients per server process (Linux)")
     command.add_argument("--json", type=Path, metavar="OUT", help="write all figures to this file")
     command.add_argument("--quick", action="store_true", help="one coarse search, within 45 s")
+    command.add_argument(
+        "--crowd", type=int, nargs="?", const=300, metavar="N", help="N players in one segment instead (300)"
+    )
     command.set_defaults(run=run_server)
     args = parser.parse_args(argv)
     return int(args.run(args, Console()))

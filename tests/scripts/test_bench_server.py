@@ -1,0 +1,76 @@
+"""The benchmark of the server: the search, on servers of known size, and each kind of server once, with few players."""
+
+import sys
+import tomllib
+from pathlib import Path
+from typing import Any, cast
+
+import pytest
+
+from shared.scene import Scene
+
+sys.path.insert(0, str(Path(__file__).parents[2] / "scripts"))
+import _bench_server as bench
+
+needs_linux = pytest.mark.skipif(sys.platform != "linux", reason="the generator polls with epoll")
+
+
+class Holds:
+    """Stands for a rig: a server that holds so many clients, and works in proportion to how many there are."""
+
+    def __init__(self, most: int) -> None:
+        self.most = most
+        self.asked: list[int] = []
+
+    def hold(self, clients: int, seconds: float) -> bench.Figures:
+        self.asked.append(clients)
+        return {"clients": clients, "held": clients <= self.most, "server_cpu_share": min(1.0, clients / self.most)}
+
+
+@pytest.mark.parametrize("most", [90, 399, 400, 401, 1000, bench.CAPACITY])
+def test_the_search_ends_close_below_the_most_that_is_held(most: int) -> None:
+    holds = Holds(most)
+    stages = bench.search(cast("bench.Rig", holds), 400, 1.0, 0.04, 20, lambda stage: None)
+    best = bench.most(stages)
+    assert best is not None
+    assert most / 1.05 <= best["clients"] <= most
+    assert len(holds.asked) == len(set(holds.asked)) <= 12
+
+
+def test_a_search_of_few_steps_tells_what_it_has_tried() -> None:
+    told: list[bench.Figures] = []
+    stages = bench.search(cast("bench.Rig", Holds(10)), 400, 1.0, 0.2, 3, told.append)
+    assert [stage["clients"] for stage in stages] == [400, 200, 100]
+    assert stages == told
+    assert bench.most(stages) is None
+
+
+@pytest.mark.parametrize(("players", "per_segment"), [(40, bench.PER_SEGMENT), (30, 30)])
+def test_every_player_has_a_spawn_and_a_segment_as_many_as_it_should(players: int, per_segment: int) -> None:
+    scene = Scene.from_table({"name": "wide", **tomllib.loads(bench.scene_toml(players, per_segment))})
+    assert scene.tick_rate == bench.RATE
+    by_segment: dict[tuple[int, int], int] = {}
+    for x, y, _ in scene.spawns[:players]:
+        cell = (int(x) // 32, int(y) // 32)
+        by_segment[cell] = by_segment.get(cell, 0) + 1
+    assert set(by_segment.values()) == {per_segment}
+
+
+@needs_linux
+@pytest.mark.slow
+@pytest.mark.e2e
+@pytest.mark.parametrize("kind", ["echo", bench.ECHO_PICOWS, "game", "profile"])
+def test_each_kind_of_server_holds_a_few_players(kind: str) -> None:
+    more = ("1000",) if kind.startswith("echo") else ()
+    with bench.rig(kind, *more, capacity=4, per_segment=4) as running:
+        stage: dict[str, Any] = bench.packed(running.hold(4, 0.5))
+    assert stage["clients"] == 4
+    assert stage["lost"] == 0
+    assert stage["cpu_us_per_client_tick"] > 0
+    assert stage["bytes_per_client_per_s"] > 0
+    assert 0 < stage["fairness"] <= 1
+    assert ("samples" in stage) == (kind == "profile")
+    if kind in ("game", "profile"):
+        assert stage["inputs_used"] > 0
+    else:
+        assert stage["bytes_per_client_per_s"] > 1000 * bench.RATE / 2
