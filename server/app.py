@@ -83,7 +83,7 @@ def run(settings: Settings) -> int:
     with asyncio.Runner(loop_factory=_loop_factory()) as runner, contextlib.ExitStack() as stack:
         store = world = None
         if settings.data is not None:
-            store = stack.enter_context(saved(scene, settings.data, power=settings.durability == "power"))
+            store = stack.enter_context(saved(scene, settings))
             world = store.world
         if settings.record is not None:
             world = stack.enter_context(recorded(scene, settings.record, world))
@@ -217,15 +217,17 @@ class Server:
 
 
 @contextlib.contextmanager
-def saved(scene: Scene, directory: str, *, power: bool) -> Iterator[Store]:
-    """A store with the world of a directory, where all of it is saved in the end.
+def saved(scene: Scene, settings: Settings) -> Iterator[Store]:
+    """A store with the world of the directory `settings.data`, where all of it is saved in the end.
 
     Raises:
         StoreError: what is there cannot be used.
     """
-    store = Store(directory, scene, power=power)
+    assert settings.data is not None
+    power = settings.durability == "power"
+    store = Store(settings.data, scene, power=power, checkpoint_s=settings.checkpoint_s)
     tick, state_hash = store.restored
-    logger.info("restored", directory=directory, tick=tick, state_hash=state_hash)
+    logger.info("restored", directory=settings.data, tick=tick, state_hash=state_hash)
     try:
         yield store
     finally:

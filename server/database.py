@@ -212,9 +212,13 @@ def _reading(path: Path) -> Iterator[sqlite3.Connection]:
         with contextlib.closing(connection):
             connection.execute("BEGIN")
             yield connection
+    except StoreError:
+        raise
     except sqlite3.OperationalError as error:
-        raise StoreError(f"{path}: cannot be read ({error})") from error
-    except (sqlite3.Error, TypeError, struct.error) as error:  # TypeError: a column of another type
+        if error.sqlite_errorcode == sqlite3.SQLITE_ERROR:  # no such table, or column
+            raise damaged(path, error) from error
+        raise StoreError(f"{path}: cannot be read ({error}). Look to the disk, and to who may read the file") from error
+    except (sqlite3.Error, TypeError, ValueError, struct.error) as error:  # a column of another type, or no UTF-8
         raise damaged(path, error) from error
 
 

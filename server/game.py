@@ -12,6 +12,7 @@ import dataclasses
 import hashlib
 import math
 import secrets
+from collections import deque
 from collections.abc import Callable, Iterator
 from itertools import count
 from typing import Any
@@ -62,7 +63,8 @@ class Game:
         limits: bounds.
         compiled: as for `World`.
         world: to be played in, with its blocks; by default a new one.
-        saves: where that world is saved, if it is: the game goes on with what was kept beside it.
+        saves: where that world is saved, if it is: the game goes on with what was kept beside it, and a verdict is told
+            when no crash can undo it any more.
         rules: what happens beyond moving and editing.
         seed: of their randomness.
         authenticate: gives the subject of the token that a client shows; a `ValueError` of it refuses the client,
@@ -101,6 +103,9 @@ class Game:
         self.players: dict[int, Player] = self.stage.players
         """By entity, in the order in which they joined; also those whose connection is lost, for a while."""
         self._authenticate = authenticate
+        self._saves = saves
+        self._unanswered: deque[tuple[int, Player, int, int]] = deque()
+        """Verdicts that are not on disk yet: tick, player, number, verdict."""
         self._numbers = count(1)
         self._leaving: list[Player] = []
         self._respawn: list[int] = []
@@ -179,7 +184,10 @@ class Game:
 
     def keep(self) -> list[list[Any]]:
         """What belongs to the game and is not in its world, for a checkpoint."""
-        return keeping.whole(self.stage.kept)
+        answers = ((player.entity, number, verdict) for _, player, number, verdict in self._unanswered)
+        return keeping.whole(self.stage.kept) + [
+            [keeping.ANSWERED, entity, *answer] for entity, *answer in answers if entity in self.players
+        ]
 
     def rewound(self, session: Session, seen: float) -> Past:
         """The world as a client saw it; ask between two ticks, or for a command within one.
@@ -289,13 +297,23 @@ class Game:
                 if player.session is not None and player.session.closed:
                     break
                 command = player.commands.popleft()
+                if self._saves is not None and self._saves.trouble:
+                    player.settle(command.number, messages.UNSAVED)
+                    continue
                 try:
                     verdict = self._carry_out(player, command)
                 except Exception:
                     self.faults.report("a command")
                     verdict = messages.FAILED
-                player.settle(command.number, verdict)
+                self._unanswered.append((tick, player, command.number, verdict))
                 self.world.note([keeping.ANSWERED, player.entity, command.number, verdict])
+
+    def _answer(self) -> None:
+        """Tells the verdicts that no crash can undo any more."""
+        durable = self.world.tick if self._saves is None else self._saves.durable_tick
+        while self._unanswered and self._unanswered[0][0] <= durable:
+            _, player, number, verdict = self._unanswered.popleft()
+            player.settle(number, verdict)
 
     def _carry_out(self, player: Player, command: Command) -> int:
         if command.name != edits.NAME:
@@ -326,6 +344,7 @@ class Game:
         self.counters.fell_out += len(self._respawn)
 
     def _send(self, now: float) -> None:
+        self._answer()
         for session in tuple(self.sessions):
             if session.allowance < 0:
                 session.allowance = min(session.allowance + self.limits.messages_per_tick, 0.0)

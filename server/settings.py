@@ -64,6 +64,7 @@ class Settings:
         "power",
         Kind(str, "what a saved edit survives: the end of the process, or a power cut", choices=("process", "power")),
     )
+    checkpoint_s: float = setting(60.0, Kind(float, "a checkpoint of the saved world so often", "S", 0.1, 3600))
     limits: Limits = field(default_factory=Limits)
     origins: Mapping[str, str] = field(default_factory=dict, compare=False)
 

@@ -12,7 +12,7 @@ compared with the marks and hashes in it; it is the same world at the same tick,
 A tick in which nothing was told, nothing moved and nothing changed is quiet. Quiet ticks are written once a second; the
 loss of some is the loss of nothing, so they count as durable as soon as everything before them is.
 
-Every `CHECKPOINT_S` seconds the world is copied (`server.checkpoint`: entities at once, changed segments piece by piece
+Every `checkpoint_s` seconds the world is copied (`server.checkpoint`: entities at once, changed segments piece by piece
 and in the thread), packed between the transactions of the log, and saved in one transaction, which also drops the log
 up to there. Until it is complete the old checkpoint and its log are. The ticks wait for none of it.
 
@@ -31,7 +31,7 @@ import logging
 import sqlite3
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -47,10 +47,8 @@ from shared.inputs import Input
 from shared.scene import Scene
 from shared.world import World
 
-CHECKPOINT_S = 60.0
-"""A checkpoint so often, in seconds of the world's time,"""
 LOG_BYTES_MAX = 32 << 20
-"""or when the log has grown to this."""
+"""A log that has grown to this is cut by a checkpoint ahead of time."""
 QUIET_S = 1.0
 """Ticks in which nothing happened wait so long for company."""
 BEHIND_S = 10.0
@@ -69,6 +67,7 @@ class Store(Pen):
         directory: made if it is not there.
         scene: the rules; they must be those that the world was saved with.
         power: whether a verdict waits until it survives a power cut (an fsync), or just the end of the process.
+        checkpoint_s: a checkpoint so often, in seconds of the world's time.
         compiled: as for `World`.
 
     Attributes:
@@ -81,12 +80,19 @@ class Store(Pen):
     """
 
     def __init__(
-        self, directory: str | Path, scene: Scene, *, power: bool = True, compiled: bool | None = None
+        self,
+        directory: str | Path,
+        scene: Scene,
+        *,
+        power: bool = True,
+        checkpoint_s: float = 60.0,
+        compiled: bool | None = None,
     ) -> None:
         super().__init__(first=False)
         self._path = Path(directory) / "world.db"
         self._rules = msgpack.packb(scene.to_table())
         self._power = power
+        self._checkpoint_ticks = max(1, round(checkpoint_s * scene.tick_rate))
         self.trouble = ""
         """Why nothing can be saved just now, in one line; empty if all is well."""
         self.commit_s, self.checkpoint_s = Histogram(), Histogram()
@@ -112,7 +118,8 @@ class Store(Pen):
         except BaseException:
             self._claim.close()
             raise
-        self.world, self.kept, self.notes = loaded.world, loaded.kept, loaded.notes
+        self.world, self.kept = loaded.world, loaded.kept
+        self.notes: Sequence[tuple[int, Any]] = loaded.notes
         self._chain, self._log_bytes, self._copied = loaded.chain, loaded.log_bytes, loaded.checkpoint_tick
         self.restored = (self.world.tick, self.world.state_hash().hex())
         """The tick and the state hash of the world that was found, or of the new one."""
@@ -147,7 +154,7 @@ class Store(Pen):
         parts, tick = self.taken(world, inputs), world.tick
         loud = any(parts[:3])
         copy = None
-        if self._copy is None and (self._copy_due or tick - self._copied >= CHECKPOINT_S * world.scene.tick_rate):
+        if self._copy is None and (self._copy_due or tick - self._copied >= self._checkpoint_ticks):
             copy = Copy(world, msgpack.packb(self._keep()))
         record = msgpack.packb(parts)
         with self._wake:
@@ -274,7 +281,9 @@ class Store(Pen):
             self._wake.wait_for(lambda: self._closing, RETRY_S)
             self._copy_due = True
             self._wake.wait_for(lambda: self._copy is not None)
-            copy = self._copy
+            copy = self._copying = self._copy
+            if self._closing:
+                self._gap = False
         assert copy is not None
         self._began = time.monotonic()
         file = Database(self._path, power=self._power)
@@ -300,5 +309,7 @@ class Store(Pen):
         """Begins a gap; the lock is held."""
         if not self.trouble:
             logger.error("cannot save: %s; commands are refused until it works again", reason)
-        self.trouble, self._gap, self._copy = reason, True, None
+        self.trouble, self._gap = reason, True
+        if not self._closing or self._copy is self._copying:  # else it is the last one, which has not been tried yet
+            self._copy = None
         self._records.clear()

@@ -78,7 +78,7 @@ MARGIN_ONE = 256
 MARGIN_REFUSED = -(1 << 15)
 """Stands for the margin of an input that was refused."""
 
-DONE, OVERLAPS, OUT_OF_REACH, TOO_MANY, INVALID, FORBIDDEN, FAILED = range(7)
+DONE, OVERLAPS, OUT_OF_REACH, TOO_MANY, INVALID, FORBIDDEN, FAILED, UNSAVED = range(8)
 """The verdict on a command."""
 VERDICT_TEXTS = (
     "done",
@@ -88,6 +88,7 @@ VERDICT_TEXTS = (
     "not possible there",
     "not allowed",
     "the server failed",
+    "the server cannot save just now",
 )
 
 # Close codes.

@@ -5,6 +5,7 @@ from typing import Any
 
 from server.game import Game
 from server.limits import Limits
+from server.recorder import Saves
 from server.rules import Rules
 from server.session import Session
 from shared import edits, messages
@@ -71,11 +72,13 @@ class Table:
         fill: list[list[int]] = FLOOR,
         rules: Rules | None = None,
         resume_s: float = 0.0,
+        saves: Saves | None = None,
         **changes: Any,
     ) -> None:
         values: dict[str, Any] = {"origin": (0, 0, 0), "size": (1, 1, 1), "spawns": ((16.0, 16.0, 1.0),)}
         limits = replace(limits or Limits(), resume_s=resume_s)
-        self.game = Game(scene(fill, **(values | changes)), limits=limits, compiled=False, rules=rules)
+        made = scene(fill, **(values | changes))
+        self.game = Game(made, limits=limits, compiled=False, rules=rules, saves=saves)
         self.now = 0.0
         self.tick_s = 1 / self.game.scene.tick_rate
 

@@ -1,13 +1,13 @@
 """What clients order: carried out in its tick, bounded, answered."""
 
+from collections.abc import Sequence
+from typing import Any
+
 import pytest
 
 from server.limits import Limits
 from shared import edits, messages
-from shared.messages import (
-    Command,
-    Snapshot,
-)
+from shared.messages import Command, Inputs, Snapshot
 from tests.tables import FakeLink, Table, order
 
 
@@ -83,6 +83,58 @@ def test_commands_are_bounded_in_number_and_rate() -> None:
     assert sorted(verdicts(link)) == list(range(1, 9))
     assert [verdicts(link)[n] for n in range(5, 9)] == [messages.TOO_MANY] * 4
     assert sum(verdict == messages.DONE for verdict in verdicts(link).values()) == 2  # two seconds' worth at once
+
+
+class Disk:
+    """Where a world is said to be saved."""
+
+    def __init__(self) -> None:
+        self.kept: Any = None
+        self.notes: Sequence[tuple[int, Any]] = ()
+        self.trouble = ""
+        self.durable_tick = 1 << 30
+
+
+def test_a_verdict_is_told_when_its_tick_is_on_disk() -> None:
+    disk = Disk()
+    table = Table(saves=disk)
+    link = builder(table)
+    link.say(order(1, 0, 18, 16, 1, 5), order(2, 0, 30, 16, 1, 5))
+    disk.durable_tick = table.tick_number
+    table.tick(3)
+    assert table.game.world.blocks.get(18, 16, 1) == 5
+    link.say(order(1, 0, 18, 16, 1, 5))  # asked again
+    table.tick()
+    assert verdicts(link) == {}
+    told = [note[1:] for note in table.game.keep() if note[0] == "answered"]  # a checkpoint now would hold them
+    assert told == [[link.session.entity, 1, messages.DONE], [link.session.entity, 2, messages.OUT_OF_REACH]]
+    disk.durable_tick += 1
+    table.tick()
+    assert verdicts(link) == {1: messages.DONE, 2: messages.OUT_OF_REACH}
+
+
+def test_while_nothing_can_be_saved_commands_are_refused_and_players_move_on() -> None:
+    disk = Disk()
+    table = Table(saves=disk)
+    link = builder(table)
+    link.say(order(1, 0, 18, 16, 1, 5))
+    disk.durable_tick = table.tick_number
+    table.tick()
+    disk.trouble = "no room"
+    at = table.game.world.position(link.session.entity)
+    tick = table.tick_number
+    link.say(order(2, 0, 18, 16, 2, 5), Inputs(tick + 1, tick, bytes((127, 0, 0)) * 8))
+    table.tick(8)
+    assert verdicts(link) == {2: messages.UNSAVED}
+    assert table.game.world.blocks.get(18, 16, 2) == 0
+    assert table.game.world.position(link.session.entity)[0] > at[0]
+    disk.trouble, disk.durable_tick = "", table.tick_number
+    link.say(order(3, 0, 18, 16, 2, 5))
+    table.tick()
+    assert verdicts(link) == {2: messages.UNSAVED, 1: messages.DONE}
+    disk.durable_tick = table.tick_number
+    table.tick()
+    assert verdicts(link)[3] == messages.DONE
 
 
 def test_what_a_client_ordered_before_it_was_closed_is_not_carried_out(table: Table) -> None:

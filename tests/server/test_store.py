@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 
 from server import database
-from server import store as stores
 from server.database import StoreError
 from server.store import Store
 from shared.blocks import pack
@@ -41,8 +40,8 @@ def opened(tmp_path: Path) -> Iterator[Callable[..., Store]]:
     """Opens stores in `tmp_path / "data"` (or elsewhere); those that are left open are closed in the end."""
     found: list[Store] = []
 
-    def open_one(directory: Path = tmp_path / "data", *, start: bool = True) -> Store:
-        store = Store(directory, SCENE, compiled=False)
+    def open_one(directory: Path = tmp_path / "data", *, start: bool = True, checkpoint_s: float = 60) -> Store:
+        store = Store(directory, SCENE, compiled=False, checkpoint_s=checkpoint_s)
         found.append(store)
         if start:
             store.start(keep)
@@ -130,12 +129,9 @@ def test_what_a_restart_changes_is_in_the_log(opened: Callable[..., Store], tmp_
     assert len(opened(third, start=False).world) == 0
 
 
-def test_checkpoints_are_exact_while_the_world_goes_on(
-    opened: Callable[..., Store], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(stores, "CHECKPOINT_S", 5 / SCENE.tick_rate)
+def test_checkpoints_are_exact_while_the_world_goes_on(opened: Callable[..., Store], tmp_path: Path) -> None:
     rng = random.Random(5)
-    store = opened()
+    store = opened(checkpoint_s=5 / SCENE.tick_rate)
     hashes: dict[int, bytes] = {}
     for life in range(12):
         hashes |= dict(play(store, 20, rng))

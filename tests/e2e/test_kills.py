@@ -1,0 +1,223 @@
+"""The real server, killed at any instant: what a client was told had been done is in the world that comes back."""
+
+import asyncio
+import contextlib
+import json
+import random
+import resource
+import shutil
+import sys
+import time
+from collections.abc import AsyncIterator, Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from websockets.asyncio.client import ClientConnection, connect
+from websockets.exceptions import ConnectionClosed
+
+from server.store import Store
+from shared import edits, messages
+from shared.layout import ID, X
+from shared.messages import VERSION, Command, Hello, Inputs, Snapshot, Welcome, decode_from_server, encode
+from shared.scene import Scene, load_scene
+from shared.snapshot import VERDICT, decode_parts
+from shared.units import BLOCK
+from shared.world import World
+from tests.e2e.processes import END_S, ServerProcess, page, running, stats, until
+
+pytestmark = pytest.mark.e2e
+
+KILLS = 50
+BOTS = 6
+Cell = tuple[int, int, int]
+
+
+class Cells:
+    """What clients have asked for and what they were told, for each block above the plain."""
+
+    def __init__(self) -> None:
+        self.asked: dict[Cell, list[int]] = {}
+        """The kinds that a block may have: the last that was told to be done (or found), and those asked for since."""
+        self.done = self.refused = 0
+
+    def ask(self, cell: Cell, kind: int) -> None:
+        self.asked.setdefault(cell, [0]).append(kind)
+
+    def answered(self, cell: Cell, kind: int, verdict: int) -> None:
+        if verdict == messages.DONE:
+            del self.asked[cell][: self.asked[cell].index(kind)]
+            self.done += 1
+        else:
+            self.asked[cell].remove(kind)
+            self.refused += 1
+
+    def check(self, world: World) -> None:
+        """Compares with a world, and goes on from there."""
+        for cell, kinds in self.asked.items():
+            found = world.blocks.get(*cell)
+            assert found in kinds, f"block {cell} is {found}; could be {kinds}"
+            self.asked[cell] = [found]
+
+
+class Editor:
+    """A client that does little but edit the blocks above it, in an order that tells every edit from the others."""
+
+    def __init__(self, cells: Cells, scene: Scene, turn: int) -> None:
+        self.cells, self.scene, self.turn = cells, scene, turn
+        self.entity = 0
+        self.own: list[Cell] = []
+        self.waiting: dict[int, tuple[Cell, int]] = {}
+        self.told: list[int] = []
+
+    async def play(self, address: tuple[str, int]) -> None:
+        """Until the connection ends."""
+        with contextlib.suppress(ConnectionClosed, OSError, asyncio.TimeoutError):
+            async with connect(f"ws://{address[0]}:{address[1]}", compression=None, max_queue=None) as link:
+                await link.send(encode(Hello(VERSION, {}, "editor")))
+                async for data in link:
+                    assert isinstance(data, bytes)
+                    message = decode_from_server(data)
+                    if isinstance(message, Welcome):
+                        self.entity = message.entity
+                    elif isinstance(message, Snapshot):
+                        self.hear(message)
+                        await self.say(link, message.tick)
+
+    def hear(self, snapshot: Snapshot) -> None:
+        if not self.own:
+            (state,) = [state for state in self.states(snapshot) if state[ID] == self.entity]
+            x, y, z = (part // BLOCK for part in state[X : X + 3])
+            self.own = [(x, y, z + 3), (x, y, z + 4), (x, y + 1, z + 3)]
+        for number, verdict in np.frombuffer(snapshot.verdicts, VERDICT).tolist():
+            self.told.append(verdict)
+            self.cells.answered(*self.waiting.pop(number), verdict)
+
+    def states(self, snapshot: Snapshot) -> list[list[int]]:
+        """Those of a snapshot that is the first, or follows one that has been seen."""
+        rows: list[list[int]] = decode_parts(snapshot.segments, len(self.scene.templates))[1].tolist()
+        return rows
+
+    async def say(self, link: ClientConnection, tick: int) -> None:
+        """An input (east and west, to keep the world busy) and now and then an edit."""
+        move = 127 if tick // 16 % 2 else 129
+        await link.send(encode(Inputs(tick + 2, tick, bytes((move, 0, 0)))))
+        if tick % 3:
+            return
+        self.turn += 1
+        cell, kind = self.own[self.turn % len(self.own)], self.turn // len(self.own) % 255 + 1
+        self.waiting[self.turn] = (cell, kind)
+        self.cells.ask(cell, kind)
+        await link.send(
+            encode(Command(self.turn, tick + 1, float(tick), edits.NAME, edits.pack(edits.Edit(*cell, kind))))
+        )
+
+
+@contextlib.asynccontextmanager
+async def editing(address: tuple[str, int], cells: Cells, scene: Scene, turn: int) -> AsyncIterator[list[Editor]]:
+    """Clients that edit, and that have all gone in the end."""
+    editors = [Editor(cells, scene, turn) for _ in range(BOTS)]
+    tasks = [asyncio.create_task(editor.play(address)) for editor in editors]
+    try:
+        yield editors
+    finally:
+        done, late = await asyncio.wait(tasks, timeout=END_S)
+        assert not late
+        for task in done:
+            task.result()
+
+
+def looked_at(data: Path, scene: Scene, copy: Path) -> tuple[World, tuple[int, str]]:
+    """The world in a directory, and its tick and hash, found by replay in this process and from a copy."""
+    shutil.copytree(data, copy)
+    store = Store(copy, scene)
+    store.close()
+    shutil.rmtree(copy)
+    return store.world, store.restored
+
+
+@pytest.mark.slow
+def test_nothing_that_a_client_was_told_is_lost_in_fifty_kills(tmp_path: Path) -> None:
+    seed = 17
+    rng, cells, scene = random.Random(seed), Cells(), load_scene("flat")
+    data, early = tmp_path / "data", 0
+    expected: tuple[int, str] | None = None
+    for life in range(KILLS):
+        how = {"checkpoint_s": rng.choice(("0.1", "0.5", "60")), "durability": rng.choice(("process", "power"))}
+        environment = {f"SOVEREIGN_{name.upper()}": value for name, value in how.items()}
+        server = ServerProcess("--port", "0", "--scene", "flat", "--data", str(data), **environment)
+        try:
+            if life % 5 == 4:  # while it starts
+                time.sleep(rng.uniform(0.0, 0.7))
+                early += 1
+                server.process.kill()
+            else:
+                address = server.address()
+                if expected is not None:
+                    figures = stats(address)
+                    assert (figures["restored_tick"], figures["restored_hash"]) == expected, (seed, life)
+                asyncio.run(one_life(server, address, cells, scene, 1000 * life, rng.uniform(0.05, 0.8)))
+        finally:
+            server.close()
+        if (data / "world.db").exists():
+            world, expected = looked_at(data, scene, tmp_path / "copy")
+            cells.check(world)
+    assert early == KILLS // 5
+    assert cells.done > 10 * KILLS, (cells.done, cells.refused)
+
+
+async def one_life(
+    server: ServerProcess, address: tuple[str, int], cells: Cells, scene: Scene, turn: int, seconds: float
+) -> None:
+    """Edits, and a kill so long after the first verdict."""
+    before = cells.done
+    async with editing(address, cells, scene, turn):
+        await asyncio.get_running_loop().run_in_executor(None, until, lambda: cells.done > before)
+        await asyncio.sleep(seconds)
+        server.process.kill()
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="limits another process's files")
+def test_a_full_disk_is_told_players_move_on_and_room_is_made_use_of(tmp_path: Path) -> None:
+    cells, data = Cells(), tmp_path / "data"
+    with running("--port", "0", "--scene", "flat", "--data", str(data)) as server:
+        address = server.address()
+        asyncio.run(fill_up(server, address, cells, data))
+        server.end()
+        said = [line for line in server.errors if json.loads(line)["level"] != "info"]
+    assert len(said) == 2, said
+    assert "cannot save" in said[0]
+    assert "saving again" in said[1]
+    world, _ = looked_at(data, load_scene("flat"), tmp_path / "copy")
+    cells.check(world)
+
+
+async def fill_up(server: ServerProcess, address: tuple[str, int], cells: Cells, data: Path) -> None:
+    loop = asyncio.get_running_loop()
+
+    async def seen(condition: Callable[[], bool]) -> None:
+        await loop.run_in_executor(None, until, condition)
+
+    def limit(size: int) -> None:
+        resource.prlimit(server.process.pid, resource.RLIMIT_FSIZE, (size, resource.RLIM_INFINITY))
+
+    async with editing(address, cells, load_scene("flat"), 0) as editors:
+        await seen(lambda: cells.done > 20)
+        limit((data / "world.db-wal").stat().st_size)
+        await seen(lambda: messages.UNSAVED in editors[0].told)
+        figures = await loop.run_in_executor(None, stats, address)
+        assert figures["save_trouble"]
+        assert not figures["ready"]
+        assert figures["internal_errors"] == 0
+        done = cells.done
+        tick = figures["tick"]
+        await seen(lambda: stats(address)["tick"] > tick + 30)
+        later = await loop.run_in_executor(None, stats, address)
+        assert later["inputs_used"] > figures["inputs_used"]
+        assert later["snapshots_sent"] > figures["snapshots_sent"]
+        assert cells.done == done
+        limit(resource.RLIM_INFINITY)
+        await seen(lambda: not stats(address)["save_trouble"])
+        await seen(lambda: cells.done > done + 20)
+        assert await loop.run_in_executor(None, page, address, "/readyz") == "ready\n"
+        server.process.kill()
