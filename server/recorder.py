@@ -7,6 +7,7 @@ from typing import Any, Protocol
 
 import msgpack
 import numpy as np
+import numpy.typing as npt
 
 from server.journal import (
     FILL,
@@ -28,7 +29,7 @@ from shared import terrain
 from shared.blocks import Kinds, digest_of, pack, segment_of
 from shared.checks import Cell, SceneError
 from shared.inputs import Input
-from shared.layout import ID, Int64s
+from shared.layout import FALLING, FLAGS, ID, Int64s
 from shared.world import STATES, OverlapError, World
 
 
@@ -160,9 +161,21 @@ class RecordedWorld(World):
             self._call([PUT, *rows.ravel().tolist()])
         super().put(states)
 
+    def spawn_many(self, template: str, positions: npt.ArrayLike) -> range:
+        self._inside += 1  # if it fails, it removes what it has put, and nothing has happened
+        try:
+            ids = super().spawn_many(template, positions)
+        finally:
+            self._inside -= 1
+        if self._pens and ids:
+            states = self.rows(ids)[:, :STATES]
+            states[:, FLAGS] &= FALLING
+            self._call([PUT, *states.ravel().tolist()])
+        return ids
+
     def remove(self, entity: int) -> None:
         super().remove(entity)
-        if self._pens:
+        if self._pens and not self._inside:
             self._forget([entity])
             self._call([REMOVE, int(entity)])
 

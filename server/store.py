@@ -145,6 +145,11 @@ class Store(Pen):
         """The newest tick with nothing before it that a crash could undo."""
         return self._tick if self._written >= self._loud else self._written
 
+    @property
+    def idle(self) -> bool:
+        """Whether no checkpoint is being made."""
+        return self._copy is None
+
     def touch(self, segment: Cell) -> None:
         copy = self._copy
         if copy is not None:
@@ -196,6 +201,7 @@ class Store(Pen):
             "restored_hash": self.restored[1],
             "durable_tick": self.durable_tick,
             "journal_lag_ticks": self._tick - self.durable_tick,
+            "log_bytes": self._log_bytes,
             "commit_ms": self.commit_s.summary(),
             "checkpoints": self.checkpoint_s.count,
             "checkpoint_ms": self.checkpoint_s.summary(),

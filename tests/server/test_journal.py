@@ -69,6 +69,10 @@ def play(world: RecordedWorld) -> list[bytes]:
     world.unload_segment((-1, -1, -1))
     world.load_terrain([(-1, -1, -1)])
     step()
+    world.spawn_many("box", [(-20, -20, 5), (-16, -20, 0), (-12, -20, 1)])
+    with pytest.raises(OverlapError):
+        world.spawn_many("box", [(-8, -20, 0), (-8, -20, 0.5)])
+    step()
     world.rebase(1000)
     step()
     world.spawn("box", (20, 20, 2))
@@ -92,7 +96,7 @@ def test_every_call_is_replayed_to_the_same_hash_at_every_tick() -> None:
     assert last.ended
     assert last.hashed
     assert last.world.state_hash() == world.state_hash()
-    assert recording.world.next_id == world.next_id == 7
+    assert recording.world.next_id == world.next_id == 10
     assert recording.torn == 0
 
 
