@@ -23,6 +23,9 @@ from client_sdk.transports.polling import PollingTransport
 from shared.inputs import make_input
 from shared.scene import Scene
 
+PATIENCE_S = 30.0
+"""A server that is started anew is back by then."""
+
 
 class Transport(Protocol):
     """What carries a client's messages. None of these block, but for `close`."""
@@ -59,6 +62,8 @@ class Client:
         *,
         name: str = "",
         scene: Scene | None = None,
+        token: str = "",
+        patience_s: float = PATIENCE_S,
         timeout: float = 5.0,
         tls: ssl.SSLContext | None = None,
     ) -> "Client":
@@ -68,13 +73,15 @@ class Client:
             url: where the server is, like ws://localhost:8765.
             name: shown to others, up to 32 characters.
             scene: the scene this program was built for; another one on the server ends in `Left`. None: take its.
+            token: proves who this is, where the server asks for one.
+            patience_s: after a lost connection, it tries to come back for so long; 0: not at all.
             timeout: the longest that this may block, in seconds.
             tls: whom to trust for wss://; None: whom the system trusts.
 
         Raises:
             ConnectError: there is no connection; the text says why and what to do.
         """
-        core = Core(name, scene)
+        core = Core(name, scene, token=token, patience_s=patience_s)
         return cls(core, PollingTransport(Connection(url, core), timeout, tls))
 
     @property
@@ -86,6 +93,11 @@ class Client:
     def playing(self) -> bool:
         """Whether inputs count and there is a world to draw."""
         return self.core.state == "playing"
+
+    @property
+    def away(self) -> bool:
+        """Whether the connection is lost and the client tries to come back: `Disconnected`, then `Resumed`."""
+        return self.core.state == "away"
 
     @property
     def closed(self) -> bool:

@@ -2,27 +2,33 @@
 
     joining   hello and pings are out; the welcome, the terrain around the player and the server's time come in
     playing   every tick: step the predicted world with the wish, send the wish; every snapshot: reconcile
+    away      the connection is lost: prediction goes on for a while; once there is another one, the world is fetched
+              anew beside it, what was not acknowledged is sent again, and the new world takes the place of the old
     closed    it is over
 
 `now` is always float seconds of any one monotonic clock.
 """
 
+import copy
 import math
 import struct
 from collections import deque
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from client_sdk.clock import LeadController, PricedLead, ServerClock, Timeline
+from client_sdk.comeback import Comeback
 from client_sdk.events import (
     Answered,
     Corrected,
+    Disconnected,
     Diverged,
     Event,
     Happened,
     Joined,
     Left,
+    Resumed,
     Resynchronised,
     SegmentLoaded,
     Stats,
@@ -61,7 +67,19 @@ TICKS_PER_UPDATE_MAX = 16
 UNCONFIRMED_MAX = 96
 """So many ticks beyond the newest snapshot, prediction waits."""
 INPUT_DELAY_MAX = 3
+CLOCK_S = 1.0
+"""A server whose time is this far from what it was believed to be is not the same one any more, or was away."""
+COME_AGAIN = (messages.TOO_SLOW, messages.GOING_AWAY)
+"""The connection was at fault, not the player."""
 EVENTS_MAX = 1000
+
+
+class _Copy(NamedTuple):
+    """What a client knows of a server."""
+
+    prediction: Prediction
+    picture: Picture
+    clock: ServerClock
 
 
 class Core:
@@ -70,6 +88,8 @@ class Core:
     Args:
         name: shown to others.
         scene: the scene this program was built for, checked by the server; None: the server's is taken.
+        token: proves who this is, where the server asks for it.
+        patience_s: for so long it tries to come back after a lost connection; 0: that is the end.
         compiled: run the physics compiled by Numba; None: where it is installed.
         neighbours: predict blocking others, too (see `Prediction`).
         lead: decides how far to live ahead of the server.
@@ -80,6 +100,8 @@ class Core:
         name: str = "",
         scene: Scene | None = None,
         *,
+        token: str = "",
+        patience_s: float = 0.0,
         compiled: bool | None = None,
         neighbours: bool = True,
         lead: LeadController | None = None,
@@ -94,8 +116,18 @@ class Core:
         self.clock = ServerClock()
         self.prediction: Prediction | None = None
         self.timeline: Timeline | None = None
+        self.comeback = Comeback(patience_s)
+        self._token = token
+        self._resume = b""
+        self._filled: _Copy | None = None
+        """What the server's messages go into: after a return not yet what is played in."""
+        self._unanswered: dict[int, bytes] = {}
+        """Commands by number."""
+        self._told = -1
+        """The newest tick that the server has an input for."""
         self._compiled = compiled
         self._lead = lead or PricedLead()
+        self._new_lead = copy.deepcopy(self._lead)
         self.wish = NEUTRAL
         self._out: list[bytes] = []
         self._events: deque[Event] = deque(maxlen=EVENTS_MAX)
@@ -119,11 +151,13 @@ class Core:
     def open(self, now: float) -> None:
         """The connection is there: says hello."""
         self._open = True
-        self._send(Hello(messages.VERSION, self.scene.digests if self.scene else {}, self.name[: messages.NAME_MAX]))
+        self._out.clear()
+        digests = self.scene.digests if self.scene else {}
+        self._send(Hello(messages.VERSION, digests, self.name[: messages.NAME_MAX], self._token, self._resume))
 
     def receive(self, data: bytes, now: float) -> None:
         """One message of the server. One that is malformed closes the connection."""
-        if self.state == "closed":
+        if self.state == "closed" or not self._open:
             return
         self.stats.bytes_down += len(data)
         try:
@@ -132,8 +166,12 @@ class Core:
             self._fail(messages.MALFORMED, f"the server sent something malformed: {error}")
 
     def lost(self, code: int, reason: str, now: float) -> None:
-        """The connection is gone."""
-        self._end(Left(code, reason))
+        """The connection is gone, or could not be made."""
+        if self.state in ("playing", "away"):
+            if self._open or self.comeback.retry_at == math.inf:  # else a `Bye` has told already
+                self._cut_off(Left(code, reason, 0.0), now)
+        else:
+            self._end(Left(code, reason))
 
     def command(self, name: str, data: Any = None) -> int:
         """Asks the game's rules for something, with the next tick; the number by which it is `Answered`.
@@ -142,7 +180,7 @@ class Core:
             RuntimeError: the client has not joined.
             ValueError: the name or the data are too long (32 characters, 1,024 bytes), or no MessagePack.
         """
-        if self.state != "playing":
+        if self.state not in ("playing", "away"):
             raise RuntimeError("command: the client has not joined")
         assert self.prediction is not None
         if not 0 < len(name) <= messages.NAME_MAX or name == edits.NAME:
@@ -151,8 +189,7 @@ class Core:
             )
         payload = messages.pack_value(data)
         self._number += 1
-        tick = self.prediction.predicted.tick + self._delay + 1
-        self._send(Command(self._number, tick, self._seen, name, payload))
+        self._order(Command(self._number, self.prediction.predicted.tick + self._delay + 1, self._seen, name, payload))
         return self._number
 
     def edit(self, x: int, y: int, z: int, kind: int) -> int:
@@ -161,13 +198,13 @@ class Core:
         Raises:
             RuntimeError: the client has not joined.
         """
-        if self.state != "playing":
+        if self.state not in ("playing", "away"):
             raise RuntimeError("edit: the client has not joined")
         assert self.prediction is not None
         edit = edits.Edit(x, y, z, kind)
         self._number += 1
         tick = self.prediction.edit(self._number, edit)
-        self._send(Command(self._number, tick, self._seen, edits.NAME, edits.pack(edit)))
+        self._order(Command(self._number, tick, self._seen, edits.NAME, edits.pack(edit)))
         return self._number
 
     def close(self) -> None:
@@ -186,26 +223,27 @@ class Core:
 
     def update(self, now: float) -> None:
         """Sends pings that are due, and predicts every tick whose time has come."""
-        if self.state == "closed" or not self._open:
-            return
-        if self.clock.due(now):
+        if self._open and (self._filled.clock if self._filled else self.clock).due(now):
             self._send(Ping(now, self.stats.corrections))
             self._pings.append(now)
         if self.state == "joining":
             self._try_to_join(now)
-        if self.state != "playing":
+        elif self.state == "away" and self._filled:
+            self._try_to_come_back(self._filled, now)
+        if self.state not in ("playing", "away"):
             return
         assert self.timeline is not None
         assert self.picture is not None
-        self._reconcile(now)
-        if self.timeline.steer(self._lead, self.clock, now):
-            self._restart(now)
-        self._seen = self.picture.advance(self.clock, now)
+        if self.state == "playing":
+            self._reconcile(now)
+            if self.timeline.steer(self._lead, self.clock, now):
+                self._restart(now)
+            self._seen = self.picture.advance(self.clock, now)
         self._predict(math.floor(self.timeline.tick(now)), now)
 
     def next_update(self, now: float) -> float:
         """The local time at which `update` has something to do."""
-        due = self.clock.next_ping
+        due = (self._filled.clock if self._filled else self.clock).next_ping if self._open else self.comeback.retry_at
         prediction = self.prediction
         if self.timeline and prediction and self._newest < prediction.confirmed.tick + UNCONFIRMED_MAX:
             due = min(due, self.timeline.when(self._newest + 1))
@@ -240,41 +278,61 @@ class Core:
             case Pong():
                 if message.sent in self._pings:  # anything else is no answer to a ping of ours
                     self._pings.remove(message.sent)
-                    self.clock.answered(message.sent, message.tick, now)
+                    (self._filled.clock if self._filled else self.clock).answered(message.sent, message.tick, now)
             case Terrain():
                 self._terrain(message)
             case Welcome():
-                self._welcome(message)
+                self._welcome(message, now)
             case messages.Happened():
                 data = messages.unpack_value(message.payload)
                 self._events.append(Happened(message.tick, message.name, data))
             case messages.Shared():
                 self.shared = message.values
             case Bye():
-                self._end(Left(message.code, message.reason, message.wait))
+                left = Left(message.code, message.reason, message.wait)
+                if self.state in ("playing", "away") and (message.wait >= 0 or message.code in COME_AGAIN):
+                    self._cut_off(left, now)
+                else:
+                    self._end(left)
             case _:
                 raise ProtocolError(f"{type(message).__name__} from a server")
 
-    def _welcome(self, welcome: Welcome) -> None:
-        if self.entity:
+    def _welcome(self, welcome: Welcome, now: float) -> None:
+        if self._filled or (self.entity and self.state != "away"):
             raise ProtocolError("a second Welcome")
         scene = check_scene(welcome.scene)
         if self.scene is not None and scene.digests != self.scene.digests:
             raise ProtocolError("Welcome.scene: not the scene that was asked for")
-        self.scene = scene
-        self.entity = welcome.entity
-        self.prediction = Prediction(scene, welcome.entity, neighbours=self._neighbours, compiled=self._compiled)
-        self.picture = Picture(scene, self.prediction)
-        self.clock.rate = float(scene.tick_rate)
+        self.scene, self._resume, self._told = scene, welcome.resume, -1
+        self.comeback.spread = welcome.entity
+        clock = self.clock
+        if clock.rate == 0 or abs(clock.tick(now) - welcome.tick) > CLOCK_S * scene.tick_rate:
+            clock = ServerClock()
+            clock.rate = float(scene.tick_rate)
+        prediction = Prediction(scene, welcome.entity, neighbours=self._neighbours, compiled=self._compiled)
+        self._filled = _Copy(prediction, Picture(scene, prediction), clock)
+        if self.state == "joining":
+            self._play_in(self._filled)
+        elif welcome.entity == self.entity:
+            self._out += self._unanswered.values()
+        else:
+            for number in self._unanswered:
+                self._events.append(Answered(number, False, "the connection was lost"))
+            self._unanswered.clear()
+
+    def _play_in(self, filled: "_Copy") -> None:
+        self.prediction, self.picture, self.clock = filled
+        self.entity = filled.prediction.entity
 
     def _terrain(self, terrain: Terrain) -> None:
         """A piece of a segment; the edits that came before the last piece are made up for."""
-        if self.prediction is None:
+        if self._filled is None:
             raise ProtocolError("Terrain before Welcome")
+        prediction = self._filled.prediction
         segment = (terrain.x, terrain.y, terrain.z)
         if terrain.offset == 0:
             self._pieces = (segment, bytearray())
-            self.prediction.expect_segment(segment)
+            prediction.expect_segment(segment)
         if self._pieces[0] != segment or len(self._pieces[1]) != terrain.offset:
             raise ProtocolError("Terrain: a piece is missing")
         self._pieces[1].extend(terrain.chunk)
@@ -284,26 +342,29 @@ class Core:
             kinds = unpack(bytes(self._pieces[1]))
         except ValueError as error:
             raise ProtocolError(f"Terrain.chunk: {error}") from error
-        self.prediction.load_segment(segment, kinds)
+        prediction.load_segment(segment, kinds)
         self._events.append(SegmentLoaded(segment))
 
     def _snapshot(self, snapshot: Snapshot, now: float) -> None:
-        prediction = self.prediction
-        if prediction is None or self.picture is None:
+        if self._filled is None:
             raise ProtocolError("Snapshot before Welcome")
+        prediction = self._filled.prediction
         if snapshot.tick <= prediction.confirmed.tick:
             raise ProtocolError(f"Snapshot.tick = {snapshot.tick}: not newer than the one before")
         self.stats.snapshots += 1
-        if self.stats.snapshots > 1:
+        self._told = max(self._told, snapshot.newest)
+        if len(prediction.confirmed):
             self.stats.snapshots_skipped += snapshot.tick - prediction.confirmed.tick - 1
         self._late |= self._fates(snapshot, now)
-        verdicts = np.frombuffer(snapshot.verdicts, VERDICT).tolist() if snapshot.verdicts else ()
-        for number, verdict in verdicts:
-            prediction.settle(number, verdict == messages.DONE)
+        for number, verdict in np.frombuffer(snapshot.verdicts, VERDICT).tolist() if snapshot.verdicts else ():
+            if self._unanswered.pop(number, None) is None:
+                continue  # asked and answered twice
+            if self.prediction is not None:
+                self.prediction.settle(number, verdict == messages.DONE)
             text = messages.VERDICT_TEXTS[min(verdict, len(messages.VERDICT_TEXTS) - 1)]
             self._events.append(Answered(number, verdict == messages.DONE, text))
         self._wrong = prediction.apply(snapshot) or self._wrong
-        self.picture.interpolation.push(snapshot.tick, prediction.truth)
+        self._filled.picture.interpolation.push(snapshot.tick, prediction.truth)
 
     def _reconcile(self, now: float) -> None:
         """Compares the prediction with the newest snapshot: once per update, however many have come."""
@@ -363,6 +424,49 @@ class Core:
         self.state = "playing"
         self._events.append(Joined(self.entity, self.scene, prediction.predicted.tick))
 
+    def _try_to_come_back(self, filled: "_Copy", now: float) -> None:
+        """Goes on in the new copy of the world once as much is known of it as for joining."""
+        prediction, _, clock = filled
+        assert self.scene is not None
+        assert self.prediction is not None
+        if not clock.ready or prediction.entity not in prediction.confirmed or not prediction.grounded():
+            return
+        same = prediction.entity == self.entity
+        if same:
+            prediction.adopt(self.prediction)
+        if self.timeline is None or clock is not self.clock:
+            self._newest = -1
+            self._phases = Ring(256)
+            self._lead = copy.deepcopy(self._new_lead)
+            self.timeline = Timeline(clock.rate, self._lead.start(clock, now), now)
+        self._play_in(filled)
+        self._restart(now)
+        self.state = "playing"
+        self.stats.reconnects += 1
+        tick = prediction.predicted.tick
+        back = Resumed(tick, self.comeback.away_s(now)) if same else Joined(self.entity, self.scene, tick)
+        self._events.append(back)
+        self.comeback.back()
+        since = max(self._told, prediction.confirmed.tick, self._newest - messages.INPUT_ROWS_MAX)
+        if same and self._newest > since:
+            self._send(Inputs(since + 1, prediction.confirmed.tick, prediction.rows_since(since, self._newest)))
+
+    def _cut_off(self, left: Left, now: float) -> None:
+        """The connection is gone, and there may be another one."""
+        self._open, self._filled = False, None
+        self._out.clear()
+        wait = max(left.wait, 0.0)
+        if not self._resume or not self.comeback.lost(now, wait):
+            self._end(left)
+            return
+        self.state = "away"
+        self._events.append(Disconnected(left.reason, self.comeback.retry_at - now))
+
+    def _order(self, command: Command) -> None:
+        self._unanswered[command.number] = encode(command)
+        if self._open:
+            self._out.append(self._unanswered[command.number])
+
     def set_input_delay(self, ticks: int) -> None:
         """Shows the effect of inputs so many ticks (0 to 3) later than they are sent: fewer and shorter replays.
 
@@ -408,7 +512,8 @@ class Core:
             self.stats.rtt_s = self.clock.rtt_s
             self.stats.lead_ticks = timeline.phase - self.clock.phase
             row = bytes(part & 0xFF for part in self.wish)
-            self._send(Inputs(first, prediction.confirmed.tick, row * (to + 1 - first)))
+            if self.state == "playing":
+                self._send(Inputs(first, prediction.confirmed.tick, row * (to + 1 - first)))
         while prediction.predicted.tick < self._newest - self._delay:
             prediction.step()
 

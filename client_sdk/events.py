@@ -17,6 +17,28 @@ class Joined:
 
 
 @dataclass(frozen=True)
+class Disconnected:
+    """The connection is lost; the client tries to come back, the next time in `wait_s` seconds. Told once per attempt.
+
+    Meanwhile the own entity goes on in the picture for some 3 s, then it stands.
+    """
+
+    reason: str
+    wait_s: float
+
+
+@dataclass(frozen=True)
+class Resumed:
+    """The client is back after `away_s` seconds, with the entity and everything that was ordered meanwhile.
+
+    Where the server did not keep the entity for so long, there is a new `Joined` instead.
+    """
+
+    tick: int
+    away_s: float
+
+
+@dataclass(frozen=True)
 class Left:
     """It is over. `wait`: come back in so many seconds; negative: do not."""
 
@@ -84,7 +106,9 @@ class SegmentLoaded:
     segment: Cell
 
 
-Event = Joined | Left | Corrected | Answered | Happened | Diverged | Resynchronised | SegmentLoaded
+Event = (
+    Joined | Disconnected | Resumed | Left | Corrected | Answered | Happened | Diverged | Resynchronised | SegmentLoaded
+)
 
 
 @dataclass
@@ -105,6 +129,7 @@ class Stats:
     repredictions: int = 0
     replayed_ticks: int = 0
     resyncs: int = 0
+    reconnects: int = 0
     divergences: int = 0
     inputs_refused: int = 0
     rtt_s: float = 0.0

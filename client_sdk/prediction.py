@@ -191,6 +191,14 @@ class Prediction:
         self._replay(tick)
         self.begun = True
 
+    def adopt(self, old: "Prediction") -> None:
+        """Goes on from where an earlier one of the same entity was: its inputs, and its edits without a verdict."""
+        self._inputs, self._edits = old._inputs, old._edits
+
+    def rows_since(self, tick: int, to: int) -> bytes:
+        """The own inputs after `tick`, up to `to`, as `Inputs.rows`; what was left out is what would stand in."""
+        return b"".join(bytes(part & 0xFF for part in self._wish(at)) for at in range(tick + 1, to + 1))
+
     def file(self, tick: int, wish: Input) -> None:
         """The own input for a tick to come."""
         self._inputs.put(tick, wish)

@@ -35,8 +35,8 @@ class Player:
         self.closed: tuple[int, str] | None = None
         self.session: Session | None = None
         self.weather = Weather(path, seed + 3)
-        self.up = Wire(match, self.weather, seed + 1, self._at_server)
-        self.down = Wire(match, self.weather, seed + 2, self._at_client)
+        self._seed = seed
+        self._connect_wires()
         self._acted = -1
         self.frame_s = 0.0
         """The program draws, reads and updates only so often; 0: at once when something is due."""
@@ -48,6 +48,13 @@ class Player:
         """The time on the client's own clock."""
         return self.clock_start + self.match.now * (1 + self.drift)
 
+    def _connect_wires(self) -> None:
+        """New wires; what is still on the way in old ones is lost."""
+        up = Wire(self.match, self.weather, self._seed + 1, lambda message: self._at_server(message, up))
+        down = Wire(self.match, self.weather, self._seed + 2, lambda message: self._at_client(message, down))
+        self.up, self.down = up, down
+        self._seed += 10
+
     def connect(self) -> None:
         """Opens the connection."""
         self.session = self.match.game.open(self, self.match.now)
@@ -55,10 +62,14 @@ class Player:
         self._update()
 
     def disconnect(self) -> None:
-        """Pulls the plug."""
+        """Pulls the plug: what is on the way is lost. The client comes back if it has the patience."""
         assert self.session is not None
         self.match.game.lost(self.session, self.match.now)
+        self.session = None
+        self._inbox.clear()
+        self._connect_wires()
         self.core.lost(1006, "gone", self.local)
+        self._update()
 
     def suspend(self, seconds: float) -> None:
         """The program stands still; what comes in meanwhile waits."""
@@ -83,11 +94,15 @@ class Player:
         assert self.session is not None
         self.match.game.lost(self.session, self.match.now)
 
-    def _at_server(self, message: bytes) -> None:
+    def _at_server(self, message: bytes, wire: Wire) -> None:
+        if wire is not self.up:
+            return
         assert self.session is not None
         self.match.game.receive(self.session, message, self.match.now)
 
-    def _at_client(self, message: bytes) -> None:
+    def _at_client(self, message: bytes, wire: Wire) -> None:
+        if wire is not self.down:
+            return
         self._inbox.append(message)
         if self._away or self.frame_s:
             return
@@ -114,6 +129,10 @@ class Player:
             core.set_input(self.policy(core, self.rng))
         now = self.local
         core.update(now)
+        if self.session is None and core.state == "away" and now >= core.comeback.retry_at:
+            core.comeback.trying()
+            self.connect()
+            return
         self._flush()
         if self.frame_s:
             self.match.at(self.match.now + self.frame_s, self._update, key=self)

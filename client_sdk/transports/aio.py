@@ -22,6 +22,7 @@ from client_sdk.transports.connection import CLOSE_S, UNSENT_MAX, ConnectError, 
 from shared.inputs import Input
 from shared.scene import Scene
 
+TIMEOUT_S = 5.0
 WAIT_S_MIN = 0.001
 """Timers are that coarse: an update is never asked for earlier."""
 WAIT_S_MAX = 3600.0
@@ -37,7 +38,14 @@ class AsyncClient:
         before_update: called with the core before each tick is predicted, so that it can set the input.
     """
 
-    def __init__(self, connection: Connection, before_update: Callable[[Core], None] | None = None) -> None:
+    def __init__(
+        self,
+        connection: Connection,
+        before_update: Callable[[Core], None] | None = None,
+        tls: ssl.SSLContext | None = None,
+    ) -> None:
+        self._tls = tls
+        self._redialing: asyncio.Task[None] | None = None
         self.core = connection.core
         self._connection = connection
         self._before_update = before_update
@@ -58,7 +66,9 @@ class AsyncClient:
         *,
         name: str = "",
         scene: Scene | None = None,
-        timeout: float = 5.0,
+        token: str = "",
+        patience_s: float = 30.0,
+        timeout: float = TIMEOUT_S,
         tls: ssl.SSLContext | None = None,
         before_update: Callable[[Core], None] | None = None,
     ) -> "AsyncClient":
@@ -67,15 +77,11 @@ class AsyncClient:
         Raises:
             ConnectError: there is no connection; the text says why and what to do.
         """
-        client = cls(Connection(url, Core(name, scene)), before_update)
+        core = Core(name, scene, token=token, patience_s=patience_s)
+        client = cls(Connection(url, core), before_update, tls)
         connection = client._connection
-        uri = connection.uri
         try:
-            async with asyncio.timeout(timeout):
-                await client._loop.create_connection(
-                    lambda: _Stream(client), uri.host, uri.port, ssl=(tls or True) if uri.secure else None
-                )
-                await client._answered
+            await client._dial(timeout)
         except ConnectError:
             raise
         except ssl.SSLError as error:
@@ -142,6 +148,8 @@ class AsyncClient:
     async def close(self, timeout: float = 1.0) -> None:
         """Says goodbye, and waits for the server to do so for at most `timeout` seconds. Again: does nothing."""
         self.core.close()
+        if self._redialing is not None:
+            self._redialing.cancel()
         self._pump(time.monotonic())
         if self._transport is not None:
             await asyncio.wait((self._gone,), timeout=timeout)
@@ -180,6 +188,28 @@ class AsyncClient:
         if self.core.next_update(now) < self._due - WAIT_S_MIN:
             self._schedule(now)
 
+    async def _dial(self, timeout: float) -> None:
+        """Connects, and waits until the server has answered."""
+        connection, uri = self._connection, self._connection.uri
+        async with asyncio.timeout(timeout):
+            await self._loop.create_connection(
+                lambda: _Stream(self, connection), uri.host, uri.port, ssl=(self._tls or True) if uri.secure else None
+            )
+            await self._answered
+
+    async def _redial(self) -> None:
+        """Connects again; where that fails, the core says when to try next."""
+        connection = self._connection = Connection(self._connection.url, self.core)
+        self._answered, self._gone = self._loop.create_future(), self._loop.create_future()
+        try:
+            await self._dial(TIMEOUT_S)
+        except OSError as error:  # a ConnectError, an SSLError and a TimeoutError are such
+            if connection.refused is None:
+                connection.broke(f"no connection ({str(error) or 'no answer in time'})", time.monotonic())
+            self._drop()
+            self._pump(time.monotonic())
+            self._schedule(time.monotonic())
+
     def _ended(self, error: Exception | None) -> None:
         now = time.monotonic()
         if error is None:
@@ -189,6 +219,7 @@ class AsyncClient:
         self._transport = None
         self._pump(now)
         self._gone.set_result(None)
+        self._schedule(now)
 
     def _stalled(self) -> None:
         now = time.monotonic()
@@ -202,6 +233,9 @@ class AsyncClient:
         if self._before_update is not None and core.state == "playing":
             self._before_update(core)
         core.update(now)
+        if core.state == "away" and self._transport is None and now >= core.comeback.retry_at:
+            core.comeback.trying()
+            self._redialing = self._loop.create_task(self._redial())
         self._pump(now)
         self._schedule(now)
 
@@ -249,19 +283,26 @@ class AsyncClient:
 
 
 class _Stream(asyncio.Protocol):
-    """asyncio's side of a client."""
+    """asyncio's side of one connection of a client; what comes of an earlier one is not heard."""
 
-    def __init__(self, client: AsyncClient) -> None:
-        self._client = client
+    def __init__(self, client: AsyncClient, connection: Connection) -> None:
+        self._client, self._connection = client, connection
+
+    @property
+    def _current(self) -> bool:
+        return self._client._connection is self._connection
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         self._client._made(cast("asyncio.Transport", transport))  # uvloop's are no subclass of it
 
     def data_received(self, data: bytes) -> None:
-        self._client._received(data)
+        if self._current:
+            self._client._received(data)
 
     def connection_lost(self, error: Exception | None) -> None:
-        self._client._ended(error)
+        if self._current:
+            self._client._ended(error)
 
     def pause_writing(self) -> None:
-        self._client._stalled()
+        if self._current:
+            self._client._stalled()

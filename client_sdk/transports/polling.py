@@ -1,6 +1,8 @@
 """One non-blocking socket, looked at when the game says so: no thread, no event loop."""
 
 import contextlib
+import math
+import os
 import select
 import socket
 import ssl
@@ -15,7 +17,7 @@ NOT_NOW = (BlockingIOError, InterruptedError, ssl.SSLWantReadError, ssl.SSLWantW
 
 
 class PollingTransport:
-    """A connection over one non-blocking TCP socket (TLS for wss://).
+    """A connection over one non-blocking TCP socket (TLS for wss://), and another one after it is lost.
 
     Args:
         timeout: seconds that the handshake may take altogether; until then this blocks.
@@ -29,9 +31,13 @@ class PollingTransport:
         self._connection = connection
         self._buffer = memoryview(bytearray(READ_BYTES))
         self._unsent = bytearray()
+        self._timeout, self._tls = timeout, tls
         deadline = time.monotonic() + timeout
+        self._dialing: socket.socket | None = None
+        self._dial_until = math.inf
         self._socket: socket.socket | None = _connected(connection, timeout, tls)
         try:
+            self._address, self._family = self._socket.getpeername(), self._socket.family
             self._socket.setblocking(False)
             self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             self._handshake(deadline)
@@ -41,8 +47,16 @@ class PollingTransport:
 
     def poll(self, now: float) -> None:
         """Takes in what has arrived, and writes what there is to write; never blocks."""
+        core = self._connection.core
+        if self._socket is None and core.state == "away":
+            if self._dialing is not None:
+                self._dial_on(self._dialing, now)
+            elif now >= core.comeback.retry_at:
+                self._dial(now)
         if self._socket is None:
             return
+        if now > self._dial_until and not self._connection.opened:
+            self._connection.broke("no answer in time", now)
         self._read(self._socket, now)
         self.send(now)
 
@@ -68,6 +82,44 @@ class PollingTransport:
                 self.poll(time.monotonic())
         finally:
             self._drop()
+
+    def _dial(self, now: float) -> None:
+        """Begins to connect anew, to the address that was found the first time."""
+        self._connection = Connection(self._connection.url, self._connection.core)
+        self._connection.core.comeback.trying()
+        self._dial_until = now + self._timeout
+        self._dialing = socket.socket(self._family, socket.SOCK_STREAM)
+        self._dialing.setblocking(False)
+        self._dialing.connect_ex(self._address)
+
+    def _dial_on(self, sock: socket.socket, now: float) -> None:
+        """Looks how far that has come."""
+        try:
+            if isinstance(sock, ssl.SSLSocket):
+                sock.do_handshake()
+            else:
+                if not select.select([], [sock], [sock], 0)[1]:
+                    if now > self._dial_until:
+                        raise TimeoutError("no answer in time")
+                    return
+                error = sock.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR)
+                if error:
+                    raise OSError(error, os.strerror(error))
+                sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+                if self._connection.uri.secure:
+                    tls, host = self._tls or ssl.create_default_context(), self._connection.uri.host
+                    self._dialing = tls.wrap_socket(sock, server_hostname=host, do_handshake_on_connect=False)
+                    return
+            self._socket, self._dialing = sock, None
+        except NOT_NOW:
+            if now > self._dial_until:
+                self._give_up("no answer in time", now)
+        except OSError as error:
+            self._give_up(error.strerror or str(error), now)
+
+    def _give_up(self, reason: str, now: float) -> None:
+        self._drop()
+        self._connection.broke(f"no connection ({reason})", now)
 
     def _handshake(self, deadline: float) -> None:
         connection = self._connection
@@ -116,9 +168,10 @@ class PollingTransport:
             stalled(self._connection, now)
 
     def _drop(self) -> None:
-        if self._socket is not None:
-            self._socket.close()
-            self._socket = None
+        for sock in (self._socket, self._dialing):
+            if sock is not None:
+                sock.close()
+        self._socket = self._dialing = None
         self._unsent.clear()
 
 

@@ -1,0 +1,107 @@
+"""The server process dies and is started anew; its clients, in a game's loop and in an event loop, go on."""
+
+import asyncio
+import contextlib
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from client_sdk.client import Client
+from client_sdk.events import Disconnected, Event, Joined, Left, Resumed
+from client_sdk.transports.aio import AsyncClient
+from tests.client_sdk.servers import ROOT
+
+pytestmark = pytest.mark.e2e
+COMMAND = (sys.executable, "-m", "server", "--host", "127.0.0.1", "--scene", "flat", "--log-level", "warning")
+
+
+@contextlib.contextmanager
+def server(data: Path, port: int = 0) -> Iterator[tuple[subprocess.Popen[str], str]]:
+    """A server process and its URL; it is killed in the end, as by a power cut."""
+    flags = ("--port", str(port), "--data", str(data))
+    with subprocess.Popen([*COMMAND, *flags], cwd=ROOT, stdout=subprocess.PIPE, text=True) as process:
+        try:
+            assert process.stdout is not None
+            line = process.stdout.readline()
+            assert line.startswith("listening on "), "the server did not start"
+            yield process, line.split()[-1]
+        finally:
+            process.kill()
+
+
+def port_of(url: str) -> int:
+    return int(url.rpartition(":")[2])
+
+
+def poll(client: Client, events: list[Event], wanted: type[Event]) -> None:
+    """Plays until something has happened."""
+    until = time.monotonic() + 30
+    while not any(isinstance(event, wanted) for event in events):
+        assert time.monotonic() < until, events
+        events += client.poll()
+        client.set_input(1, 0)
+        client.update()
+        time.sleep(0.005)
+
+
+def test_a_client_in_a_games_loop_survives_its_server(tmp_path: Path) -> None:
+    events: list[Event] = []
+    with server(tmp_path) as (process, url):
+        client = Client.connect(url, name="Ann")
+        poll(client, events, Joined)
+        me = client.entity
+        until = time.monotonic() + 2  # on disk by then
+        while time.monotonic() < until:
+            events += client.poll()
+            client.update()
+            time.sleep(0.005)
+        process.kill()
+        poll(client, events, Disconnected)
+        assert client.away
+        assert client.view().me is not None, "there is something to draw all the time"
+    with server(tmp_path, port_of(url)):
+        poll(client, events, Resumed)
+        assert (client.entity, client.playing) == (me, True)
+        assert not any(isinstance(event, Left) for event in events)
+        client.close()
+
+
+def test_a_client_gives_up_after_its_patience(tmp_path: Path) -> None:
+    events: list[Event] = []
+    with server(tmp_path) as (_, url):
+        client = Client.connect(url, patience_s=1.0)
+        poll(client, events, Joined)
+    poll(client, events, Left)
+    assert client.closed
+    assert any(isinstance(event, Disconnected) for event in events)
+
+
+async def test_a_client_in_an_event_loop_survives_its_server(tmp_path: Path) -> None:
+    loop = asyncio.get_running_loop()
+    with contextlib.ExitStack() as first:
+        process, url = await loop.run_in_executor(None, first.enter_context, server(tmp_path))
+        client = await AsyncClient.connect(url, name="Ann")
+        seen: list[Event] = []
+
+        async def until(wanted: type[Event]) -> None:
+            async with asyncio.timeout(30):
+                async for event in client:
+                    seen.append(event)
+                    if isinstance(event, wanted):
+                        return
+
+        await until(Joined)
+        me = client.entity
+        await asyncio.sleep(2)
+        process.kill()
+        await until(Disconnected)
+    with contextlib.ExitStack() as second:
+        await loop.run_in_executor(None, second.enter_context, server(tmp_path, port_of(url)))
+        await until(Resumed)
+        assert client.entity == me
+        await client.close()
+        assert not any(isinstance(event, Left) for event in seen)

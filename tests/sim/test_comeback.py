@@ -1,0 +1,132 @@
+"""A lost connection, in simulated time: the client comes back by itself and goes on."""
+
+import itertools
+
+import pytest
+
+from client_sdk.comeback import Comeback
+from client_sdk.core import Core
+from client_sdk.events import Answered, Corrected, Disconnected, Joined, Left, Resumed
+from server.limits import Limits
+from shared.scene import load_scene
+from tests.links import PRESETS, Path
+from tests.match import Match, Player, wander
+
+
+def joined(match: Match, player: Player) -> None:
+    match.run_until(lambda: player.core.state == "playing", 30)
+
+
+def told(player: Player, *kinds: type) -> list[object]:
+    return [event for event in player.events if isinstance(event, kinds)]
+
+
+@pytest.mark.parametrize("preset", ["lan", "typical", "far"])
+@pytest.mark.parametrize("seed", [1, 2])
+def test_who_is_cut_off_goes_on_with_the_same_entity(preset: str, seed: int) -> None:
+    match = Match(load_scene("hills"), seed)
+    player = match.join(wander, PRESETS[preset], Core("Ann", patience_s=10))
+    witness = match.join(wander, PRESETS["lan"])
+    joined(match, player)
+    joined(match, witness)
+    entity = player.core.entity
+    for round_ in range(1, 4):
+        match.run(5)
+        player.disconnect()
+        assert player.core.state == "away"
+        match.run(0.1)
+        assert entity in match.game.world
+        match.run_until(lambda: player.core.state == "playing", 10)
+        assert player.core.stats.reconnects == round_
+    match.run(10)
+    assert player.core.entity == entity
+    assert match.game.counters.joined == 2
+    assert len(told(player, Disconnected)) == len(told(player, Resumed)) == 3
+    assert not told(player, Left)
+    assert player.core.stats.divergences == 0
+    # What follows is played as before: the world that came back is the server's.
+    assert all(event.cause != "nondeterminism" for event in player.events if isinstance(event, Corrected))
+    prediction = player.core.prediction
+    assert prediction
+    truth = match.game.world
+    assert prediction.confirmed.tick > truth.tick - 64
+
+
+def test_what_was_ordered_meanwhile_is_done_once() -> None:
+    match = Match(load_scene("flat"), 3)
+    player = match.join(lambda core, rng: core.wish, Path(0.05), Core(patience_s=10))
+    joined(match, player)
+    match.run(3)
+    x, y, z = (int(part // 1) for part in match.game.world.position(player.core.entity))
+    first = player.core.edit(x + 2, y, z, 5)
+    match.run(0.01)  # on its way
+    player.disconnect()
+    second = player.core.edit(x + 2, y, z + 1, 6)
+    third = player.core.edit(x + 2, y, z + 1, 0)
+    match.run(6)
+    answers = [event for event in player.events if isinstance(event, Answered)]
+    assert [(answer.number, answer.done) for answer in answers] == [(first, True), (second, True), (third, True)]
+    assert match.game.world.blocks.get(x + 2, y, z) == 5
+    assert match.game.world.blocks.get(x + 2, y, z + 1) == 0
+    prediction = player.core.prediction
+    assert prediction
+    assert prediction.predicted.blocks.get(x + 2, y, z) == 5
+    assert player.core.stats.divergences == 0
+
+
+def test_whose_entity_was_not_kept_joins_anew() -> None:
+    match = Match(load_scene("flat"), 4, limits=Limits(resume_s=0.1))
+    player = match.join(wander, Path(0.05), Core(patience_s=10))
+    joined(match, player)
+    match.run(3)
+    entity = player.core.entity
+    player.disconnect()
+    number = player.core.edit(0, 0, 0, 5)
+    match.run_until(lambda: player.core.state == "playing", 10)
+    assert player.core.entity not in (0, entity)
+    assert [event.entity for event in player.events if isinstance(event, Joined)] == [entity, player.core.entity]
+    assert not told(player, Resumed)
+    assert [event for event in player.events if isinstance(event, Answered)] == [
+        Answered(number, False, "the connection was lost")
+    ]
+    match.run(5)
+    assert player.core.stats.divergences == 0
+
+
+def test_who_has_no_patience_or_was_told_to_go_does_not_come_back() -> None:
+    match = Match(load_scene("flat"), 5)
+    impatient = match.join(wander, Path(0.05), Core(patience_s=0))
+    rude = match.join(wander, Path(0.05), Core(patience_s=10))
+    for player in (impatient, rude):
+        joined(match, player)
+    impatient.disconnect()
+    rude.core._out.append(b"\xff")
+    match.run(5)
+    for player in (impatient, rude):
+        assert player.core.state == "closed"
+        assert len(told(player, Left)) == 1
+        assert not told(player, Disconnected)
+
+
+def test_waits_grow_spread_and_end() -> None:
+    comeback = Comeback(30.0, spread=7)
+    now, waits = 100.0, []
+    while comeback.lost(now):
+        waits.append(comeback.retry_at - now)
+        now = comeback.retry_at
+        comeback.trying()
+    assert 100.0 + 25 < now < 130.0
+    assert 0.25 <= waits[0] <= 0.32
+    assert all(a < b or b > 3.9 for a, b in itertools.pairwise(waits))
+    assert max(waits) <= 5.0
+    assert comeback.away_s(now) == now - 100.0
+    comeback.back()
+    assert comeback.lost(now)
+    assert comeback.retry_at - now <= 0.32
+    firsts = set()
+    for spread in range(50):
+        other = Comeback(30.0, spread)
+        assert other.lost(0.0, 2.0)
+        firsts.add(round(other.retry_at, 3))
+    assert len(firsts) == 50
+    assert (min(firsts) >= 2.0, max(firsts) <= 2.5) == (True, True)
