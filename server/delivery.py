@@ -13,7 +13,6 @@ import numpy as np
 from server import interest
 from server.counters import Counters
 from server.limits import Limits
-from server.pacing import LEAST_BYTES
 from server.replication import ChangeLog
 from server.session import Session
 from shared import messages
@@ -47,7 +46,7 @@ class Delivery:
         for message in session.outbox:
             session.send(message)
         session.outbox.clear()
-        self._send_snapshot(session, max(window - outstanding, LEAST_BYTES))
+        self._send_snapshot(session, session.pacing.room(window, outstanding))
         if outstanding == 0 and session.probe is None:
             session.probe = (self._world.tick, now, session.snapshot_bytes)
         if session.terrain_now or session.terrain_due:
@@ -101,11 +100,17 @@ class Delivery:
         self._counters.snapshot_bytes += len(message)
 
     def _send_terrain(self, session: Session, room: int) -> None:
-        """Terrain behind the snapshot, as far as it fits into what may be on the way."""
+        """Terrain behind the snapshot, as far as it fits into what may be on the way.
+
+        A segment's blocks never go before its keyframe, which tells no edits: those in between would be lost.
+        """
         room = min(room, self._limits.terrain_bytes_per_tick)
         while room > 0 and (session.terrain_now or session.terrain_due):
             if session.terrain_now is None:
-                segment = session.terrain_due.popleft()
+                segment = next((segment for segment in session.terrain_due if session.sight.begun(segment)), None)
+                if segment is None:
+                    return
+                session.terrain_due.remove(segment)
                 session.terrain_now = (segment, self._log.packed(segment), 0)
             segment, packed, offset = session.terrain_now
             chunk = packed[offset : offset + self._limits.terrain_chunk_bytes]

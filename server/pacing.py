@@ -8,6 +8,12 @@ snapshot goes behind it. So a snapshot is sent only while the bytes on the way (
 where `rate` is the fastest the path has acknowledged bytes lately and the least round trip is that of an empty
 path. Three of them, because a lost packet holds up the acknowledgements of all behind it for two or more, although
 no queue has grown: with one, a path of 200 ms that loses 2 % of its packets gets 28 snapshots/s instead of 32.
+
+Where that holds back most snapshots for a second, it is no loss but the path that is narrow. Then the queue is of
+one's own making, and there should be none: one round trip and two ticks may be on the way when a snapshot is sent, and
+it may be as large as the path carries in four ticks. So a client gets small snapshots often, its own segment in each,
+instead of large ones rarely: at 30 kb/s for a view of 90, they are 0.25 s old instead of 0.56.
+
 The round trip is measured of snapshots before which nothing was on the way. Where that never happens because the
 path is full, sending pauses once a minute until it is empty, or a queue of one's own would pass for distance, and grow
 for ever.
@@ -29,6 +35,14 @@ STALL_RTTS = 3.0
 HOLD_S_MAX = 0.6
 """Three round trips are enough at this length; of longer ones one and a half."""
 LEAST_BYTES = 512
+HELD_TICKS = 32.0
+"""The share of ticks in which nothing could be sent is averaged over so many."""
+NARROW, WIDE = 0.5, 0.4
+"""A path is narrow from this share on, until it is less than that."""
+NARROW_TICKS = 4.0
+"""On a narrow path, a snapshot may be as large as what it carries in so many ticks,"""
+NARROW_BYTES = 96
+"""or this."""
 
 
 class Pacing:
@@ -43,8 +57,10 @@ class Pacing:
         self._rates: list[tuple[float, float]] = []
         self._rtts: list[tuple[float, float]] = []
         self._full_at = -math.inf
-        self._pauses = False
+        self._pauses = self._narrow = False
+        self._held = 0.0
         self._carries = LEAST_BYTES
+        self._portion = 0
 
     @property
     def rate(self) -> float:
@@ -76,10 +92,16 @@ class Pacing:
             self._measure(outstanding, tick_s, now)
         if self._pauses:
             return 0
-        window = max(2 * snapshot_bytes, self._carries)
-        if outstanding > window:
+        window = self._carries if self._narrow else max(2 * snapshot_bytes, self._carries)
+        held = outstanding > window
+        self._held += (held - self._held) / HELD_TICKS
+        if held:
             self._full_at = now
         return window
+
+    def room(self, window: int, outstanding: int) -> int:
+        """How large about a snapshot may be that is sent now."""
+        return self._portion if self._narrow else max(window - outstanding, LEAST_BYTES)
 
     def _measure(self, outstanding: int, tick_s: float, now: float) -> None:
         acked = self.sent_bytes - outstanding
@@ -95,6 +117,11 @@ class Pacing:
         while self._rates and self._rates[0][0] < now - RATE_WINDOW_S:
             self._rates.pop(0)
         rtt_s = self.least_rtt_s
-        hold_s = min(STALL_RTTS * rtt_s, max(HOLD_S_MAX, 1.5 * rtt_s)) + tick_s
-        self._carries = max(LEAST_BYTES, int(self.rate * hold_s))
+        self._narrow = self._held > (WIDE if self._narrow else NARROW)
+        if self._narrow:
+            self._carries = max(NARROW_BYTES, int(self.rate * (rtt_s + 2 * tick_s)))
+            self._portion = max(NARROW_BYTES, int(self.rate * NARROW_TICKS * tick_s))
+        else:
+            hold_s = min(STALL_RTTS * rtt_s, max(HOLD_S_MAX, 1.5 * rtt_s)) + tick_s
+            self._carries = max(LEAST_BYTES, int(self.rate * hold_s))
         self._pauses = bool(self._rtts) and now - self._rtts[-1][0] > RTT_WINDOW_S > now - self._full_at

@@ -2,7 +2,7 @@
 
 Theory of operation. Everything that changed goes, as long as it fits into what may be on the way to the client.
 Where it does not, the own segment goes, then the others by urgency: how many ticks of changes wait, over how far away
-they are. What waits is not lost but grows staler, so it becomes urgent: nobody is starved. A segment that is new to
+they are. One of them always goes, and what waits grows more urgent: nobody is starved. A segment that is new to
 the client is sent whole (a keyframe) and waits its turn in the same order, so that walking up to a crowd does not put
 a wall of bytes in front of the own position.
 """
@@ -49,8 +49,20 @@ class Sight:
 
     def lost_track(self, tick: int) -> bool:
         """Whether something waits for longer than its changes are kept."""
-        oldest = min(self._behind.values()) if self._behind else self._tick
-        return self._tick >= 0 and tick - oldest > HISTORY
+        return self._tick >= 0 and self.waits(tick) > HISTORY
+
+    def begun(self, segment: Cell) -> bool:
+        """Whether a segment that is seen has been sent whole."""
+        return segment not in self._fresh
+
+    @property
+    def complete(self) -> bool:
+        """Whether the latest snapshot had all there was."""
+        return not (self._behind or self._fresh)
+
+    def waits(self, tick: int) -> int:
+        """For how many ticks the segment that was sent longest ago, of those known, has not been sent."""
+        return tick - (min(self._behind.values()) if self._behind else self._tick)
 
     def take(self, log: ChangeLog, tick: int, room: int) -> list[bytes]:
         """The encoded parts of a snapshot for `tick`, of about `room` bytes; they count as sent, as do `drops`."""
@@ -78,7 +90,7 @@ class Sight:
         return list(parts.values())
 
     def _urgent(self, parts: dict[Cell, bytes], due: dict[Cell, int], tick: int, room: int) -> dict[Cell, bytes]:
-        """The parts that fit, in the order of urgency; at least the first."""
+        """The parts that fit, in the order of urgency; at least the own segment and one more."""
         centre = self.centre
         assert centre is not None
 
@@ -90,7 +102,7 @@ class Sight:
         chosen: dict[Cell, bytes] = {}
         for segment in order:
             room -= len(parts[segment])
-            if chosen and room < 0:
+            if len(chosen) > 1 and room < 0:
                 break
             chosen[segment] = parts[segment]
         return chosen

@@ -1,6 +1,6 @@
 """How much may be on the way: by hand-made paths."""
 
-from server.pacing import HOLD_S_MAX, LEAST_BYTES, RTT_WINDOW_S, Pacing
+from server.pacing import HOLD_S_MAX, LEAST_BYTES, NARROW_TICKS, RTT_WINDOW_S, Pacing
 
 TICK_S = 1 / 32
 
@@ -73,3 +73,20 @@ def test_a_path_that_is_never_full_is_never_emptied() -> None:
     pacing.answered(0.05, 0, 0.0)
     now = stream(pacing, 3 * RTT_WINDOW_S, 320, 0)
     assert pacing.window(0, 320, TICK_S, now) > 0
+
+
+def test_a_path_that_mostly_holds_snapshots_back_is_narrow_and_gets_small_ones_until_it_does_not() -> None:
+    pacing = Pacing()
+    pacing.answered(0.05, 0, 0.0)
+    now = stream(pacing, 2.0, 320, 0)
+    wide = pacing.window(0, 1000, TICK_S, now)
+    assert wide == 2000
+    assert pacing.room(wide, 500) == 1500
+    now = stream(pacing, 0.5, 320, 10**6, now)  # a stall
+    assert pacing.room(wide, 500) == 1500
+    now = stream(pacing, 1.5, 320, 10**6, now)
+    window = pacing.window(10**6, 1000, TICK_S, now)
+    assert window == int(pacing.rate * (0.05 + 2 * TICK_S)) < wide
+    assert pacing.room(window, 0) == int(pacing.rate * NARROW_TICKS * TICK_S)
+    now = stream(pacing, 2.0, 320, 0, now)
+    assert pacing.window(0, 1000, TICK_S, now) == wide

@@ -50,12 +50,15 @@ def test_everything_goes_where_it_fits_first_whole_and_then_its_changes() -> Non
     assert set(log.asked) == {(segment, 5) for segment in ROW}
 
 
-def test_the_own_segment_always_goes_however_little_room_there_is() -> None:
+def test_the_own_segment_always_goes_and_one_more_however_little_room_there_is() -> None:
     sight, log = looking(), Log(dict.fromkeys(ROW, 1000))
+    others = set()
     for tick in range(1, 200):
-        assert take(sight, log, tick, 10) == [OWN]
-        if sight.lost_track(tick + 1):
-            sight.forget()
+        own, other = take(sight, log, tick, 10)
+        assert own == OWN
+        others.add(other)
+        assert sight.waits(tick) < 8
+    assert others == {NEAR, FAR}
 
 
 def test_what_waits_is_caught_up_with_from_where_it_was_and_nobody_starves() -> None:
@@ -95,7 +98,7 @@ def test_who_is_too_far_behind_has_lost_track(ticks: int) -> None:
 
 def test_only_what_was_sent_and_is_seen_no_more_is_dropped() -> None:
     sight, log = looking(), Log(dict.fromkeys(ROW, 10))
-    take(sight, log, 1, 10)  # the client knows of its own segment only
+    take(sight, log, 1, 10)  # the client knows of its own segment and one more
     sight.move((20, 0, 0), 1, 2, lambda segment: False)
-    assert sight.drops == [OWN]
+    assert sight.drops == [OWN, NEAR]
     assert sight.sees == {(20, 0, 0)}
