@@ -21,7 +21,7 @@ from server.access import authenticator, tls_context
 from server.database import StoreError
 from server.door import Door
 from server.game import Game
-from server.gateway import CLOSE_S, Gateway
+from server.gateway import Gateway
 from server.histogram import Histogram
 from server.kinds import SettingsError
 from server.metrics import metrics_page
@@ -39,8 +39,8 @@ from shared.scene import Scene, load_scene
 READY_S = 1.0
 """Ready is who has begun a tick within so long."""
 COMMANDS = {"token": tokens.main, "check": check.main}
-STOP_S = CLOSE_S + 0.25
-"""The end waits no longer than this for peers to finish closing."""
+STOP_S = 1.5
+"""The end waits no longer than this for peers to finish closing; with what the disk may take, it is less than 5 s."""
 
 logger = structlog.stdlib.get_logger("server")
 

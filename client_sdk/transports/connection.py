@@ -18,18 +18,27 @@ from websockets.protocol import CLOSED, OPEN
 from websockets.uri import WebSocketURI, parse_uri
 
 from client_sdk.core import Core
-from shared.messages import MESSAGE_MAX, TEXT, TOO_SLOW
+from shared.messages import MESSAGE_MAX, REASON_MAX, TEXT, TOO_SLOW
 
 UNSENT_MAX = 64 * 1024
 """Bytes that may wait for a server that does not read, some 20 s of a player's inputs; more end the connection."""
 CLOSE_S = 2.0
 """A server that does not finish closing by then is left without its goodbye."""
+REFUSALS = (403, 429, 503)
+"""HTTP statuses with which a server refuses a client, in words."""
 REASON_BYTES_MAX = 123
 """A close frame has room for no more."""
 
 
 class ConnectError(ConnectionError):
-    """There is no connection; the text says why, and what to do about it."""
+    """There is no connection; the text says why, and what to do about it.
+
+    `wait`: the server asks to try again in so many seconds; negative: it does not.
+    """
+
+    def __init__(self, text: str, wait: float = -1.0) -> None:
+        super().__init__(text)
+        self.wait = wait
 
 
 class Connection:
@@ -120,7 +129,7 @@ class Connection:
         """Tells the core, at once, that it is over; and why there is no connection, if it never began."""
         protocol = self._protocol
         if protocol.handshake_exc is not None and self.refused is None:
-            self.refused = ConnectError(f"{self.url}: {_advice(protocol.handshake_exc)}")
+            self.refused = _refusal(self.url, protocol.handshake_exc)
         if self._ending_since is not None or not (protocol.close_expected() or protocol.state is CLOSED):
             return
         self._ending_since = now
@@ -165,6 +174,15 @@ def _parse(url: str) -> WebSocketURI:
     return uri
 
 
-def _advice(error: Exception) -> str:
-    answer = f"HTTP status {error.response.status_code}" if isinstance(error, InvalidStatus) else str(error)
-    return f"something is there, but it is not a Sovereign Netcode server ({answer}); are host, port and path right?"
+def _refusal(url: str, error: Exception) -> ConnectError:
+    """Why a handshake has failed: what a server of ours says, or that there is none."""
+    answer = str(error)
+    if isinstance(error, InvalidStatus):
+        response = error.response
+        answer = f"HTTP status {response.status_code}"
+        kind, retry = (" ".join(response.headers.get_all(name)) for name in ("Content-Type", "Retry-After"))
+        if response.status_code in REFUSALS and response.body and kind.startswith("text/plain"):
+            said = response.body.decode(errors="replace").strip()[:REASON_MAX]
+            return ConnectError(f"{url}: {said}", float(retry) if retry.isdecimal() and retry.isascii() else -1.0)
+    what = f"something is there, but it is not a Sovereign Netcode server ({answer})"
+    return ConnectError(f"{url}: {what}; are host, port and path right?")

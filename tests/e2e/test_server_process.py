@@ -18,6 +18,7 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import ClientConnection, connect
 
 from client_sdk.client import Client
+from client_sdk.transports.connection import ConnectError
 from server.tokens import issue
 from shared.messages import UNAUTHORISED, VERSION, Bye, Hello, Inputs, Message, Welcome, decode_from_server, encode
 from tests.e2e.processes import END_S, START_S, UPGRADE, ServerProcess, page, running, stats, until
@@ -148,6 +149,24 @@ def test_while_it_goes_down_it_says_so_and_nobody_comes_in() -> None:
             assert refused.value.response.status_code == 503
             assert refused.value.response.headers["Retry-After"] == "7"
             assert server.end() == 0
+
+
+def test_who_is_beyond_a_limit_is_told_so_before_the_websocket_opens() -> None:
+    with running(
+        "--port", "0", "--scene", "flat", "--loopback-exempt", "no", "--connections-per-address", "1"
+    ) as server:
+        address = server.address()
+        url = "ws://{}:{}".format(*address)
+        with Client.connect(url, name="Ann") as client:
+            with pytest.raises(
+                ConnectError, match=r"too many connections from your address \(1 are allowed\)"
+            ) as error:
+                Client.connect(url, name="Bob")
+            assert error.value.wait == 2.0
+            until(lambda: stats(address)["refused_at_door"] == {"address": 1})
+            client.poll()
+            assert not client.closed
+        assert server.end(signal.SIGTERM) == 0
 
 
 @pytest.mark.skipif(os.name == "nt", reason="there is no such signal")
