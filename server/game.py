@@ -264,7 +264,8 @@ class Game:
         token = secrets.token_bytes(messages.RESUME_BYTES)
         player.tokens.append(_digest(token))
         self.world.note(keeping.note_of(player))
-        session.send(encode(Welcome(messages.VERSION, self.world.tick, player.entity, self._rules, token)))
+        welcome = encode(Welcome(messages.VERSION, self.world.tick, player.entity, self._rules, token))
+        session.greeting = (self.world.tick + 1, welcome)
 
     def _returning(self, session: Session, hello: Hello) -> Player | None:
         """The player that this is, if it was here before and still is; a connection that it still has is closed."""
@@ -308,9 +309,13 @@ class Game:
                 self._unanswered.append((tick, player, command.number, verdict))
                 self.world.note([keeping.ANSWERED, player.entity, command.number, verdict])
 
+    def _durable_tick(self) -> int:
+        """The newest tick that no crash can undo any more."""
+        return self.world.tick if self._saves is None else self._saves.durable_tick
+
     def _answer(self) -> None:
-        """Tells the verdicts that no crash can undo any more."""
-        durable = self.world.tick if self._saves is None else self._saves.durable_tick
+        """Tells the verdicts that will last."""
+        durable = self._durable_tick()
         while self._unanswered and self._unanswered[0][0] <= durable:
             _, player, number, verdict = self._unanswered.popleft()
             player.settle(number, verdict)
@@ -351,10 +356,19 @@ class Game:
             if session.entity and not session.closed:
                 try:
                     self.stage.tell(session)
-                    self.delivery.serve(session, now)
+                    if session.greeting is None or self._greeted(session, *session.greeting):
+                        self.delivery.serve(session, now)
                 except Exception:
                     self._break(session, "serving a client")
         self.stage.told()
+
+    def _greeted(self, session: Session, tick: int, welcome: bytes) -> bool:
+        """Lets a client in once its token will last; at once, if it cannot be saved: then it plays all the same."""
+        waits = self._durable_tick() < tick and not (self._saves is not None and self._saves.trouble)
+        if not waits:
+            session.send(welcome)
+            session.greeting = None
+        return not waits
 
     def _check_clocks(self, now: float) -> None:
         for session in tuple(self.sessions):

@@ -178,6 +178,8 @@ class Session:
         """The player's."""
         self.hello: Hello | None = None
         """With which it waits to join."""
+        self.greeting: tuple[int, bytes] | None = None
+        """Its welcome, and the tick from which on it may be sent: when the token in it is on disk."""
         self.subject = ""
         self.opened = self.heard = self.sent_at = now
         self.allowance = 0.0

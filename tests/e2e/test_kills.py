@@ -6,6 +6,7 @@ import json
 import random
 import resource
 import shutil
+import signal
 import sys
 import time
 from collections.abc import AsyncIterator, Callable
@@ -16,6 +17,8 @@ import pytest
 from websockets.asyncio.client import ClientConnection, connect
 from websockets.exceptions import ConnectionClosed
 
+from server.database import read
+from server.journal import replay
 from server.store import Store
 from shared import edits, messages
 from shared.layout import ID, X
@@ -63,9 +66,9 @@ class Cells:
 class Editor:
     """A client that does little but edit the blocks above it, in an order that tells every edit from the others."""
 
-    def __init__(self, cells: Cells, scene: Scene, turn: int) -> None:
-        self.cells, self.scene, self.turn = cells, scene, turn
-        self.entity = 0
+    def __init__(self, cells: Cells, scene: Scene) -> None:
+        self.cells, self.scene, self.turn = cells, scene, 0
+        self.entity, self.resume, self.returns = 0, b"", 0
         self.own: list[Cell] = []
         self.waiting: dict[int, tuple[Cell, int]] = {}
         self.told: list[int] = []
@@ -74,15 +77,23 @@ class Editor:
         """Until the connection ends."""
         with contextlib.suppress(ConnectionClosed, OSError, asyncio.TimeoutError):
             async with connect(f"ws://{address[0]}:{address[1]}", compression=None, max_queue=None) as link:
-                await link.send(encode(Hello(VERSION, {}, "editor")))
+                await link.send(encode(Hello(VERSION, {}, "editor", resume=self.resume)))
                 async for data in link:
                     assert isinstance(data, bytes)
                     message = decode_from_server(data)
                     if isinstance(message, Welcome):
-                        self.entity = message.entity
+                        self.welcome(message)
                     elif isinstance(message, Snapshot):
                         self.hear(message)
                         await self.say(link, message.tick)
+
+    def welcome(self, welcome: Welcome) -> None:
+        """Whoever has a token comes back to the entity that it was given for."""
+        if self.resume:
+            assert welcome.entity == self.entity
+            self.returns += 1
+        self.entity, self.resume = welcome.entity, welcome.resume
+        self.own, self.waiting = [], {}
 
     def hear(self, snapshot: Snapshot) -> None:
         if not self.own:
@@ -114,12 +125,11 @@ class Editor:
 
 
 @contextlib.asynccontextmanager
-async def editing(address: tuple[str, int], cells: Cells, scene: Scene, turn: int) -> AsyncIterator[list[Editor]]:
+async def editing(address: tuple[str, int], editors: list[Editor]) -> AsyncIterator[None]:
     """Clients that edit, and that have all gone in the end."""
-    editors = [Editor(cells, scene, turn) for _ in range(BOTS)]
     tasks = [asyncio.create_task(editor.play(address)) for editor in editors]
     try:
-        yield editors
+        yield
     finally:
         done, late = await asyncio.wait(tasks, timeout=END_S)
         assert not late
@@ -140,6 +150,7 @@ def looked_at(data: Path, scene: Scene, copy: Path) -> tuple[World, tuple[int, s
 def test_nothing_that_a_client_was_told_is_lost_in_fifty_kills(tmp_path: Path) -> None:
     seed = 17
     rng, cells, scene = random.Random(seed), Cells(), load_scene("flat")
+    editors = [Editor(cells, scene) for _ in range(BOTS)]
     data, early = tmp_path / "data", 0
     expected: tuple[int, str] | None = None
     for life in range(KILLS):
@@ -156,25 +167,51 @@ def test_nothing_that_a_client_was_told_is_lost_in_fifty_kills(tmp_path: Path) -
                 if expected is not None:
                     figures = stats(address)
                     assert (figures["restored_tick"], figures["restored_hash"]) == expected, (seed, life)
-                asyncio.run(one_life(server, address, cells, scene, 1000 * life, rng.uniform(0.05, 0.8)))
+                asyncio.run(one_life(server, address, cells, editors, rng.uniform(0.05, 0.8), signal.SIGKILL))
         finally:
             server.close()
         if (data / "world.db").exists():
             world, expected = looked_at(data, scene, tmp_path / "copy")
             cells.check(world)
     assert early == KILLS // 5
+    assert sum(editor.returns for editor in editors) > BOTS * KILLS // 2
     assert cells.done > 10 * KILLS, (cells.done, cells.refused)
 
 
 async def one_life(
-    server: ServerProcess, address: tuple[str, int], cells: Cells, scene: Scene, turn: int, seconds: float
+    server: ServerProcess, address: tuple[str, int], cells: Cells, editors: list[Editor], seconds: float, end: int
 ) -> None:
-    """Edits, and a kill so long after the first verdict."""
+    """Edits, and a signal so long after the first verdict."""
     before = cells.done
-    async with editing(address, cells, scene, turn):
+    async with editing(address, editors):
         await asyncio.get_running_loop().run_in_executor(None, until, lambda: cells.done > before)
         await asyncio.sleep(seconds)
-        server.process.kill()
+        server.process.send_signal(end)
+
+
+def test_a_clean_stop_leaves_a_checkpoint_and_no_log(tmp_path: Path) -> None:
+    data, record, cells, scene = tmp_path / "data", tmp_path / "record", Cells(), load_scene("flat")
+    editors = [Editor(cells, scene) for _ in range(BOTS)]
+    with running("--port", "0", "--scene", "flat", "--data", str(data), "--record", str(record)) as server:
+        asyncio.run(one_life(server, server.address(), cells, editors, 0.3, signal.SIGTERM))
+        assert server.end() == 0
+    saved = read(data / "world.db")
+    assert saved is not None
+    assert saved.log == []
+    assert not (data / "world.db-wal").exists()
+    *_, last = replay(record)
+    assert saved.checkpoint.hash == last.world.state_hash()
+    world, found = looked_at(data, scene, tmp_path / "copy")
+    assert found == (last.world.tick, last.world.state_hash().hex())
+    cells.check(world)
+    with running("--port", "0", "--scene", "flat", "--data", str(data)) as server:
+        figures = stats(server.address())
+        assert (figures["restored_tick"], figures["restored_hash"]) == found
+        with running("--port", "0", "--scene", "flat", "--data", str(data)) as second:
+            assert second.end() == 2
+            assert second.rest() == []
+            assert "another server is using it" in second.errors[-1]
+        assert server.end(signal.SIGTERM) == 0
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="limits another process's files")
@@ -194,6 +231,7 @@ def test_a_full_disk_is_told_players_move_on_and_room_is_made_use_of(tmp_path: P
 
 async def fill_up(server: ServerProcess, address: tuple[str, int], cells: Cells, data: Path) -> None:
     loop = asyncio.get_running_loop()
+    editors = [Editor(cells, load_scene("flat")) for _ in range(BOTS)]
 
     async def seen(condition: Callable[[], bool]) -> None:
         await loop.run_in_executor(None, until, condition)
@@ -201,7 +239,7 @@ async def fill_up(server: ServerProcess, address: tuple[str, int], cells: Cells,
     def limit(size: int) -> None:
         resource.prlimit(server.process.pid, resource.RLIMIT_FSIZE, (size, resource.RLIM_INFINITY))
 
-    async with editing(address, cells, load_scene("flat"), 0) as editors:
+    async with editing(address, editors):
         await seen(lambda: cells.done > 20)
         limit((data / "world.db-wal").stat().st_size)
         await seen(lambda: messages.UNSAVED in editors[0].told)

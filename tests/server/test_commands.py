@@ -7,7 +7,7 @@ import pytest
 
 from server.limits import Limits
 from shared import edits, messages
-from shared.messages import Command, Inputs, Snapshot
+from shared.messages import Command, Inputs, Snapshot, Welcome
 from tests.tables import FakeLink, Table, order
 
 
@@ -111,6 +111,21 @@ def test_a_verdict_is_told_when_its_tick_is_on_disk() -> None:
     disk.durable_tick += 1
     table.tick()
     assert verdicts(link) == {1: messages.DONE, 2: messages.OUT_OF_REACH}
+
+
+def test_a_client_is_let_in_when_its_token_is_on_disk_or_nothing_can_be_saved() -> None:
+    disk = Disk()
+    table = Table(saves=disk)
+    disk.durable_tick = table.tick_number
+    first = table.join()
+    table.tick(3)
+    assert first.sent == []
+    disk.durable_tick = 1
+    table.tick()
+    assert [type(message) for message in first.sent[:2]] == [Welcome, Snapshot]
+    disk.trouble = "no room"
+    second = table.join()
+    assert [type(message) for message in second.sent[:2]] == [Welcome, Snapshot]
 
 
 def test_while_nothing_can_be_saved_commands_are_refused_and_players_move_on() -> None:

@@ -11,6 +11,7 @@ from server.store import Store
 from shared import messages
 from shared.messages import Hello, Inputs, Shared, Welcome
 from tests.server.test_rules import Told, attributes
+from tests.server.test_store import until
 from tests.tables import FakeLink, Table, gone, order
 
 
@@ -29,6 +30,12 @@ class Stored(Table):
             rules=rules,
         )
         self.store.start(self.game.keep)
+
+    def tick(self, n: int = 1) -> None:
+        """Ticks that are on disk each before the next one."""
+        for _ in range(n):
+            super().tick()
+            until(lambda: self.store.durable_tick == self.game.world.tick)
 
     def stop(self) -> None:
         assert self.store.close()
@@ -55,7 +62,7 @@ def goes_on(table: Stored, before: FakeLink, token: bytes, rules: Told) -> None:
     assert rules.told == []
     assert table.game.world.blocks.get(18, 16, 1) == 5
     link = table.connect(Hello(1, {}, "", resume=token))
-    table.tick()
+    table.tick(2)
     me = link.session.entity
     assert me == before.session.entity
     assert attributes(link) == {me: {"name": "Ann"}, 2: {"mood": "cross"}}
