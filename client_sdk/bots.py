@@ -4,8 +4,8 @@ A policy knows nothing of networks, so the same one plays over the wire (in a cl
 server. Each is seeded by the random source it is given.
 """
 
-from collections.abc import Callable
-from typing import Protocol, runtime_checkable
+from collections.abc import Callable, Mapping
+from typing import Any, Protocol, runtime_checkable
 
 from client_sdk.core import Core
 from shared.edits import Edit
@@ -40,6 +40,15 @@ class Builder(Policy, Protocol):
         ...
 
 
+@runtime_checkable
+class Learner(Policy, Protocol):
+    """A policy that wants to know what the game's rules say of the entities in sight."""
+
+    def learn(self, attributes: Mapping[int, Mapping[str, Any]]) -> None:
+        """Attributes by entity, ahead of each wish. The table changes as news come in."""
+        ...
+
+
 class Bot:
     """A policy at the wheel of a client: `AsyncClient.connect(..., before_update=Bot(Wander(Random(1))))`."""
 
@@ -54,6 +63,8 @@ class Bot:
         world = core.prediction.predicted
         if world.tick != self._tick and core.entity in world:
             self._tick = world.tick
+            if isinstance(self._policy, Learner):
+                self._policy.learn(core.prediction.attributes)
             core.set_input(self._policy(world, core.entity))
             if isinstance(self._policy, Builder) and core.state == "playing":
                 edit = self._policy.edit(world, core.entity)

@@ -35,6 +35,11 @@ class Contacts:
         }
         return sorted(new)
 
+    def of(self, entity: int) -> list[int]:
+        """Who touches an entity at this moment, ascending."""
+        pairs = self._touched(self._world.states(), np.array([entity], np.int64))
+        return sorted(b if a == entity else a for a, b in pairs)
+
     def _touched(self, states: Int64s, changed: Int64s) -> set[Pair]:
         low = states[:, X : X + 3] + self._low[states[:, TEMPLATE]]
         high = states[:, X : X + 3] + self._high[states[:, TEMPLATE]]

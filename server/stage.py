@@ -67,7 +67,8 @@ class Stage:
         self._random = (-1, Random())
         self._seen = 0.0
         self._outgoing: list[tuple[frozenset[int] | None, bytes]] = []
-        self._contacts = Contacts(world) if _overrides(rules, "on_contact") else None
+        self._contacts = Contacts(world)
+        self._told_contacts = _overrides(rules, "on_contact")
         self._started = kept is not None
         rules.game = self
 
@@ -112,6 +113,11 @@ class Stage:
     def velocity(self, entity: int) -> Vec:
         """How fast an entity is."""
         return self._world.velocity(entity)
+
+    def touching(self, entity: int) -> list[int]:
+        """The ids of those whose boxes share at least a point with that of an entity, ascending: now, not only anew."""
+        self._world.state(entity)
+        return self._contacts.of(entity)
 
     def template(self, entity: int) -> str:
         """What an entity is."""
@@ -297,7 +303,7 @@ class Stage:
         if not self._started:
             self._started = True
             self._call(self._rules.on_start)
-        for a, b in self._contacts.begun() if self._contacts else ():
+        for a, b in self._contacts.begun() if self._told_contacts else ():
             if a in self._world and b in self._world:
                 self._call(self._rules.on_contact, a, b)
         self._call(self._rules.on_tick)

@@ -14,6 +14,7 @@ from client_sdk.core import Core
 from client_sdk.events import Event
 from server.game import Game
 from server.limits import Limits
+from server.rules import Rules
 from server.session import Session
 from shared.inputs import Input
 from shared.scene import Scene
@@ -156,10 +157,11 @@ class Match:
     Args:
         scene: the rules.
         seed: everything random comes from it.
+        rules: what is played; they prepare the scene.
     """
 
-    def __init__(self, scene: Scene, seed: int, *, limits: Limits | None = None) -> None:
-        self.game = Game(scene, limits=limits)
+    def __init__(self, scene: Scene, seed: int, *, limits: Limits | None = None, rules: Rules | None = None) -> None:
+        self.game = Game(scene if rules is None else rules.prepare(scene), limits=limits, rules=rules, seed=seed)
         self.seed = seed
         self.now = 0.0
         self.players: list[Player] = []

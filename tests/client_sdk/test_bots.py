@@ -1,6 +1,8 @@
 """Policies in a world of their own: no client, no server."""
 
 import random
+from collections.abc import Mapping
+from typing import Any
 
 import pytest
 
@@ -9,6 +11,7 @@ from client_sdk.core import Core
 from shared.inputs import MOVE_MAX, NEUTRAL, Input
 from shared.scene import Scene, load_scene
 from shared.world import World
+from tests.match import Match
 
 FLAT = load_scene("flat")
 
@@ -80,3 +83,26 @@ def test_a_bot_that_is_not_in_a_world_yet_wishes_nothing() -> None:
     core = Core()
     Bot(Wander(random.Random(1)))(core)
     assert core.state == "joining"
+
+
+class Attentive(Wander):
+    """Writes down what it is told of."""
+
+    heard: Mapping[int, Mapping[str, Any]] | None = None
+
+    def learn(self, attributes: Mapping[int, Mapping[str, Any]]) -> None:
+        self.heard = attributes
+
+
+def test_a_policy_that_wants_to_learns_what_the_rules_say() -> None:
+    match = Match(FLAT, 1)
+    policy = Attentive(random.Random(1))
+    bot = Bot(policy)
+
+    def plays(core: Core, rng: random.Random) -> Input:
+        bot(core)
+        return core.wish
+
+    player = match.join(plays)
+    match.run(3)
+    assert policy.heard == {player.core.entity: {"name": "player 0"}}

@@ -131,6 +131,17 @@ def test_contact_is_told_once_when_it_begins(table: Table, rules: Told) -> None:
     assert contacts[1][3] > begun + 10
 
 
+def test_who_touches_now_is_told_however_long_it_lasts(table: Table) -> None:
+    game = table.game.stage
+    a, b, c = (game.spawn("runner", (x, 16.0, 1.0)) for x in (10.0, 11.0, 10.0 - 0.625))
+    assert (game.touching(a), game.touching(b), game.touching(c)) == ([c], [], [a])
+    game.steer(a, 1, 0)
+    table.tick(40)
+    assert (game.touching(a), game.touching(b), game.touching(c)) == ([b], [a], [])
+    with pytest.raises(KeyError):
+        game.touching(99)
+
+
 def test_who_falls_out_is_the_rules_affair_or_comes_back(table: Table, rules: Told) -> None:
     link = table.join()
     table.game.world.place(link.session.entity, (16.0, 16.0, -3.0))

@@ -75,7 +75,7 @@ def test_unknown_and_missing_fields() -> None:
 
 
 def test_files(tmp_path: Any) -> None:
-    with pytest.raises(SceneError, match="built in are arena, flat, hills, topdown"):
+    with pytest.raises(SceneError, match="built in are arena, flat, hills, meadow, topdown"):
         load_scene("nowhere")
     broken = tmp_path / "broken.toml"
     broken.write_text("gravity = = 3")

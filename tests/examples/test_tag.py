@@ -1,0 +1,82 @@
+"""Tag, played by bots over slow links in simulated time: nobody errs, and a recording gives the same game again."""
+
+import io
+import random
+from itertools import pairwise
+from typing import Any
+
+import msgpack
+import pytest
+
+from client_sdk.bots import Bot
+from client_sdk.core import Core
+from client_sdk.events import Diverged, Happened, Left
+from scripts.examples.tag import Tag
+from scripts.examples.tag_brain import TagPlayer
+from server.journal import NOTE, Recording
+from server.keeping import restored
+from shared.inputs import Input
+from shared.scene import load_scene
+from tests.match import Match, Path, Player
+
+TYPICAL = Path(0.05, 0.01, 0.01)
+CAUSES = {"late input", "other entity", "server act", "unknown edit", "missing terrain"}
+
+
+class Playing:
+    """A bot as a policy of a match."""
+
+    def __init__(self) -> None:
+        self._bot = Bot(TagPlayer())
+
+    def __call__(self, core: Core, rng: random.Random) -> Input:
+        self._bot(core)
+        return core.wish
+
+
+def played(count: int, seconds: float, seed: int, path: Path) -> tuple[Match, list[Player], io.BytesIO]:
+    """A recorded game of so many bots."""
+    match = Match(load_scene(Tag.scene), seed, rules=Tag())
+    recording = io.BytesIO()
+    match.game.world.record(recording)
+    players = [match.join(Playing(), path) for _ in range(count)]
+    match.run(seconds)
+    match.game.world.end_recording()
+    recording.seek(0)
+    return match, players, recording
+
+
+def said(match: Match) -> dict[int, Any]:
+    return {entity: match.game.stage.kept.attributes.get(entity) for entity in match.game.stage.entities()}
+
+
+@pytest.mark.parametrize(
+    ("count", "seconds"), [(6, 30), pytest.param(20, 605, marks=pytest.mark.slow)], ids=["short", "long"]
+)
+def test_bots_play_tag_and_a_recording_gives_the_same_scores(count: int, seconds: float) -> None:
+    match, players, file = played(count, seconds, 21, TYPICAL)
+    game = match.game
+    assert game.counters.rules_failed == 0
+    tagged: list[Happened] = []
+    for player in players:
+        assert player.core.state == "playing"
+        assert not [event for event in player.events if isinstance(event, Diverged | Left)]
+        assert player.core.stats.divergences == 0
+        assert set(player.core.stats.corrections_by_cause) <= CAUSES
+        tagged = [event for event in player.events if isinstance(event, Happened) and event.name == "tagged"]
+    assert len(tagged) >= seconds / 30, "they catch each other"
+    for one, two in pairwise(tagged):
+        assert one.data["who"] == two.data["by"], "who has been tagged is it"
+        if two.tick - one.tick < game.stage.ticks(Tag.safe_s):
+            assert two.data["who"] != one.data["by"], "not back at once"
+
+    recording = Recording(file)
+    notes = []
+    for moment in recording:
+        notes += [msgpack.unpackb(call[1], strict_map_key=False) for call in moment.calls if call[0] == NOTE]
+    assert recording.world.state_hash() == game.world.state_hash()
+    kept = restored(notes)
+    assert {entity: kept.attributes.get(entity) for entity in said(match)} == said(match)
+    assert kept.shared == dict(game.stage.shared)
+    scores = [attributes["score"] for attributes in said(match).values()]
+    assert max(scores) > 0

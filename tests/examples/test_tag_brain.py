@@ -1,0 +1,48 @@
+"""The heads of the runners and of the bots: whom they run after, and from whom."""
+
+import math
+
+import pytest
+
+from scripts.examples.tag import Tag
+from scripts.examples.tag_brain import TagPlayer, wish
+from shared.inputs import JUMP
+from shared.scene import load_scene
+from shared.world import World
+
+HERE = (32.0, 32.0, 9.0)
+
+
+def test_who_is_it_runs_after_the_nearest_who_can_be_tagged() -> None:
+    places = {1: HERE, 2: (34.0, 32.0, 9.0), 3: (32.0, 40.0, 9.0)}
+    assert wish(1, 0, places, (1.0, 1.0, 0.0), [1], [])[:2] == (1.0, 0.0)
+    assert wish(1, 0, places, (1.0, 1.0, 0.0), [1], [2])[:2] == (0.0, 1.0)
+
+
+@pytest.mark.parametrize("me", [1, 2, 3])
+@pytest.mark.parametrize("angle", range(8))
+def test_the_others_run_away_from_whoever_is_it(me: int, angle: int) -> None:
+    way = math.cos(angle), math.sin(angle)
+    places = {me: HERE, 9: (32 + 6 * way[0], 32 + 6 * way[1], 9.0)}
+    x, y, _ = wish(me, 0, places, (1.0, 1.0, 0.0), [9], [])
+    assert x * way[0] + y * way[1] < -0.5
+
+
+def test_who_gets_no_further_jumps() -> None:
+    places = {1: HERE, 2: (36.0, 32.0, 9.0)}
+    assert not wish(1, 0, places, (5.0, 0.0, 0.0), [1], [])[2]
+    assert wish(1, 0, places, (0.0, 0.0, 0.0), [1], [])[2]
+
+
+def test_a_bot_sees_in_its_world_who_is_it_and_learns_who_is_safe() -> None:
+    scene = Tag().prepare(load_scene(Tag.scene))
+    world = World(scene)
+    world.load_terrain()
+    me = world.spawn("it", (32.0, 32.0, 20.0))
+    near, far = world.spawn("player", (35.0, 32.0, 20.0)), world.spawn("player", (32.0, 45.0, 20.0))
+    bot = TagPlayer()
+    assert bot(world, me)[:2] == (127, 0)
+    bot.learn({near: {"safe": world.tick + 1}})
+    assert bot(world, me)[:2] == (0, 127)
+    bot.learn({near: {"safe": world.tick}, far: {}})
+    assert bot(world, me) == (127, 0, JUMP)
