@@ -122,6 +122,8 @@ MEMORY_S = 120.0
 FIRST_S = 20.0
 """Until there have been inputs for so long, shares are of this; the fewer there were, the more is kept for safety."""
 FIRST_INPUTS = 16
+SPREAD_S_MAX = 0.5
+"""A pong that took longer than that waited for a program that was busy (loading, compiling), not for the path."""
 REVIEW = 8
 """The cover is thought over after so many inputs."""
 
@@ -151,10 +153,11 @@ class PricedLead:
         self._cover: float | None = None
 
     def start(self, clock: ServerClock, now: float) -> float:
-        """Half the round trip, all the jitter there was, and two ticks."""
+        """Half the round trip, all the jitter there was (up to a bound), and two ticks."""
         self._rate = clock.rate
         self._measure(clock)
-        return clock.phase + (clock.rtt_s / 2 + clock.spread_s) * clock.rate + 2.0
+        jitter = min(clock.spread_s, SPREAD_S_MAX)
+        return clock.phase + (clock.rtt_s / 2 + jitter) * clock.rate + 2.0
 
     def observe(self, tick: int, margin: float, phase: float, now: float) -> None:
         """See `LeadController`."""

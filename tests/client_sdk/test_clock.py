@@ -158,6 +158,8 @@ def test_it_starts_on_the_safe_side() -> None:
     lead = PricedLead()
     assert lead.start(clock_at(phase=100.0, rtt_s=0.25), 9.0) == 100 + 0.125 * RATE + 2
     assert lead.start(clock_at(phase=100.0, rtt_s=0.25, spread_s=0.5), 9.0) == 100 + 0.625 * RATE + 2
+    # A program that was busy while it joined is not ahead of all that it can predict, for it would send nothing then.
+    assert lead.start(clock_at(phase=100.0, rtt_s=0.25, spread_s=5.0), 9.0) == 100 + 0.625 * RATE + 2
 
 
 def test_a_steady_path_gets_what_it_needs_and_the_safety() -> None:
