@@ -11,6 +11,7 @@ snapshot is, looked at once per tick; lead is how far ahead of the server the pl
 import argparse
 import json
 import sys
+import time
 from collections import Counter
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from pathlib import Path
@@ -72,8 +73,10 @@ def play(preset: str, clients: int, minutes: float, seed: int) -> dict[str, Any]
     for player in players:
         player.events.clear()
     watch = Watch(match)
+    began = time.process_time()
     match.run(minutes * 60)
-    return figures(match, players, before, watch, minutes)
+    spent = time.process_time() - began
+    return {**figures(match, players, before, watch, minutes), "simulated_s_per_cpu_s": round(minutes * 60 / spent, 1)}
 
 
 def figures(
@@ -165,6 +168,8 @@ def main() -> int:
             progress.advance(bar)
     presets = {name: found[name] for name in names}
     console.print(table(presets))
+    speeds = ", ".join(f"{name} {row['simulated_s_per_cpu_s']:.0f}" for name, row in presets.items())
+    console.print(f"simulated seconds per CPU second, of all {chosen.clients} clients and their server: {speeds}")
     if rows:
         console.print(league.table(rows))
     if chosen.json:
