@@ -236,10 +236,11 @@ class Core:
         assert self.picture is not None
         if self.state == "playing":
             self._reconcile(now)
-            if self.timeline.steer(self._lead, self.clock, now):
-                self._restart(now)
             self._seen = self.picture.advance(self.clock, now)
         self._predict(math.floor(self.timeline.tick(now)), now)
+        # Steered only now: a tick that was due, and for which the program woke up, is not put off by a moment.
+        if self.state == "playing" and self.timeline.steer(self._lead, self.clock, now):
+            self._restart(now)
 
     def next_update(self, now: float) -> float:
         """The local time at which `update` has something to do."""

@@ -8,6 +8,7 @@ from client_sdk.core import Core
 from client_sdk.events import Diverged, Left, Resynchronised, SegmentLoaded
 from shared.inputs import JUMP, Input
 from shared.scene import load_scene
+from tests.links import PRESETS
 from tests.match import Match, Path, Player, wander
 
 
@@ -39,6 +40,27 @@ def test_any_frame_rate_plays(frames_per_s: int) -> None:
     assert set(stats.corrections_by_cause) <= {"late input"}
     # A replay comes with new terrain only.
     assert stats.repredictions <= sum(isinstance(event, SegmentLoaded) for event in player.events)
+
+
+class Counted(Core):
+    updates = 0
+
+    def update(self, now: float) -> None:
+        self.updates += 1
+        super().update(now)
+
+
+@pytest.mark.parametrize("preset", ["lan", "typical", "wifi"])
+def test_who_sleeps_until_something_is_due_wakes_up_once_per_tick_and_ping(preset: str) -> None:
+    match, core = Match(load_scene("hills"), 6), Counted()
+    player = match.join(wander, PRESETS[preset], core)
+    joined(match, player)
+    match.run(10)
+    updates, sent = core.updates, core.stats.inputs_sent
+    match.run(20)
+    sent = core.stats.inputs_sent - sent
+    assert sent >= 20 * 32 - 10
+    assert core.updates - updates <= 1.05 * sent + 20
 
 
 @pytest.mark.parametrize("seconds", [0.3, 1.0, 2.0, 5.0, 12.0])
