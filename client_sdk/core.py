@@ -135,7 +135,8 @@ class Core:
         self._pieces: tuple[Cell, bytearray] = ((0, 0, 0), bytearray())
         self._pings: deque[float] = deque(maxlen=16)
         self._number = 0
-        self._seen = 0.0
+        self._seen = 0.0  # of the last view; of the last update, where nothing is drawn
+        self._draws = False
         self._newest = -1
         self.picture: Picture | None = None
         self.shared: dict[str, Any] = {}
@@ -236,7 +237,9 @@ class Core:
         assert self.picture is not None
         if self.state == "playing":
             self._reconcile(now)
-            self._seen = self.picture.advance(self.clock, now)
+            shown = self.picture.advance(self.clock, now)
+            if not self._draws:
+                self._seen = shown
         self._predict(math.floor(self.timeline.tick(now)), now)
         # Steered only now: a tick that was due, and for which the program woke up, is not put off by a moment.
         if self.state == "playing" and self.timeline.steer(self._lead, self.clock, now):
@@ -268,7 +271,9 @@ class Core:
         """What to draw now: the own entity predicted, the others as they were a moment ago."""
         if self.picture is None or self.timeline is None:
             return NOTHING
-        return self.picture.view(self.timeline, self.clock, now)
+        view = self.picture.view(self.timeline, self.clock, now)
+        self._draws, self._seen = True, view.seen
+        return view
 
     # -- inside --------------------------------------------------------------------------------------------
 

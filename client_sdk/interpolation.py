@@ -51,11 +51,18 @@ class Interpolation:
             self.delay_ticks = max(1.0, self.delay_ticks - max(fall, 0.0))
         self._at = now
 
+    def shown(self, server_tick: float) -> float:
+        """The moment that is drawn, as a tick: no earlier than the history, at most 100 ms beyond it."""
+        at = server_tick - self.delay_ticks
+        if not self._states:
+            return at
+        return max(self._states[0][0], min(at, self._states[-1][0] + EXTRAPOLATE_S * self._rate))
+
     def sample(self, server_tick: float) -> tuple[Int64s, Positions]:
-        """States and positions (blocks, [n, 3]) of all entities as they are to be drawn."""
+        """States and positions (blocks, [n, 3]) of all entities as they are to be drawn: as they were when `shown`."""
         if not self._states:
             return np.zeros((0, 12), np.int64), np.zeros((0, 3))
-        at = min(server_tick - self.delay_ticks, self._states[-1][0] + EXTRAPOLATE_S * self._rate)
+        at = self.shown(server_tick)
         before = after = self._states[-1]
         for entry in reversed(self._states):
             before = entry

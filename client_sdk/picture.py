@@ -33,11 +33,16 @@ class Figure:
 
 @dataclass(frozen=True)
 class View:
-    """What to draw at one moment. `me` is the own entity, `others` are the rest, ascending by id."""
+    """What to draw at one moment. `me` is the own entity at `tick`, `others` are the rest, ascending by id.
+
+    `seen` is the server's tick at which the others are drawn: commands take it along, so that the server can judge a
+    shot by what its shooter saw (`game.rewound`).
+    """
 
     tick: float
     me: Figure | None
     others: list[Figure]
+    seen: float = 0.0
 
 
 NOTHING = View(0.0, None, [])
@@ -56,7 +61,7 @@ class Picture:
     def advance(self, clock: ServerClock, now: float) -> float:
         """Adapts the delay of the others; the tick at which they are drawn."""
         self.interpolation.advance(clock.tick(now), now)
-        return clock.tick(now) - self.interpolation.delay_ticks
+        return self.interpolation.shown(clock.tick(now))
 
     def smooth(self, done: Reconciled, now: float) -> None:
         """A replay has moved things: they are shown to go there gradually (what the rules placed jumps)."""
@@ -71,8 +76,8 @@ class Picture:
     def view(self, timeline: Timeline, clock: ServerClock, now: float) -> View:
         """The picture at `now`."""
         prediction = self._prediction
-        tick = timeline.tick(now)
-        states, places = self.interpolation.sample(clock.tick(now))
+        tick, server_tick = timeline.tick(now), clock.tick(now)
+        states, places = self.interpolation.sample(server_tick)
         others = []
         for state, place in zip(states.tolist(), places.tolist(), strict=True):
             entity = state[ID]
@@ -80,7 +85,7 @@ class Picture:
                 continue
             ahead = self._ahead(entity, tick, now) if state[TEMPLATE] in self._predicted else None
             others.append(ahead or self._figure(state, place))
-        return View(tick, self._ahead(prediction.entity, tick, now), others)
+        return View(tick, self._ahead(prediction.entity, tick, now), others, self.interpolation.shown(server_tick))
 
     def _ahead(self, entity: int, tick: float, now: float) -> Figure | None:
         """An entity between its last two predicted ticks, with what smoothing adds."""

@@ -63,6 +63,13 @@ def test_beyond_the_newest_motion_goes_on_for_100_ms_and_then_holds() -> None:
     assert [shown(interpolation, tick) for tick in (15.0, 500.0)] == [{"a": 5}] * 2
 
 
+def test_the_moment_shown_is_that_of_the_clamped_picture() -> None:
+    interpolation = fed((10, states(a=0)), (11, states(a=1)))
+    ticks = [(3.0, 10.0), (10.0, 10.0), (10.5, 10.5), (12.0, 12.0), (15.0, 15.0), (15.5, 15.0), (500.0, 15.0)]
+    assert [interpolation.shown(tick + interpolation.delay_ticks) for tick, _ in ticks] == [at for _, at in ticks]
+    assert Interpolation(RATE).shown(7.0) == 5.0
+
+
 def test_who_is_new_stands_where_it_is_and_who_left_is_not_drawn() -> None:
     interpolation = fed((10, states(a=0, c=3)), (12, states(b=7, c=5)))
     assert shown(interpolation, 11.0) == {"b": 7, "c": 4}

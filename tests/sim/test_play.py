@@ -7,6 +7,7 @@ import pytest
 from client_sdk.core import Core
 from client_sdk.events import Diverged, Left, Resynchronised, SegmentLoaded
 from shared.inputs import JUMP, Input
+from shared.messages import Command, decode_from_client
 from shared.scene import load_scene
 from tests.links import PRESETS
 from tests.match import Match, Path, Player, wander
@@ -115,6 +116,39 @@ def test_the_input_delay_changes_in_mid_play_without_a_correction() -> None:
     assert player.core.stats.corrections == 0
     with pytest.raises(ValueError, match="ticks = 4"):
         player.core.set_input_delay(4)
+
+
+@pytest.mark.parametrize("preset", ["typical", "far"])
+def test_a_command_tells_what_was_drawn_when_it_was_given(preset: str) -> None:
+    """At 60 frames/s: the picture drawn last, not that of the update in between; never 100 ms beyond what is known."""
+    match = Match(load_scene("flat"), 21)
+    players = [match.join(wander, PRESETS[preset]) for _ in range(2)]
+    joined(match, *players)
+    player, core = players[0], players[0].core
+    match.run(2)
+    told: list[bool] = []
+    ahead_of_news: list[float] = []
+
+    def frame() -> None:
+        drawn = core.view(player.local).seen
+        assert core.prediction is not None
+        ahead_of_news.append(drawn - core.prediction.confirmed.tick)
+        match.at(match.now + 1 / 60, lambda: act(drawn))
+
+    def act(drawn: float) -> None:
+        core.update(player.local)
+        core.edit(1, 1, 1, 0)
+        sent = core.outgoing()
+        (command,) = [order for order in map(decode_from_client, sent) if isinstance(order, Command)]
+        told.append(command.seen == drawn)
+        for message in sent:
+            player.up.send(message)
+
+    for number in range(100):
+        match.at(match.now + number / 5, frame)
+    match.run(21)
+    assert told == [True] * 100
+    assert max(ahead_of_news) <= 3.2
 
 
 class Crowd:
