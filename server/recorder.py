@@ -1,5 +1,6 @@
 """A world that tells what happens to it: to recordings (`server.journal` draws their format) and to a store."""
 
+import math
 import struct
 import zlib
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -67,12 +68,14 @@ class Pen:
 
     Args:
         first: what was written ahead of the first tick may be among its changes without a call, so it has no mark.
+        hashed_max: no hash of a world with more entities (it takes the step 2 ms with 10,000); every tick has its mark.
     """
 
-    def __init__(self, *, first: bool = True) -> None:
+    def __init__(self, *, first: bool = True, hashed_max: float = math.inf) -> None:
         self.calls: list[Call] = []
         self._held: dict[int, Input] = {}
         self._first = first
+        self._hashed_max = hashed_max
 
     def forget(self, entities: list[int]) -> None:
         """The inputs of these entities are not known any more."""
@@ -97,7 +100,7 @@ class Pen:
                 news += map(int, (entity, *wish))
         first, self._first = self._first, False
         parts: list[Any] = [news, calls, None if first else mark(world)]
-        if first or world.tick % HASH_TICKS == 0:
+        if first or (world.tick % HASH_TICKS == 0 and len(world) <= self._hashed_max):
             parts.append(world.state_hash())
         return parts
 

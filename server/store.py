@@ -4,10 +4,12 @@ Theory of operation. The physics is deterministic, so a world is its last checkp
 store is a pen on the world (`server.recorder`): after every step it has the record of that tick, the same bytes that a
 recording would hold, and hands it to a thread of its own. That thread puts what has come since its last transaction
 into the next one (group commit), so there is never more than one fsync under way, and a slow disk makes the groups
-larger, not the ticks longer. `durable_tick` is the newest tick that is on disk. The game holds the verdict on a command
-back until its tick is: a client that was told "done" finds it done after any crash. What others see of it in their
-snapshots meanwhile is news, not a promise. `start` puts the world together again: checkpoint, then every record, each
-compared with the marks and hashes in it; it is the same world at the same tick, or an error.
+larger, not the ticks longer. `durable_tick` is the newest tick that is on disk. The game holds back until then what
+it promises: the verdict on a command, and the welcome with the token to come back with. A client that was told "done"
+finds it done after any crash. What others see of it in their snapshots meanwhile is news, not a promise.
+`server.loading` puts the world together again: checkpoint, then every record, each compared with the marks and hashes
+in it; it is the same world at the same tick, or an error. What belongs to the game and is not in the world goes the
+same way: `keep` for the checkpoint, `RecordedWorld.note` for the log.
 
 A tick in which nothing was told, nothing moved and nothing changed is quiet. Quiet ticks are written once a second; the
 loss of some is the loss of nothing, so they count as durable as soon as everything before them is.
@@ -49,6 +51,8 @@ from shared.world import World
 
 LOG_BYTES_MAX = 32 << 20
 """A log that has grown to this is cut by a checkpoint ahead of time."""
+HASHED_MAX = 1000
+"""In larger worlds, whole hashes are left to the checkpoints: no tick should pay for one."""
 QUIET_S = 1.0
 """Ticks in which nothing happened wait so long for company."""
 BEHIND_S = 10.0
@@ -88,7 +92,7 @@ class Store(Pen):
         checkpoint_s: float = 60.0,
         compiled: bool | None = None,
     ) -> None:
-        super().__init__(first=False)
+        super().__init__(first=False, hashed_max=HASHED_MAX)
         self._path = Path(directory) / "world.db"
         self._rules = msgpack.packb(scene.to_table())
         self._power = power

@@ -8,10 +8,12 @@ from collections.abc import Callable, Iterator
 from contextlib import closing
 from pathlib import Path
 
+import msgpack
 import numpy as np
 import pytest
 
 from server import database
+from server import store as stores
 from server.database import StoreError
 from server.store import Store
 from shared.blocks import pack
@@ -144,6 +146,23 @@ def test_checkpoints_are_exact_while_the_world_goes_on(opened: Callable[..., Sto
         again = opened(copy, start=False)
         assert again.world.state_hash() == hashes[again.world.tick] == hashes[store.world.tick]
     assert store.checkpoint_s.count > 3
+
+
+def test_a_large_world_is_hashed_by_its_checkpoints_only(
+    opened: Callable[..., Store], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(stores, "HASHED_MAX", 1)
+    rng = random.Random(5)
+    store = opened()
+    store.world.spawn("box", (0, 0, 9))
+    store.world.spawn("box", (0, 4, 9))
+    last = play(store, 40, rng)[-1]
+    copy = crashed(store, tmp_path)
+    with closing(sqlite3.connect(copy / "world.db")) as connection:
+        records = [msgpack.unpackb(row[0]) for row in connection.execute("SELECT record FROM log")]
+    assert {len(record) for record in records} == {3}
+    again = opened(copy, start=False)
+    assert (again.world.tick, again.world.state_hash()) == last
 
 
 def test_a_directory_belongs_to_one_server(opened: Callable[..., Store], tmp_path: Path) -> None:
