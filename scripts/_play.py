@@ -1,0 +1,88 @@
+"""Opens a window and plays: by default tag, on a server of its own, with bots."""
+
+import argparse
+import contextlib
+import os
+import sys
+import time
+
+os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
+
+import pygame
+
+import _play_server
+from _play_lag import LaggedCore
+from _play_script import Script
+from _play_window import Window, keyboard
+from client_sdk.client import Client
+from client_sdk.transports.connection import ConnectError, Connection
+from client_sdk.transports.polling import PollingTransport
+
+GAME = "scripts.examples.tag:Tag"
+FRAMES_PER_S = 60
+CONNECT_S = 5.0
+SCRIPT_S = 120.0
+"""A scripted session that is not through by then has failed."""
+
+
+def arguments(argv: list[str] | None = None) -> argparse.Namespace:
+    parser = argparse.ArgumentParser(prog="scripts/play", description=__doc__, allow_abbrev=False)
+    parser.add_argument("--url", metavar="ws://...", help="play on that server (default: starts one)")
+    parser.add_argument("--game", default=GAME, metavar="MODULE:CLASS", help="what the own server plays (default: tag)")
+    parser.add_argument("--scene", help="where (default: where the game wants to be played)")
+    parser.add_argument("--bots", type=int, metavar="N", help="bots that join (default: 4 on the own server, else 0)")
+    parser.add_argument("--name", default="You", help="shown to others (default: %(default)s)")
+    parser.add_argument("--lag", type=float, default=0, metavar="MS", help="latency to begin with (keys [ and ])")
+    parser.add_argument(
+        "--script-demo", metavar="OUT.png", help="a scripted session, also without a display: saves a picture and ends"
+    )
+    return parser.parse_args(argv)
+
+
+def main(argv: list[str] | None = None) -> int:
+    options = arguments(argv)
+    script = Script(options.script_demo) if options.script_demo else None
+    if script:
+        os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
+    try:
+        with contextlib.ExitStack() as stack:
+            url = options.url
+            if url is None:
+                print("starting a server ...", flush=True)
+                url = stack.enter_context(_play_server.server(options.game, options.scene))
+            count = options.bots if options.bots is not None else 0 if options.url else 4
+            stack.enter_context(_play_server.bots(url, count))
+            core = LaggedCore(options.name)
+            core.lag_s = options.lag / 1000
+            client = stack.enter_context(Client(core, PollingTransport(Connection(url, core), CONNECT_S)))
+            title = "Sovereign Netcode" if options.url else options.game.rpartition(":")[2]
+            return play(client, core, script, title)
+    except (ConnectError, RuntimeError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:
+        return 0
+
+
+def play(client: Client, core: LaggedCore, script: Script | None, title: str) -> int:
+    """Until somebody ends it; the exit code."""
+    pygame.display.init()
+    pygame.font.init()
+    window = Window(client, core, script or keyboard, title)
+    clock, started = pygame.time.Clock(), time.monotonic()
+    while not window.over:
+        now = time.monotonic()
+        window.frame(now)
+        clock.tick(FRAMES_PER_S)
+        if script and now - started > SCRIPT_S:
+            window.over = "the script took too long"
+    pygame.quit()
+    print(window.over)
+    if script is None:
+        return 0
+    print(*(f"{what} {much:.3g}" for what, much in script.done.items()), sep=", ")
+    return 0 if "in sight" in script.done else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

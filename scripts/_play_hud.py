@@ -1,0 +1,127 @@
+"""What is written over the picture: the round, the scores, what the network does, what has just happened."""
+
+import functools
+from collections.abc import Sequence
+
+import pygame
+
+from _play_figures import INK, IT, WHITE, Actor, font
+from _play_iso import Colour
+from client_sdk.client import Client
+
+KEYS = (
+    "WASD / arrows: walk    Space: jump    left / right mouse: dig / place    1-6: colour    "
+    "G: the server's word    [ ]: latency    Esc: quit"
+)
+FAINT: Colour = (168, 182, 206)
+TOAST_S = 4.0
+MARGIN = 14
+
+
+def network_lines(client: Client, now: float, lag_s: float) -> list[tuple[str, str]]:
+    """The figures of the connection, by name."""
+    stats, core = client.stats, client.core
+    rate = core.clock.rate
+    age = core.clock.tick(now) - core.prediction.confirmed.tick if core.prediction and core.clock.ready else 0.0
+    causes = [(f"   {cause}", f"{count}") for cause, count in sorted(stats.corrections_by_cause.items())]
+    return [
+        ("round trip", f"{stats.rtt_s * 1000:.0f} ms"),
+        ("added by [ ]", f"{lag_s * 1000:.0f} ms"),
+        ("lead", f"{stats.lead_ticks / rate * 1000:.0f} ms"),
+        ("snapshot age", f"{max(age, 0.0) / rate * 1000:.0f} ms"),
+        ("late inputs", f"{100 * stats.inputs_late / max(stats.inputs_sent, 1):.2f} %"),
+        ("corrections", f"{stats.corrections}"),
+        *causes,
+    ]
+
+
+class Hud:
+    """Panels in the window's corners."""
+
+    def __init__(self) -> None:
+        self._toasts: list[tuple[float, str]] = []
+
+    def say(self, text: str, now: float) -> None:
+        """Shows a line for a few seconds."""
+        self._toasts = [*self._toasts[-3:], (now + TOAST_S, text)]
+
+    def draw(
+        self,
+        target: pygame.Surface,
+        now: float,
+        *,
+        title: str,
+        left_s: float | None,
+        actors: Sequence[Actor],
+        network: Sequence[tuple[str, str]],
+        choice: Colour,
+    ) -> None:
+        """All of it; `left_s` is the time that is left of a round, if there is one."""
+        width, height = target.get_size()
+        clock = "" if left_s is None else f"{int(left_s) // 60}:{int(left_s) % 60:02}"
+        top = _panel(title, clock, 30)
+        target.blit(top, ((width - top.get_width()) // 2, MARGIN))
+        table = _table("The network", tuple(network), ())
+        target.blit(table, (MARGIN, MARGIN))
+        scores = _scores(actors)
+        if scores:
+            marks = tuple(tone for _, _, tone in scores)
+            board = _table("Seconds free", tuple((name, score) for name, score, _ in scores), marks)
+            target.blit(board, (width - board.get_width() - MARGIN, MARGIN))
+        keys = _panel(KEYS, "", 19)
+        target.blit(keys, ((width - keys.get_width()) // 2, height - keys.get_height() - MARGIN))
+        hand = pygame.Rect(MARGIN, height - 44, 30, 30)
+        pygame.draw.rect(target, choice, hand, border_radius=6)
+        pygame.draw.rect(target, WHITE, hand, 2, border_radius=6)
+        self._toasts = [entry for entry in self._toasts if entry[0] > now]
+        for n, (_, text) in enumerate(reversed(self._toasts)):
+            toast = _panel(text, "", 26)
+            toast.set_alpha(255 - 60 * n)
+            target.blit(toast, ((width - toast.get_width()) // 2, 70 + 42 * n))
+
+
+def _scores(actors: Sequence[Actor]) -> list[tuple[str, str, Colour]]:
+    """Name, score and colour of those who have a score, the best first."""
+    found = [
+        (int(actor.figure.attributes["score"]), str(actor.figure.attributes.get("name") or "?"), actor)
+        for actor in actors
+        if isinstance(actor.figure.attributes.get("score"), int)
+    ]
+    found.sort(key=lambda entry: (-entry[0], entry[2].figure.entity))
+    return [(name, str(score), actor.tone) for score, name, actor in found[:12]]
+
+
+def _plate(width: int, height: int) -> pygame.Surface:
+    plate = pygame.Surface((width, height), pygame.SRCALPHA)
+    pygame.draw.rect(plate, (*INK, 196), plate.get_rect(), border_radius=10)
+    return plate
+
+
+@functools.lru_cache(64)
+def _panel(text: str, more: str, size: int) -> pygame.Surface:
+    """A line on a plate; `more` stands behind it, in another colour."""
+    words = font(size).render(text, True, WHITE)
+    rest = font(size).render(more, True, (255, 214, 120)) if more else None
+    width = words.get_width() + (rest.get_width() + 14 if rest else 0)
+    plate = _plate(width + 28, words.get_height() + 14)
+    plate.blit(words, (14, 8))
+    if rest:
+        plate.blit(rest, (28 + words.get_width(), 8))
+    return plate
+
+
+@functools.lru_cache(64)
+def _table(title: str, rows: tuple[tuple[str, str], ...], marks: tuple[Colour, ...]) -> pygame.Surface:
+    """Names to the left, values to the right, and coloured marks before them, if there are."""
+    line, width, indent = 21, 196, 18 if marks else 0
+    plate = _plate(width, 38 + line * len(rows))
+    plate.blit(font(22).render(title, True, WHITE), (12, 10))
+    for n, (name, value) in enumerate(rows):
+        y = 34 + n * line
+        if marks:
+            pygame.draw.circle(plate, marks[n], (19, y + 7), 6)
+        ink = WHITE if not marks or marks[n] != IT else (255, 150, 140)
+        plate.blit(font(20).render(name, True, FAINT if not marks else ink), (12 + indent, y))
+        shown = font(20).render(value, True, ink)
+        plate.blit(shown, (width - 12 - shown.get_width(), y))
+    return plate

@@ -1,0 +1,281 @@
+"""Blocks seen from the south-east and above: where things are on the screen, and a cached picture of each segment.
+
+    screen x = (x + y) * HALF            north-west is up, north-east is right
+    screen y = (x - y) * QUARTER - z * RISE
+
+A picture is drawn anew when its blocks, or those that throw shadows on them, have changed. The faces of each block
+are kept beside it, so that what stands behind a block can be covered by it.
+"""
+
+import zlib
+from collections.abc import Iterable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+import pygame
+
+from shared.blocks import AIR, Blocks
+from shared.checks import Cell
+from shared.units import SEGMENT
+
+HALF, QUARTER, RISE = 24, 12, 26
+"""Half the width and half the height of a block's top, and the height of its sides, in pixels."""
+AROUND = 6
+"""Blocks that far outside of a segment count for its shadows."""
+SUN = ((-0.75, -0.35, 1.0), range(1, 11))
+"""Where the sun is from a block, and the steps in which shadows are looked for."""
+SKY = (1, 2, 3)
+"""The colour of a picture that is not drawn."""
+GRASS_KIND, SOIL_KIND = 3, 2
+
+Colour = tuple[int, int, int]
+Point = tuple[float, float]
+Bytes = npt.NDArray[np.uint8]
+
+PALETTE: dict[int, Colour] = {
+    1: (132, 138, 150), SOIL_KIND: (156, 116, 80), GRASS_KIND: (128, 190, 92), 4: (206, 192, 168),
+    5: (124, 90, 62), 6: (78, 152, 88),
+}  # fmt: skip
+CHOICE: tuple[Colour, ...] = (
+    (226, 122, 84), (240, 196, 96), (96, 172, 214), (154, 124, 206), (236, 236, 232), (84, 92, 110),
+)  # fmt: skip
+"""Colours of the kinds from 7 on, in turn: those that players place."""
+
+
+class Face(NamedTuple):
+    """A quadrangle, relative to the picture's origin, and its colour."""
+
+    points: tuple[Point, ...]
+    colour: Colour
+
+
+def project(x: float, y: float, z: float) -> Point:
+    """Blocks to pixels."""
+    return (x + y) * HALF, (x - y) * QUARTER - z * RISE
+
+
+def unproject(px: float, py: float, z: float) -> Point:
+    """The x and y, in blocks, that are seen at a pixel at the height z."""
+    a, b = px / HALF, (py + z * RISE) / QUARTER
+    return (a + b) / 2, (a - b) / 2
+
+
+def colour_of(kind: int) -> Colour:
+    """The colour of a kind of block in full light."""
+    return PALETTE.get(kind) or CHOICE[(kind - 7) % len(CHOICE)]
+
+
+def mixed(colour: Sequence[int], share: float, other: Sequence[int] = (0, 0, 0)) -> Colour:
+    """`share` of a colour and the rest of another (black, if not said)."""
+    r, g, b = (min(255, max(0, round(a * share + c * (1 - share)))) for a, c in zip(colour, other, strict=True))
+    return r, g, b
+
+
+class Picture(NamedTuple):
+    """A segment as it looks."""
+
+    check: int
+    surface: pygame.Surface
+    corner: Point
+    """Its left upper corner on the plane that `project` maps to."""
+    faces: dict[Cell, list[Face]]
+
+
+class Ground:
+    """The pictures of all loaded segments."""
+
+    def __init__(self) -> None:
+        self.pictures: dict[Cell, Picture] = {}
+        self._seen: dict[Cell, tuple[int, ...]] = {}
+
+    def refresh(self, blocks: Blocks, pictures_max: int) -> None:
+        """Draws at most so many pictures that are not up to date, the nearest to none before any other."""
+        for segment in self.pictures.keys() - blocks.rows.keys():
+            del self.pictures[segment], self._seen[segment]
+        for segment in sorted(blocks, key=_depth):
+            seen = tuple(blocks.digest(other) if other in blocks else -1 for other in _neighbours(segment))
+            if seen == self._seen.get(segment):
+                continue
+            kinds = _surroundings(blocks, segment)
+            check, old = zlib.crc32(kinds.tobytes()), self.pictures.get(segment)
+            if old is None or old.check != check:
+                if pictures_max == 0:
+                    return
+                pictures_max -= 1
+                self.pictures[segment] = _drawn(kinds, segment, check)
+            self._seen[segment] = seen
+
+    def draw(self, target: pygame.Surface, camera: Point) -> None:
+        """All of it; `camera` is the point of the plane at the target's left upper corner."""
+        for segment in sorted(self.pictures, key=_depth):
+            picture = self.pictures[segment]
+            place = round(picture.corner[0] - camera[0]), round(picture.corner[1] - camera[1])
+            target.blit(picture.surface, place)
+
+    def cover(self, target: pygame.Surface, camera: Point, low: Sequence[float], high: Sequence[float]) -> bool:
+        """Draws again whatever is in front of the box between two corners, in blocks, where it is; whether there was.
+
+        What was drawn in that place is clipped to the box's outline on the screen by the caller.
+        """
+        left, right = project(low[0], low[1], 0)[0], project(high[0], high[1], 0)[0]
+        top, bottom = project(low[0], high[1], high[2])[1], project(high[0], low[1], low[2])[1]
+        found = False
+        for cell in self._ahead(low, high):
+            x, y = project(*cell)
+            if x + 2 * HALF <= left or x >= right or y + QUARTER <= top or y - QUARTER - RISE >= bottom:
+                continue
+            picture = self.pictures.get((cell[0] // SEGMENT, cell[1] // SEGMENT, cell[2] // SEGMENT))
+            for points, colour in picture.faces.get(cell, ()) if picture else ():
+                found = True
+                shown = [(round(px) - round(camera[0]), round(py) - round(camera[1])) for px, py in points]
+                pygame.draw.polygon(target, colour, shown)
+        return found
+
+    def _ahead(self, low: Sequence[float], high: Sequence[float]) -> Iterable[Cell]:
+        """The cells that may hide a box, the furthest first: along the line of sight, and beside it."""
+        x0, y0, z0 = (int(part // 1) for part in low)
+        cells = []
+        for step in range(7):
+            for i in (-1, 0, 1):
+                for j in (-1, 0, 1):
+                    for k in (-1, 0, 1, 2):
+                        cell = x0 + step + i, y0 - step + j, z0 + step + k
+                        if cell[0] >= high[0] or cell[1] + 1 <= low[1] or cell[2] >= high[2]:
+                            cells.append(cell)
+        return sorted(set(cells), key=_depth)
+
+
+def target_of(blocks: Blocks, at: Point, height: float) -> tuple[Cell, Cell] | None:
+    """The first block that is seen at a point of the plane, looked for near a height, and the free cell before it."""
+    before: Cell | None = None
+    for step in range(500):
+        z = height + 9 - step * 0.04
+        x, y = unproject(*at, z)
+        cell = int(x // 1), int(y // 1), int(z // 1)
+        if cell == before:
+            continue
+        kind = blocks.get(*cell)
+        if kind and before is not None:
+            return cell, before
+        before = cell if kind is not None else None
+    return None
+
+
+def top_of(cell: Cell) -> tuple[Point, ...]:
+    """The upper face of a block: its west, south, east and north corners as seen."""
+    x, y, z = cell
+    return project(x, y, z + 1), project(x + 1, y, z + 1), project(x + 1, y + 1, z + 1), project(x, y + 1, z + 1)
+
+
+def _depth(cell: Cell) -> tuple[int, int, int, int]:
+    """What is further away comes first."""
+    x, y, z = cell
+    return x - y + z, x, -y, z
+
+
+def _neighbours(segment: Cell) -> list[Cell]:
+    x, y, z = segment
+    return [(x + i, y + j, z + k) for k in (0, 1) for j in (-1, 0, 1) for i in (-1, 0, 1)]
+
+
+def _surroundings(blocks: Blocks, segment: Cell) -> Bytes:
+    """The kinds of a segment and AROUND blocks more to each side and above, [z, y, x]; 0 where nothing is loaded."""
+    wide = SEGMENT + 2 * AROUND
+    kinds = np.zeros((SEGMENT + AROUND, wide, wide), np.uint8)
+    for other in _neighbours(segment):
+        if other in blocks:
+            here, there = zip(*(_overlap(other[k] - segment[k], k == 2) for k in (2, 1, 0)), strict=True)
+            kinds[here] = blocks.segment(other)[there]
+    return kinds
+
+
+def _overlap(way: int, upright: bool) -> tuple[slice, slice]:
+    """Where a neighbour that many segments away lies in the surroundings, and which part of it."""
+    before = 0 if upright else AROUND
+    start, end = before + way * SEGMENT, before + (way + 1) * SEGMENT
+    low, high = max(start, 0), min(end, before + SEGMENT + AROUND)
+    return slice(low, high), slice(low - start, high - start)
+
+
+def _drawn(kinds: Bytes, segment: Cell, check: int) -> Picture:
+    inner = slice(AROUND, AROUND + SEGMENT)
+    solid = kinds != AIR
+    here = solid[:SEGMENT, inner, inner]
+    shade = _light(solid)
+    seen = np.stack(
+        (
+            here & ~solid[1 : SEGMENT + 1, inner, inner],
+            here & ~solid[:SEGMENT, AROUND - 1 : AROUND + SEGMENT - 1, inner],
+            here & ~solid[:SEGMENT, inner, AROUND + 1 : AROUND + SEGMENT + 1],
+        )
+    )
+    faces: dict[Cell, list[Face]] = {}
+    origin = tuple(part * SEGMENT for part in segment)
+    for z, y, x in np.argwhere(seen.any(axis=0)).tolist():
+        cell = (origin[0] + x, origin[1] + y, origin[2] + z)
+        kind = int(kinds[z, y + AROUND, x + AROUND])
+        faces[cell] = _faces(cell, kind, seen[:, z, y, x].tolist(), float(shade[z, y, x]))
+    points = np.array([point for each in faces.values() for face in each for point in face.points] or [(0, 0)])
+    left, top = points.min(axis=0) - 1
+    width, height = (points.max(axis=0) - (left, top) + 2).astype(int).tolist()
+    surface = pygame.Surface((width, height)).convert()
+    surface.fill(SKY)
+    for cell in sorted(faces, key=_depth):
+        for face in faces[cell]:
+            shown = [(round(x - left), round(y - top)) for x, y in face.points]
+            pygame.draw.polygon(surface, face.colour, shown)
+    surface.set_colorkey(SKY, pygame.RLEACCEL)
+    return Picture(check, surface, (float(left), float(top)), faces)
+
+
+def _light(solid: npt.NDArray[np.bool_]) -> npt.NDArray[np.float64]:
+    """How bright the top of each block of the segment is: shadows of the sun, and corners that see less of the sky."""
+    inner = slice(AROUND, AROUND + SEGMENT)
+    deep, wide = solid.shape[0], SEGMENT + 2 * AROUND
+    (sx, sy, sz), steps = SUN
+    dark = np.zeros((SEGMENT, SEGMENT, SEGMENT))
+    for step in steps:
+        i, j, k = round(sx * step * 0.6), round(sy * step * 0.6), max(1, round(sz * step * 0.6))
+        if abs(i) > AROUND or abs(j) > AROUND or k > AROUND:
+            break
+        ahead = solid[k : SEGMENT + k, AROUND + j : AROUND + j + SEGMENT, AROUND + i : AROUND + i + SEGMENT]
+        dark[: len(ahead)] = np.maximum(dark[: len(ahead)], ahead)
+    above = np.zeros((SEGMENT, wide, wide))
+    above[: deep - 1] = solid[1 : SEGMENT + 1]
+    near = sum(
+        above[:, AROUND + j : AROUND + j + SEGMENT, AROUND + i : AROUND + i + SEGMENT]
+        for i in (-1, 0, 1) for j in (-1, 0, 1) if i or j
+    )  # fmt: skip
+    height = np.arange(SEGMENT)[:, None, None] / SEGMENT
+    light: npt.NDArray[np.float64] = (0.86 + 0.34 * height) * (1 - 0.26 * dark) * (1 - 0.045 * near)
+    assert light.shape == solid[:SEGMENT, inner, inner].shape
+    return light
+
+
+def _faces(cell: Cell, kind: int, seen: Sequence[bool], light: float) -> list[Face]:
+    """The faces of a block that can be seen: top, south, east."""
+    x, y, z = cell
+    grain = 1 + ((x * 73 ^ y * 151 ^ z * 57) * 2654435761 >> 7) % 16 / 200 - 0.04
+    base = mixed(colour_of(kind), grain)
+    side = mixed(colour_of(SOIL_KIND), grain) if kind == GRASS_KIND else base
+    faces = []
+    if seen[1]:
+        a, b = (x, y), (x + 1, y)
+        faces.append(_upright(a, b, z, 1.0, mixed(side, 0.84)))
+        if kind == GRASS_KIND:
+            faces.append(_upright(a, b, z, 0.3, mixed(base, 0.8), 0.7))
+    if seen[2]:
+        a, b = (x + 1, y), (x + 1, y + 1)
+        faces.append(_upright(a, b, z, 1.0, mixed(side, 0.64)))
+        if kind == GRASS_KIND:
+            faces.append(_upright(a, b, z, 0.3, mixed(base, 0.64), 0.7))
+    if seen[0]:
+        faces.append(Face(top_of(cell), mixed(base, light) if light <= 1 else mixed(base, 2 - light, (255, 255, 220))))
+    return faces
+
+
+def _upright(a: Point, b: Point, z: float, height: float, colour: Colour, above: float = 0.0) -> Face:
+    """A strip of a side, between two corners on the ground, so high and so far above its foot."""
+    low, high = z + above, z + above + height
+    return Face((project(*a, low), project(*b, low), project(*b, high), project(*a, high)), colour)

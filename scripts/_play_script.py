@@ -1,0 +1,93 @@
+"""A player without hands, for tests and for the picture in the README: walks, jumps, builds, sees a hand-over."""
+
+import math
+
+from _play_window import FIRST_KIND, Window, Wish
+from client_sdk.events import Answered, Happened
+from client_sdk.picture import View
+from scripts.examples.tag_brain import TagPlayer
+from shared.checks import Cell
+from shared.inputs import JUMP, MOVE_MAX
+
+TOWER = ((2, 0), (2, -1), (2, -2))
+"""Where blocks are placed, from the player; one, two and three high."""
+LAG_S = 0.15
+TOGETHER = 5
+"""So many figures should be in the picture."""
+PATIENCE_S = 45.0
+
+
+class Script:
+    """What is done so far; the picture is taken at a good moment after a hand-over."""
+
+    def __init__(self, path: str) -> None:
+        self.done: dict[str, float] = {}
+        """What has been seen to happen, with how far, how high, how many."""
+        self._path = path
+        self._plan: list[Cell] = []
+        self._asked: set[int] = set()
+        self._player = TagPlayer()
+        self._start: tuple[float, float, float] | None = None
+        self._began = self._placed_at = self._tagged_at = 0.0
+
+    def __call__(self, window: Window, view: View, now: float) -> Wish:
+        for event in window.events:
+            if isinstance(event, Answered) and event.number in self._asked and event.done:
+                self.done["placed"] = self.done.get("placed", 0) + 1
+            if isinstance(event, Happened) and event.name == "tagged" and "placed" in self.done:
+                self.done["tagged"] = self.done.get("tagged", 0) + 1
+                self._tagged_at = now
+        if view.me is None:
+            return 0.0, 0.0, False
+        place = view.me.position
+        if self._start is None:
+            self._start, self._began = place, now
+            window.core.lag_s, window.ghost = LAG_S, True
+        if now - self._began < 2.0:  # has fallen to the ground, and walks towards the middle
+            if now - self._began < 1.0:
+                self._start = place
+            self.done["walked"] = math.dist(place[:2], self._start[:2])
+            x, y = 32 - place[0], 32 - place[1]
+            length = math.hypot(x, y) or 1.0
+            return (x / length, y / length, False) if now - self._began > 1.0 else (0.0, 0.0, False)
+        if self.done.get("jumped", 0.0) < 0.5 or now - self._began < 3.5:
+            self._start = min(self._start, place, key=lambda each: each[2]) if "jumped" in self.done else place
+            self.done["jumped"] = max(self.done.get("jumped", 0.0), place[2] - self._start[2])
+            return 0.0, 0.0, now - self._began < 3.0
+        if not self._plan and "placed" not in self.done:
+            x, y, z = (int(part // 1) for part in place)
+            self._plan = [(x + i, y + j, z + k) for n, (i, j) in enumerate(TOWER) for k in range(n + 1)]
+            self._placed_at = now
+        if self._plan and now > self._placed_at:
+            self._placed_at = now + 0.15
+            self._asked.add(window.edit(self._plan[0], FIRST_KIND + len(self._plan) % 3))
+            self._plan.pop(0)
+        if self._plan:
+            return 0.0, 0.0, False
+        self._take_picture(window, view, now)
+        return self._play(window)
+
+    def _play(self, window: Window) -> Wish:
+        """Plays tag, like everybody else."""
+        prediction = window.core.prediction
+        assert prediction is not None
+        if window.core.entity not in prediction.predicted:
+            return 0.0, 0.0, False
+        self._player.learn(prediction.attributes)
+        wish = self._player(prediction.predicted, window.core.entity)
+        return wish.move_x / MOVE_MAX, wish.move_y / MOVE_MAX, bool(wish.buttons & JUMP)
+
+    def _take_picture(self, window: Window, view: View, now: float) -> None:
+        """Soon after a hand-over, with many in sight and on the move; or else as it comes."""
+        if "tagged" not in self.done or view.me is None:
+            return
+        me, ghost = view.me.position, window.core.prediction
+        assert ghost is not None
+        behind = math.dist(ghost.confirmed.position(view.me.entity), me)
+        room = min((math.dist(figure.position, me) for figure in view.others), default=9.0)
+        near = sum(window.shown(figure.position) for figure in (view.me, *view.others))
+        good = near >= TOGETHER and behind > 0.7 and room > 1.8 and 0.4 < now - self._tagged_at < 3
+        if good or now - self._began > PATIENCE_S:
+            self.done["in sight"] = len(view.others) + 1
+            window.save(self._path)
+            window.over = "the script has ended"

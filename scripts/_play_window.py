@@ -1,0 +1,265 @@
+"""The window: a client's picture of the world, and the keyboard and mouse of who plays."""
+
+import math
+from collections.abc import Mapping
+from typing import Any, Protocol
+
+import pygame
+
+from _play_figures import INK, OWN, TONES, WHITE, Actor, draw_ghost, label, screen
+from _play_hud import Hud, network_lines
+from _play_iso import CHOICE, Colour, Ground, Point, colour_of, project, target_of, top_of
+from _play_lag import LaggedCore
+from client_sdk.client import Client
+from client_sdk.events import Answered, Diverged, Event, Happened, Left
+from client_sdk.picture import Figure, View
+from shared.checks import Cell, Vec
+from shared.edits import REACH_BLOCKS
+from shared.scene import Scene
+
+SIZE = 1280, 800
+SKY = (122, 184, 232), (222, 240, 250)
+FIRST_KIND = 7
+LAG_STEP_S, LAG_MAX_S = 0.05, 1.0
+Wish = tuple[float, float, bool]
+"""A direction (east, north), and whether to jump."""
+KEYS: dict[int, Point] = {
+    pygame.K_w: (-1, 1), pygame.K_UP: (-1, 1), pygame.K_s: (1, -1), pygame.K_DOWN: (1, -1),
+    pygame.K_d: (1, 1), pygame.K_RIGHT: (1, 1), pygame.K_a: (-1, -1), pygame.K_LEFT: (-1, -1),
+}  # fmt: skip
+"""Up on the screen is north-west."""
+
+
+class Pilot(Protocol):
+    """Who plays: a person at the keyboard, or a script."""
+
+    def __call__(self, window: "Window", view: View, now: float) -> Wish:
+        """The wish from now on; called once per frame while playing."""
+        ...
+
+
+class Window:
+    """One player's window.
+
+    Args:
+        client: connects, or has joined.
+        core: its core, whose latency the keys [ and ] change.
+        pilot: decides where to go.
+        title: shown above.
+    """
+
+    def __init__(self, client: Client, core: LaggedCore, pilot: Pilot, title: str) -> None:
+        self.client, self.core, self.title = client, core, title
+        self.events: list[Event] = []
+        """Those of the latest frame."""
+        self.actors: list[Actor] = []
+        """Everybody in sight."""
+        self.ghost = False
+        self.kind = FIRST_KIND
+        self.over = ""
+        """Why it is over."""
+        self._pilot = pilot
+        self._screen = pygame.display.set_mode(SIZE, pygame.RESIZABLE)
+        self._ground, self._hud = Ground(), Hud()
+        self._camera: Point | None = None
+        self._looks: dict[int, int] = {}
+        self._tones: dict[int, int] = {}
+        self._at = 0.0
+        pygame.display.set_caption(f"{title} - Sovereign Netcode")
+
+    # -- a frame ---------------------------------------------------------------------------------------------
+
+    def frame(self, now: float) -> None:
+        """Reads, wishes, predicts and draws."""
+        self.events = self.client.poll(now)
+        view = self.client.view(now)
+        for event in self.events:
+            self._take(event, view, now)
+        for key in pygame.event.get():
+            self._handle(key, view)
+        if self.client.playing:
+            x, y, jump = self._pilot(self, view, now)
+            self.client.set_input(x, y, jump=jump)
+        self.client.update(now)
+        self._draw(self.client.view(now), now)
+        self._at = now
+
+    def edit(self, cell: Cell, kind: int) -> int:
+        """Places (kind 1 to 255) or removes (0) a block; the number of the answer."""
+        return self.client.edit(*cell, kind)
+
+    def save(self, path: str) -> None:
+        """Saves what is shown as a picture."""
+        pygame.image.save(self._screen, path)
+
+    def shown(self, place: Vec, margin: int = 120) -> bool:
+        """Whether a place, in blocks, is well within the window."""
+        area = self._screen.get_rect().inflate(-2 * margin, -2 * margin)
+        return self._camera is not None and area.collidepoint(screen(place, self._camera))
+
+    # -- what comes in ---------------------------------------------------------------------------------------
+
+    def _take(self, event: Event, view: View, now: float) -> None:
+        match event:
+            case Left(reason=reason):
+                self.over = self.over or reason
+            case Happened(name=name, data=data):
+                self._hud.say(_sentence(name, data, view), now)
+            case Answered(done=False, verdict=verdict):
+                self._hud.say(f"not possible: {verdict}", now)
+            case Diverged(what=what):
+                self._hud.say(f"ALARM, the two worlds differ: {what}", now)
+            case _:
+                pass
+
+    def _handle(self, event: pygame.event.Event, view: View) -> None:
+        if event.type == pygame.QUIT or (event.type == pygame.KEYDOWN and event.key == pygame.K_ESCAPE):
+            self.over = "closed by the player"
+        elif event.type == pygame.KEYDOWN:
+            if event.key == pygame.K_g:
+                self.ghost = not self.ghost
+            elif event.key == pygame.K_LEFTBRACKET:
+                self.core.lag_s = max(self.core.lag_s - LAG_STEP_S, 0.0)
+            elif event.key == pygame.K_RIGHTBRACKET:
+                self.core.lag_s = min(self.core.lag_s + LAG_STEP_S, LAG_MAX_S)
+            elif pygame.K_1 <= event.key < pygame.K_1 + len(CHOICE):
+                self.kind = FIRST_KIND + event.key - pygame.K_1
+        elif event.type == pygame.MOUSEBUTTONDOWN and event.button in (1, 3):
+            found = self._pointed(view)
+            if found is not None and self.client.playing:
+                self.edit(found[0] if event.button == 1 else found[1], 0 if event.button == 1 else self.kind)
+
+    def _pointed(self, view: View) -> tuple[Cell, Cell] | None:
+        """The block under the mouse that is within reach, and the free cell before it."""
+        prediction = self.core.prediction
+        if prediction is None or view.me is None or self._camera is None:
+            return None
+        x, y = pygame.mouse.get_pos()
+        found = target_of(prediction.predicted.blocks, (x + self._camera[0], y + self._camera[1]), view.me.position[2])
+        if found is None:
+            return None
+        centre = [part + 0.5 for part in found[0]]
+        return found if math.dist(centre, view.me.position) <= REACH_BLOCKS else None
+
+    # -- what is drawn ---------------------------------------------------------------------------------------
+
+    def _draw(self, view: View, now: float) -> None:
+        target, prediction, scene = self._screen, self.core.prediction, self.core.scene
+        target.blit(_sky(target.get_size()), (0, 0))
+        if view.me is None or prediction is None or scene is None:
+            plate = label("fetching the world ...", INK, WHITE, 30)
+            target.blit(plate, plate.get_rect(center=target.get_rect().center))
+            pygame.display.flip()
+            return
+        blocks = prediction.predicted.blocks
+        first = not self._ground.pictures
+        self._ground.refresh(blocks, 999 if first else 1)
+        camera = self._follow(view.me.position, now)
+        self._ground.draw(target, camera)
+        pointed = self._pointed(view)
+        if pointed is not None:
+            rim = [(round(x - camera[0]), round(y - camera[1])) for x, y in top_of(pointed[0])]
+            pygame.draw.polygon(target, WHITE, rim, 2)
+        self.actors = self._cast(view, scene)
+        for actor in sorted(self.actors, key=lambda actor: actor.depth):
+            actor.draw(target, camera, self._ground, blocks.get, self._look(actor.figure))
+        if self.ghost and view.me.entity in prediction.confirmed:
+            at = prediction.confirmed.position(view.me.entity)
+            draw_ghost(target, camera, at, view.me.position, self._look(view.me))
+        for actor in self.actors:
+            actor.draw_name(target, camera)
+        ends = self.client.shared.get("ends")
+        left_s = max(ends - view.tick, 0.0) / scene.tick_rate if isinstance(ends, int) else None
+        self._hud.draw(
+            target,
+            now,
+            title=self.title,
+            left_s=left_s,
+            actors=self.actors,
+            network=network_lines(self.client, now, self.core.lag_s),
+            choice=colour_of(self.kind),
+        )
+        pygame.display.flip()
+
+    def _cast(self, view: View, scene: Scene) -> list[Actor]:
+        """The figures in sight, with what the game says of them."""
+        it = scene.index_of.get("it")
+        found = []
+        for figure in (*view.others, *([view.me] if view.me else [])):
+            own = figure is view.me
+            safe = figure.attributes.get("safe", 0)
+            safe = isinstance(safe, int) and safe > view.tick
+            tone = OWN if own else self._tone(figure.entity)
+            found.append(Actor(figure, tone, it=figure.template == it, own=own, safe=safe))
+        seen = {actor.figure.entity for actor in found}
+        self._tones = {entity: tone for entity, tone in self._tones.items() if entity in seen}
+        return found
+
+    def _tone(self, entity: int) -> Colour:
+        """A colour that stays while its figure is in sight, and that nobody else has while there are enough."""
+        if entity not in self._tones:
+            counts = [0] * len(TONES)
+            for tone in self._tones.values():
+                counts[tone] += 1
+            self._tones[entity] = counts.index(min(counts))
+        return TONES[self._tones[entity]]
+
+    def _look(self, figure: Figure) -> int:
+        """Where a figure looks, in eighths of a turn on the screen: where it went last."""
+        vx, vy, _ = figure.velocity
+        if vx or vy:
+            self._looks[figure.entity] = round(math.atan2(vx - vy, vx + vy) * 4 / math.pi) % 8
+        return self._looks.get(figure.entity, 2)
+
+    def _follow(self, me: Vec, now: float) -> Point:
+        """The camera goes after the own figure, gently."""
+        width, height = self._screen.get_size()
+        x, y = project(*me)
+        wanted = x - width / 2, y - height / 2 - 20
+        if self._camera is None:
+            self._camera = wanted
+        share = 1 - math.exp(-6 * max(now - self._at, 0.0))
+        old = self._camera
+        self._camera = old[0] + (wanted[0] - old[0]) * share, old[1] + (wanted[1] - old[1]) * share
+        return self._camera
+
+
+def keyboard(window: Window, view: View, now: float) -> Wish:
+    """What the keys that are held say."""
+    held = pygame.key.get_pressed()
+    x = sum(way[0] for key, way in KEYS.items() if held[key])
+    y = sum(way[1] for key, way in KEYS.items() if held[key])
+    length = math.hypot(x, y) or 1.0
+    return x / length, y / length, held[pygame.K_SPACE]
+
+
+_skies: dict[tuple[int, int], pygame.Surface] = {}
+
+
+def _sky(size: tuple[int, int]) -> pygame.Surface:
+    """A gradient from above to below."""
+    if size not in _skies:
+        strip = pygame.Surface((1, 2))
+        strip.set_at((0, 0), SKY[0])
+        strip.set_at((0, 1), SKY[1])
+        _skies.clear()
+        _skies[size] = pygame.transform.smoothscale(strip.convert(), size)
+    return _skies[size]
+
+
+def _sentence(name: str, data: Any, view: View) -> str:
+    """What has happened, in words; other games than tag say it as it came."""
+    figures = {figure.entity: figure for figure in (*view.others, *([view.me] if view.me else []))}
+
+    def called(entity: Any) -> str:
+        figure = figures.get(entity)
+        return str(figure.attributes.get("name", f"#{entity}")) if figure else "somebody"
+
+    match name, data:
+        case "tagged", {"by": by, "who": who}:
+            return f"{called(by)} tagged {called(who)}"
+        case "round", {"winner": winner}:
+            return f"{called(winner)} wins the round"
+    if isinstance(data, Mapping):
+        return name + "".join(f"  {key} {value}" for key, value in data.items())
+    return f"{name} {'' if data is None else data}"

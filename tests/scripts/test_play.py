@@ -1,0 +1,215 @@
+"""The window of the game: what is seen where, what keys and mouse do, and a whole session without a display."""
+
+import os
+import random
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from client_sdk.client import Client
+from shared import kernels
+from shared.blocks import Blocks
+from shared.inputs import NEUTRAL, Input
+from shared.scene import load_scene
+from shared.world import World
+from tests.match import Match, Player
+from tests.match import Path as Line
+
+ROOT = Path(__file__).resolve().parents[2]
+sys.path.insert(0, str(ROOT / "scripts"))
+os.environ["SDL_VIDEODRIVER"] = "dummy"
+os.environ["PYGAME_HIDE_SUPPORT_PROMPT"] = "1"
+
+import pygame  # noqa: E402
+
+import _play_iso as iso  # noqa: E402
+from _play_lag import LaggedCore  # noqa: E402
+from _play_window import SIZE, Window, keyboard  # noqa: E402
+from scripts.examples.tag import Tag  # noqa: E402
+
+
+@pytest.fixture(autouse=True)
+def _display() -> Iterator[None]:
+    pygame.display.init()
+    pygame.font.init()
+    pygame.display.set_mode(SIZE)
+    yield
+    pygame.display.quit()
+
+
+def blocks(*kinds: tuple[int, int, int, int]) -> Blocks:
+    """An empty segment with some blocks."""
+    world = World(load_scene("flat"))
+    world.load_segment((0, 0, 0), np.zeros(32768, np.uint8))
+    for x, y, z, kind in kinds:
+        world.set_block(x, y, z, kind)
+    return world.blocks
+
+
+@pytest.mark.parametrize("place", [(0.0, 0.0, 0.0), (3.5, -2.25, 7.0), (100.0, 40.0, 31.0)])
+def test_a_pixel_is_seen_where_it_is(place: tuple[float, float, float]) -> None:
+    assert iso.unproject(*iso.project(*place), place[2]) == pytest.approx(place[:2])
+
+
+def test_the_mouse_points_at_the_first_block_and_the_free_cell_before_it() -> None:
+    found = blocks((10, 10, 5, 1), (12, 8, 7, 1))  # the second one hides most of the first
+    assert iso.target_of(found, iso.project(12.5, 8.5, 8), 6.0) == ((12, 8, 7), (12, 8, 8))
+    assert iso.target_of(found, iso.project(13, 8.5, 7.5), 6.0) == ((12, 8, 7), (13, 8, 7))
+    assert iso.target_of(found, iso.project(12.5, 8, 7.5), 6.0) == ((12, 8, 7), (12, 7, 7))
+    assert iso.target_of(found, iso.project(10.5, 10.5, 6), 6.0) == ((12, 8, 7), (12, 8, 8))
+    assert iso.target_of(found, iso.project(10.5, 10, 5.1), 6.0) == ((10, 10, 5), (10, 9, 5))
+    assert iso.target_of(found, iso.project(20, 20, 6), 6.0) is None
+
+
+def test_only_what_has_changed_is_drawn_anew() -> None:
+    world = World(load_scene("meadow"))
+    world.load_terrain()
+    ground = iso.Ground()
+    ground.refresh(world.blocks, 99)
+    before = dict(ground.pictures)
+    assert len(before) == 4
+    ground.refresh(world.blocks, 99)
+    assert ground.pictures == before
+    world.set_block(40, 10, 30, 4)  # far from the rim: nobody else's shadow
+    ground.refresh(world.blocks, 0)
+    assert ground.pictures == before, "not more than was asked for"
+    ground.refresh(world.blocks, 1)
+    assert [segment for segment in before if ground.pictures[segment] is not before[segment]] == [(1, 0, 0)]
+    world.unload_segment((1, 1, 0))
+    ground.refresh(world.blocks, 99)
+    assert (1, 1, 0) not in ground.pictures
+
+
+def test_faces_are_those_that_can_be_seen() -> None:
+    ground = iso.Ground()
+    ground.refresh(blocks((5, 5, 5, 1), (6, 5, 5, 1), (5, 5, 6, 1)), 1)
+    faces = {cell: len(found) for cell, found in ground.pictures[(0, 0, 0)].faces.items()}
+    assert faces == {(5, 5, 5): 1, (6, 5, 5): 3, (5, 5, 6): 3}
+
+
+def test_what_stands_before_something_covers_it() -> None:
+    target = pygame.Surface(SIZE)
+    for wall, hides in (((7, 3, 0), True), ((7, 3, 1), True), ((3, 7, 0), False), ((5, 5, 3), False)):
+        ground = iso.Ground()
+        ground.refresh(blocks((*wall, 4)), 1)
+        low, high = (5.2, 4.2, 0.0), (5.8, 4.8, 1.8)
+        assert ground.cover(target, (-400.0, -400.0), low, high) == hides, wall
+
+
+class Idle:
+    """The match carries the messages."""
+
+    def poll(self, now: float) -> None:
+        pass
+
+    send = poll
+
+    def close(self, timeout: float) -> None:
+        pass
+
+
+class Session:
+    """A window on a player of a match of tag."""
+
+    def __init__(self, latency_s: float = 0.01) -> None:
+        self.match = Match(load_scene("meadow"), 5, rules=Tag())
+        self.core = LaggedCore("Ann")
+        self.player: Player = self.match.join(self._wish, Line(latency_s), self.core)
+        self.window = Window(Client(self.core, Idle()), self.core, keyboard, "Tag")
+        self.run(2)
+
+    def _wish(self, core: object, rng: random.Random) -> Input:
+        return self.core.wish if self.core.state == "playing" else NEUTRAL
+
+    def run(self, seconds: float) -> None:
+        """So long, at 20 frames a second."""
+        for _ in range(round(20 * seconds)):
+            self.match.run(0.05)
+            self.window.frame(self.player.local)
+
+    def press(self, key: int) -> None:
+        pygame.event.post(pygame.event.Event(pygame.KEYDOWN, key=key))
+        self.run(0.05)
+
+    def colours(self) -> int:
+        """How many different ones are in the window."""
+        surface = pygame.display.get_surface()
+        assert surface is not None
+        pixels = pygame.surfarray.array3d(surface).reshape(-1, 3)
+        return len(np.unique(pixels, axis=0))
+
+
+def test_everybody_is_in_the_picture_and_the_keys_do_what_they_say() -> None:
+    session = Session()
+    window, core = session.window, session.core
+    assert core.state == "playing"
+    assert {actor.figure.entity for actor in window.actors} == set(session.match.game.stage.entities())
+    assert sum(actor.own for actor in window.actors) == sum(actor.it for actor in window.actors) == 1
+    assert len({actor.tone for actor in window.actors}) == len(window.actors) == Tag.players_min
+    assert session.colours() > 200
+    session.press(pygame.K_g)
+    assert window.ghost
+    session.press(pygame.K_3)
+    assert window.kind == 9
+    session.press(pygame.K_LEFTBRACKET)
+    assert core.lag_s == 0
+    session.press(pygame.K_RIGHTBRACKET)
+    session.press(pygame.K_RIGHTBRACKET)
+    assert core.lag_s == 0.1
+    session.run(3)
+    assert core.stats.divergences == 0
+    assert "closed" not in window.over
+    session.press(pygame.K_ESCAPE)
+    assert "closed" in window.over
+
+
+def test_the_mouse_places_and_digs(monkeypatch: pytest.MonkeyPatch) -> None:
+    session = Session()
+    window, world = session.window, session.match.game.world
+    x, y, _ = (int(part // 1) for part in world.position(session.core.entity))
+    ground = next(k for k in range(31, 0, -1) if world.blocks.get(x + 2, y - 2, k)), x + 2, y - 2
+    spot = ground[1] + 0.5, ground[2] + 0.5, ground[0] + 1.0
+    camera = window._camera
+    assert camera is not None
+    at = tuple(int(a - b) for a, b in zip(iso.project(*spot), camera, strict=True))
+    monkeypatch.setattr(pygame.mouse, "get_pos", lambda: at)
+    for button, kind in ((3, window.kind), (1, 0)):
+        pygame.event.post(pygame.event.Event(pygame.MOUSEBUTTONDOWN, button=button))
+        session.run(0.5)
+        if kind:
+            assert world.blocks.get(ground[1], ground[2], ground[0] + 1) == kind
+    assert world.blocks.get(ground[1], ground[2], ground[0] + 1) == 0
+
+
+def test_the_latency_of_the_keys_is_as_much_as_they_say() -> None:
+    match = Match(load_scene("flat"), 5)
+    core = LaggedCore("Ann")
+    core.lag_s = 0.2
+    match.join(lambda core, rng: NEUTRAL, Line(0.01), core).frame_s = 0.001
+    match.run(5)
+    assert core.state == "playing"
+    assert 0.22 <= core.clock.rtt_s < 0.225
+    assert core.stats.corrections == 0
+
+
+@pytest.mark.e2e
+@pytest.mark.slow
+@pytest.mark.skipif(not kernels.available(), reason="with plain Python the bots take all the time there is")
+def test_a_scripted_session_walks_jumps_builds_and_sees_a_hand_over(tmp_path: Path) -> None:
+    out = tmp_path / "out.png"
+    command = [sys.executable, "scripts/_play.py", "--script-demo", str(out)]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "Traceback" not in done.stderr
+    seen = {
+        what: float(much) for what, much in (part.rsplit(" ", 1) for part in done.stdout.split("\n")[-2].split(", "))
+    }
+    assert seen["walked"] > 1
+    assert seen["jumped"] > 1
+    assert seen["placed"] >= 3
+    assert seen["tagged"] >= 1
+    assert pygame.image.load(out).get_size() == SIZE
