@@ -12,7 +12,7 @@ no queue has grown: with one, a path of 200 ms that loses 2 % of its packets get
 Where that holds back most snapshots for a second, it is no loss but the path that is narrow. Then the queue is of
 one's own making, and there should be none: one round trip and two ticks may be on the way when a snapshot is sent, and
 it may be as large as the path carries in four ticks. So a client gets small snapshots often, its own segment in each,
-instead of large ones rarely: at 30 kb/s for a view of 90, they are 0.25 s old instead of 0.56.
+instead of large ones rarely: at 30 kb/s for a view of 90, they are 0.28 s old instead of 0.56.
 
 The round trip is measured of snapshots before which nothing was on the way. Where that never happens because the
 path is full, sending pauses once a minute until it is empty, or a queue of one's own would pass for distance, and grow
