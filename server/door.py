@@ -22,6 +22,7 @@ SPARE_PER_ADDRESS = 4
 """and of one address."""
 BURST_S = 2.0
 RETRY_S = "2"
+NOBODY = ipaddress.IPv6Address("2000::")
 
 
 class Request(NamedTuple):
@@ -123,11 +124,14 @@ class Door:
         return True
 
     def _welcome(self, request: Request) -> bool:
-        """Only browsers send an origin, and they tell the truth about it."""
+        """Only browsers send an origin, and they tell the truth about it.
+
+        The own host is known by its address only: a name in `Host` may be one that somebody else has pointed here.
+        """
         if request.origin is None or "*" in self._origins:
             return True
-        origin = request.origin.lower()
-        return origin in self._origins or origin.partition("://")[2] == request.host.lower() != ""
+        origin, host = request.origin.lower(), request.host.lower()
+        return origin in self._origins or (_is_address(host) and origin.partition("://")[2] == host)
 
     def _limited(self, address: str) -> bool:
         return not (self.limits.loopback_exempt and is_loopback(address))
@@ -155,10 +159,16 @@ def network_of(address: str) -> str:
     return str(parsed) if parsed.version == 4 else str(int(parsed) >> 64)
 
 
+def _is_address(host: str) -> bool:
+    """Whether the `Host` of a request, with or without a port, is no name; `localhost` is none."""
+    bare = host[1:].partition("]")[0] if host.startswith("[") else host.partition(":")[0]
+    return bare == "localhost" or _parsed(bare) != NOBODY
+
+
 def _parsed(address: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address:
     """IPv4 in IPv6's clothes is IPv4. What is no address (of a peer that has gone already) is nobody's."""
     try:
         parsed = ipaddress.ip_address(address.partition("%")[0])
     except ValueError:
-        return ipaddress.IPv6Address("2000::")
+        return NOBODY
     return getattr(parsed, "ipv4_mapped", None) or parsed

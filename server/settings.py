@@ -51,7 +51,12 @@ class Settings:
         "private", Kind(str, "whose addresses get /stats and /metrics", choices=("none", "loopback", "private", "all"))
     )
     allowed_origins: tuple[str, ...] = setting(
-        (), Kind(tuple, "pages whose browsers may play, besides this host's own; * for all", "ORIGIN,...")
+        (),
+        Kind(
+            tuple,
+            "pages that browsers may play from, besides those at the server's own IP address; * for all",
+            "ORIGIN,...",
+        ),
     )
     restart_s: float = setting(2.0, Kind(float, "when the server ends, clients come back after so long", "S", 0, 3600))
     log_level: str = setting("info", Kind(str, "what goes to stderr", choices=LOG_LEVELS))

@@ -95,9 +95,13 @@ def test_ipv6_counts_by_the_network_that_one_customer_has() -> None:
     ("allowed", "origin", "host", "welcome"),
     [
         ((), None, "", True),
-        ((), "https://play.example", "play.example", True),
         ((), "http://localhost:8765", "localhost:8765", True),
-        ((), "https://PLAY.example", "play.example", True),
+        ((), "http://LOCALHOST", "localhost", True),
+        ((), "http://192.168.1.7:8765", "192.168.1.7:8765", True),
+        ((), "http://[::1]:8765", "[::1]:8765", True),
+        ((), "http://192.168.1.7:81", "192.168.1.7:8765", False),
+        ((), "http://evil.example:8765", "evil.example:8765", False),  # its name points to this machine
+        ((), "http://127.0.0.1.evil.example", "127.0.0.1.evil.example", False),
         ((), "https://evil.example", "play.example", False),
         ((), "https://play.example.evil", "play.example", False),
         ((), "http://play.example:81", "play.example", False),
