@@ -108,10 +108,11 @@ class Delivery:
         while room > 0 and (session.terrain_now or session.terrain_due):
             if session.terrain_now is None:
                 segment = next((segment for segment in session.terrain_due if session.sight.begun(segment)), None)
-                if segment is None:
+                blocks = None if segment is None else self._log.packed(segment)
+                if segment is None or blocks is None:
                     return
                 session.terrain_due.remove(segment)
-                session.terrain_now = (segment, self._log.packed(segment), 0)
+                session.terrain_now = (segment, blocks, 0)
             segment, packed, offset = session.terrain_now
             chunk = packed[offset : offset + self._limits.terrain_chunk_bytes]
             session.send(encode(Terrain(*segment, offset, len(packed), chunk)))

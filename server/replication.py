@@ -7,14 +7,14 @@ ticks behind, or has just begun to see the segment, gets a keyframe. Nothing is 
 
 from collections import defaultdict
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from server.faults import Faults
 from shared.blocks import offset_of, pack, segment_of
 from shared.checks import Cell
-from shared.layout import ID, X
+from shared.layout import ID, Int64s, X
 from shared.ring import Ring
 from shared.snapshot import KEYFRAME, ROW, checksum, encode_part, encode_rows, join_part
 from shared.units import BLOCK_SHIFT, SEGMENT_SHIFT
@@ -22,6 +22,9 @@ from shared.world import World
 
 HISTORY = 64
 """Ticks for which changes are kept."""
+PACKS_PER_TICK = 8
+"""So many segments are packed anew in a tick, 0.25 to 0.7 ms each: who joins where nobody was waits for terrain, not
+everybody for the tick."""
 CHECK_TICKS = 32
 """How often a segment in which something changes is sent with its checksum."""
 
@@ -30,14 +33,28 @@ class _Tick:
     """One tick's changes."""
 
     def __init__(self) -> None:
-        self.changed: dict[Cell, list[int]] = defaultdict(list)  # ids by segment
+        self.ids: list[int] = []  # of what has changed, in the order of segments
+        self.changed: dict[Cell, range] = {}  # where in them a segment's are
         self.gone: dict[Cell, list[int]] = defaultdict(list)
         self.edited: dict[Cell, set[int]] = defaultdict(set)  # block offsets by segment
         self.acted: set[int] = set()  # ids that the rules placed or threw
         self.said: dict[Cell, set[int]] = defaultdict(set)  # ids whose attributes are news in the segment
 
-    def segments(self) -> set[Cell]:
-        return self.changed.keys() | self.gone.keys() | self.edited.keys() | self.said.keys()
+    def changed_in(self, segment: Cell) -> list[int]:
+        span = self.changed.get(segment, range(0))
+        return self.ids[span.start : span.stop]
+
+    def more(self) -> set[Cell]:
+        """The segments of which there is more to tell than rows."""
+        return self.gone.keys() | self.edited.keys() | self.said.keys()
+
+
+class _Span(NamedTuple):
+    """The ticks after some tick, the segments in which anything changed, and those with `more`."""
+
+    ticks: list[_Tick]
+    segments: set[Cell]
+    more: set[Cell]
 
 
 class _Parts(dict[Cell, bytes]):
@@ -81,10 +98,14 @@ class ChangeLog:
         self._home: dict[int, Cell] = {
             entity: (x, y, z) for entity, (x, y, z) in zip(states[:, ID].tolist(), homes, strict=True)
         }
-        self._changed: dict[int, set[Cell] | None] = {}
+        self._known: Int64s = np.zeros(
+            (0, 4), np.int64
+        )  # by row of the world: id and segment when it was recorded last
+        self._spans: dict[int, _Span | None] = {}
         self._parts: dict[int, _Parts] = {}
         self._packed: dict[Cell, tuple[int, bytes]] = {}
-        self._latest: dict[Cell, bytes] | None = None
+        self._packs_left = PACKS_PER_TICK
+        self._latest: bytes | None = None
         """The packed rows of the entities that the newest tick changed, until something is removed."""
 
     def segment(self, entity: int) -> Cell:
@@ -114,41 +135,43 @@ class ChangeLog:
         """Takes in what the step has changed: all of it is packed at once, in the order of segments.
 
         So a part of the newest tick, which nearly all are, is a slice of that: 4.9 us per client and tick became 1.7.
+        And Python looks at those only that are new to their segment: of 10,000 walkers in 2,300 segments among 100,000
+        entities, 11.3 ms became 5.0, and with a full garbage collection in it 53 ms became 22.
         """
-        now, rows, homes = self._now, self._world.changed, self._home
+        now, homes = self._now, self._home
+        indices = self._world.changed_rows
+        rows = self._world.matrix[indices]
+        alive = rows[:, ID] != 0
+        indices, rows = indices[alive], rows[alive]
         cells = rows[:, X : X + 3] >> (BLOCK_SHIFT + SEGMENT_SHIFT)
         order = np.lexsort((rows[:, ID], *cells.T))
-        rows, cells = rows[order], cells[order]
-        ids, packed = rows[:, ID].tolist(), encode_rows(rows, now.acted)
+        indices, rows, cells = indices[order], rows[order], cells[order]
+        now.ids, self._latest = rows[:, ID].tolist(), encode_rows(rows, now.acted)
         starts = np.flatnonzero(np.any(cells[1:] != cells[:-1], axis=1)) + 1
-        bounds = [0, *starts.tolist(), len(ids)] if ids else [0]
-        self._latest = {}
-        for start, stop, cell in zip(bounds, bounds[1:], cells[bounds[:-1]].tolist(), strict=False):
-            segment = (cell[0], cell[1], cell[2])
-            here = now.changed[segment] = ids[start:stop]
-            self._latest[segment] = packed[start * ROW.itemsize : stop * ROW.itemsize]
-            for entity in here:
-                home = homes.get(entity)
-                if home != segment:
-                    if home is not None:
-                        now.gone[home].append(entity)
-                    homes[entity] = segment
-                    if entity in self._attributes:
-                        now.said[segment].add(entity)
+        bounds = [0, *starts.tolist(), len(rows)] if len(rows) else [0]
+        firsts = map(tuple, cells[bounds[:-1]].tolist())
+        now.changed = dict(zip(firsts, map(range, bounds, bounds[1:]), strict=True))
+        for entity, x, y, z in self._news(indices, np.column_stack((rows[:, ID], cells))):
+            home, segment = homes.get(entity), (x, y, z)
+            if home != segment:
+                if home is not None:
+                    now.gone[home].append(entity)
+                homes[entity] = segment
+                if entity in self._attributes:
+                    now.said[segment].add(entity)
         for entity in self._said & homes.keys():
             now.said[homes[entity]].add(entity)
         self._said.clear()
         self._ticks.put(self._world.tick, now)
         self._now = _Tick()
         self._parts.clear()
-        self._changed.clear()
+        self._spans.clear()
+        self._packs_left = PACKS_PER_TICK
 
     def changed_segments(self, since: int) -> set[Cell] | None:
         """The segments in which anything changed after tick `since`; None: too long ago to tell."""
-        if since not in self._changed:
-            ticks = self._since(since)
-            self._changed[since] = None if ticks is None else set().union(*(tick.segments() for tick in ticks))
-        return self._changed[since]
+        span = self._span(since)
+        return None if span is None else span.segments
 
     def since(self, since: int) -> Mapping[Cell, bytes]:
         """Each segment's encoded changes after tick `since`, `KEYFRAME` or at most `HISTORY` ago; empty: none."""
@@ -161,23 +184,40 @@ class ChangeLog:
         """A part, made anew: ask `since` for one that is shared."""
         if since == KEYFRAME:
             return self._keyframe(segment)
-        changed = self.changed_segments(since)
-        assert changed is not None, "lost track"
-        return self._changes(segment, since) if segment in changed else b""
+        span = self._span(since)
+        assert span is not None, "lost track"
+        return self._changes(segment, since, span) if segment in span.segments else b""
 
-    def packed(self, segment: Cell) -> bytes:
-        """A segment's blocks as they are, packed."""
+    def packed(self, segment: Cell) -> bytes | None:
+        """A segment's blocks as they are, packed; None: that has to wait for another tick."""
         digest = self._world.blocks.digest(segment)
         known = self._packed.get(segment)
         if known is None or known[0] != digest:
+            if not self._packs_left:
+                return None
+            self._packs_left -= 1
             known = self._packed[segment] = (digest, pack(self._world.blocks.segment(segment)))
         return known[1]
 
-    def _since(self, since: int) -> list[_Tick] | None:
-        if self._world.tick - since > HISTORY:
-            return None
-        ticks = [self._ticks.get(tick) for tick in range(since + 1, self._world.tick + 1)]
-        return [tick for tick in ticks if tick is not None]
+    def _news(self, indices: Int64s, now: Int64s) -> list[list[int]]:
+        """Those of the rows (`now`: id and segment) that were not there the last time; from now on they are known."""
+        if len(self._known) < len(self._world.matrix):
+            more = np.zeros((2 * len(self._world.matrix), 4), np.int64)
+            more[: len(self._known)] = self._known
+            self._known = more
+        news: list[list[int]] = now[np.any(self._known[indices] != now, axis=1)].tolist()
+        self._known[indices] = now
+        return news
+
+    def _span(self, since: int) -> _Span | None:
+        if since not in self._spans:
+            newest, span = self._world.tick, None
+            if newest - since <= HISTORY:
+                ticks = [tick for at in range(since + 1, newest + 1) if (tick := self._ticks.get(at)) is not None]
+                more = set().union(*(tick.more() for tick in ticks))
+                span = _Span(ticks, more.union(*(tick.changed for tick in ticks)), more)
+            self._spans[since] = span
+        return self._spans[since]
 
     def _keyframe(self, segment: Cell) -> bytes:
         if segment in self._world.blocks:
@@ -187,16 +227,17 @@ class ChangeLog:
             rows = self._world.rows(sorted(strays))
         return encode_part(segment, KEYFRAME, rows, attributes=self._of(rows[:, ID].tolist()))
 
-    def _changes(self, segment: Cell, since: int) -> bytes:
-        ticks = self._since(since)
-        assert ticks is not None
-        gone = {entity for tick in ticks for entity in tick.gone.get(segment, ()) if self._home.get(entity) != segment}
-        edited = {offset for tick in ticks for offset in tick.edited.get(segment, ())}
+    def _changes(self, segment: Cell, since: int, span: _Span) -> bytes:
         due = (self._world.tick + hash(segment)) % CHECK_TICKS == 0 and segment in self._world.blocks
         check = checksum(self._world, segment) if due else 0
+        ticks = span.ticks
+        rows = self._rows(segment, since, ticks)
+        if segment not in span.more:
+            return join_part(segment, since, rows, check=check)
+        gone = {entity for tick in ticks for entity in tick.gone.get(segment, ()) if self._home.get(entity) != segment}
+        edited = {offset for tick in ticks for offset in tick.edited.get(segment, ())}
         kinds = self._kinds(segment, sorted(edited))
         said = {entity for tick in ticks for entity in tick.said.get(segment, ()) if self._home.get(entity) == segment}
-        rows = self._rows(segment, since, ticks)
         return join_part(segment, since, rows, sorted(gone), kinds, check, self._of(sorted(said)))
 
     def _of(self, entities: list[int]) -> list[Any]:
@@ -210,10 +251,9 @@ class ChangeLog:
     def _rows(self, segment: Cell, since: int, ticks: list[_Tick]) -> bytes:
         """What changed and is still there, packed."""
         if self._latest is not None and since == self._world.tick - 1:
-            return self._latest.get(segment, b"")
-        here = {
-            entity for tick in ticks for entity in tick.changed.get(segment, ()) if self._home.get(entity) == segment
-        }
+            span = ticks[-1].changed.get(segment, range(0))
+            return self._latest[span.start * ROW.itemsize : span.stop * ROW.itemsize]
+        here = {entity for tick in ticks for entity in tick.changed_in(segment) if self._home.get(entity) == segment}
         acted = {entity for tick in ticks for entity in tick.acted if entity in here}
         return encode_rows(self._world.rows(sorted(here)), acted)
 

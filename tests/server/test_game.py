@@ -176,7 +176,9 @@ def test_an_endless_plea_for_everything_anew_is_granted_rarely(table: Table) -> 
     for _ in range(64):
         link.say(Resync(), Resync())
         table.tick()
-    assert table.game.counters.terrain_bytes - before < 3 * len(table.game.log.packed((0, 0, 0)))
+    packed = table.game.log.packed((0, 0, 0))
+    assert packed is not None
+    assert table.game.counters.terrain_bytes - before < 3 * len(packed)
 
 
 # -- any client ----------------------------------------------------------------------------------------------

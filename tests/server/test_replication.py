@@ -8,7 +8,7 @@ import pytest
 
 from server.game import Game
 from server.limits import Limits
-from server.replication import HISTORY, ChangeLog
+from server.replication import HISTORY, PACKS_PER_TICK, ChangeLog
 from server.session import Session
 from shared.blocks import Kinds, unpack
 from shared.checks import Cell
@@ -192,8 +192,19 @@ def test_one_encoding_serves_all_who_ask_for_the_same(told: Recorded) -> None:
     assert told.log.packed(HOME) is told.log.packed(HOME)
     before = told.log.packed(HOME)
     told.edit(1, 1, 1, 1)
-    assert told.log.packed(HOME) != before
-    assert unpack(told.log.packed(HOME)).reshape(SEGMENT, SEGMENT, SEGMENT)[1, 1, 1] == 1
+    after = told.log.packed(HOME)
+    assert before != after is not None
+    assert unpack(after).reshape(SEGMENT, SEGMENT, SEGMENT)[1, 1, 1] == 1
+
+
+def test_a_tick_packs_few_segments_and_the_next_one_packs_on(told: Recorded) -> None:
+    for i in range(PACKS_PER_TICK):
+        told.edit(1, 1, 1, i + 1)
+        assert told.log.packed(HOME) is not None
+    assert told.log.packed(EAST) is None
+    assert told.log.packed(HOME) is not None, "it is packed already"
+    told.tick()
+    assert told.log.packed(EAST) is not None
 
 
 def test_memory_is_bounded_by_history_and_by_what_exists(told: Recorded) -> None:
