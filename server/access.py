@@ -23,8 +23,10 @@ def authenticator(settings: Settings) -> Authenticator | None:
     module, _, name = settings.auth.partition(":")
     try:
         found: Authenticator = getattr(importlib.import_module(module), name)
-    except (ImportError, AttributeError) as error:
+    except (ImportError, AttributeError, TypeError, ValueError) as error:  # the latter two: no name of a module
         raise SettingsError(f"auth = {settings.auth!r}: cannot be used ({error})") from error
+    if not callable(found):
+        raise SettingsError(f"auth = {settings.auth!r}: cannot be called")
     return found
 
 

@@ -69,7 +69,8 @@ def to_toml(value: str | int | float | bool | tuple[str, ...]) -> str:
 
 
 def _plain(value: object) -> bool:
-    return isinstance(value, str) and value.strip() == value != ""
+    """Whether a value is a text that can be a name, an address or a path."""
+    return isinstance(value, str) and value.strip() == value != "" and "\0" not in value
 
 
 def _typed(kind: type[Any], text: str) -> str | int | float | bool | list[str]:

@@ -1,10 +1,13 @@
 """Which source wins, and what a mistake says."""
 
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
-from server.kinds import SettingsError
+from server.kinds import SettingsError, checked
 from server.limits import Limits
 from server.settings import KINDS, SECTIONS, Settings, load, parse
 
@@ -142,6 +145,36 @@ def test_a_flag_of_truth_needs_no_value() -> None:
     environment = {"SOVEREIGN_LOOPBACK_EXEMPT": "no"}
     assert settings(["--loopback-exempt", "--port", "1"], environment).limits.loopback_exempt is True
     assert settings(["--loopback-exempt", "false"]).limits.loopback_exempt is False
+
+
+TEXTS = st.text(max_size=12) | st.from_regex(r"-?[0-9]{0,25}(\.[0-9]*)?(e[0-9]{1,4})?", fullmatch=True)
+TOML_VALUES = st.recursive(
+    st.one_of(TEXTS, st.integers(), st.floats(), st.booleans()), lambda inner: st.lists(inner, max_size=3), max_leaves=4
+)
+
+
+@given(st.dictionaries(st.sampled_from(sorted(KINDS)), TEXTS, max_size=6))
+def test_any_text_is_a_setting_that_reads_back_or_an_error_that_names_it(values: dict[str, str]) -> None:
+    try:
+        found = load({}, {"SOVEREIGN_" + name.upper(): text for name, text in values.items()})
+    except SettingsError as error:
+        assert any(name in str(error) for name in values)  # noqa: PT017 - or it is a setting
+        return
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "server.toml"
+        path.write_text(found.to_toml(), "utf-8")
+        again = load({"auth": found.auth}, {}, str(path))
+    assert again == found
+
+
+@given(st.sampled_from(sorted(KINDS)), TOML_VALUES)
+def test_any_value_of_a_file_is_a_setting_or_an_error_that_names_it(name: str, value: object) -> None:
+    try:
+        found = checked(name, KINDS[name], value, "file x")
+    except SettingsError as error:
+        assert str(error).startswith(f"{name} = ")  # noqa: PT017 - or it is a setting
+        return
+    assert checked(name, KINDS[name], list(found) if isinstance(found, tuple) else found, "file x") == found
 
 
 @pytest.mark.parametrize("host", ["0.0.0.0", "::", "192.168.1.1", "play.example"])

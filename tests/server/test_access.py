@@ -1,0 +1,33 @@
+"""From settings to what decides on players."""
+
+import pytest
+
+from server.access import authenticator, tls_context
+from server.kinds import SettingsError
+from server.settings import Settings
+from server.tokens import Tokens, issue
+
+
+def check_of_ones_own(token: str) -> str:
+    return token.upper()
+
+
+def test_anyone_tokens_or_a_check_of_ones_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert authenticator(Settings()) is None
+    monkeypatch.setenv("SOVEREIGN_AUTH_KEY", "k" * 32)
+    tokens = authenticator(Settings(auth="token"))
+    assert isinstance(tokens, Tokens)
+    assert tokens(issue(b"k" * 32, "ann", 60, 4e9)) == "ann"
+    own = authenticator(Settings(auth=f"{__name__}:check_of_ones_own"))
+    assert own is not None
+    assert own("ann") == "ANN"
+
+
+@pytest.mark.parametrize("auth", ["no.such:thing", "json:nothing", ".:x", "sys:path"])
+def test_a_check_that_is_none_is_told_of(auth: str) -> None:
+    with pytest.raises(SettingsError, match="auth = "):
+        authenticator(Settings(auth=auth))
+
+
+def test_no_certificate_no_tls() -> None:
+    assert tls_context(Settings()) is None
