@@ -24,6 +24,7 @@ from server.game import Game
 from server.gateway import Gateway
 from server.histogram import Histogram
 from server.kinds import SettingsError
+from server.live import Live
 from server.metrics import metrics_page
 from server.pages import Pages, json_page, ready_page
 from server.recorder import RecordedWorld
@@ -107,11 +108,12 @@ class Server:
         self.game = game
         self.store = store
         self.faults = game.faults
+        live = Live(game, self.stats, self._durations).pages() if settings.page else {}
         self.door = Door(
             settings.limits,
             Pages(
                 {"/readyz": ready_page(self.unready)},
-                {"/stats": json_page(self.stats), "/metrics": metrics_page(self.stats, self._durations)},
+                {"/stats": json_page(self.stats), "/metrics": metrics_page(self.stats, self._durations), **live},
                 self.faults.report,
             ),
             figures=settings.figures,

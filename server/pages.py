@@ -50,7 +50,7 @@ class Pages:
 
     Args:
         public: for everyone; `/` and `/healthz` are there anyway.
-        private: only for those whom the door lets see them.
+        private: only for those whom the door lets see them, and ahead of the public ones.
         failed: told which page has raised.
     """
 
@@ -67,7 +67,7 @@ class Pages:
     def get(self, method: str, target: str, *, trusted: bool) -> Page:
         """The answer to a request; never raises."""
         path = target.partition("?")[0]
-        make = self._public.get(path) or (self._private.get(path) if trusted else None)
+        make = (self._private.get(path) if trusted else None) or self._public.get(path)
         if method != "GET":
             return NO_GET
         if make is None and path in self._private:

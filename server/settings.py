@@ -18,6 +18,7 @@ from shared.checks import SceneError
 from shared.scene import SCENES, TICK_RATE_MAX, load_scene
 
 ENV_PREFIX = "SOVEREIGN_"
+ADDRESSES = ("none", "loopback", "private", "all")
 LOG_LEVELS = ("debug", "info", "warning", "error")
 
 EPILOG = f"""\
@@ -25,7 +26,8 @@ Other commands: `python -m server token --help` (issue tokens), `python -m serve
 Each setting can also come from the environment ({ENV_PREFIX}PORT=9000) or from a TOML file (port = 9000; see
 --print-config). A flag wins over the environment, that over the file, and that over the default.
 The server prints one line, "listening on ws://HOST:PORT", when it is ready, and answers GET /healthz, /readyz,
-/stats and /metrics on the same port. SIGTERM or SIGINT: clients are told, exit code 0. A bad setting: exit code 2.
+/stats and /metrics on the same port, and / with a live page. SIGTERM or SIGINT: clients are told, exit code 0.
+A bad setting: exit code 2.
 """
 
 
@@ -48,8 +50,9 @@ class Settings:
     tls_cert: str | None = setting(None, Kind(str, "file with the certificate (chain) for wss://, PEM", "FILE"))
     tls_key: str | None = setting(None, Kind(str, "file with the certificate's key, PEM", "FILE"))
     figures: str = setting(
-        "private", Kind(str, "whose addresses get /stats and /metrics", choices=("none", "loopback", "private", "all"))
+        "private", Kind(str, "whose addresses get /stats, /metrics and the live page", choices=ADDRESSES)
     )
+    page: bool = setting(True, Kind(bool, "serve the live page: the world and its players in a browser, at /"))
     allowed_origins: tuple[str, ...] = setting(
         (),
         Kind(

@@ -1,0 +1,129 @@
+"""A headless Chromium, driven by the DevTools protocol."""
+
+import base64
+import json
+import os
+import re
+import shutil
+import subprocess
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from itertools import count
+from typing import Any
+
+from websockets.sync.client import ClientConnection, connect
+
+NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
+FLAGS = (
+    "--headless --disable-gpu --disable-quic --no-first-run --disable-background-networking --disable-component-update "
+    "--disable-sync --hide-scrollbars --remote-debugging-port=0"
+).split()
+START_S = 60.0
+ANSWER_S = 30.0
+
+
+def installed() -> str | None:
+    """The path of a Chromium or Chrome, if there is one."""
+    return next(filter(None, map(shutil.which, NAMES)), None)
+
+
+class Tab:
+    """One page."""
+
+    def __init__(self, link: ClientConnection) -> None:
+        self._link = link
+        self._numbers = count(1)
+        self.said: list[str] = []
+        """What has gone wrong in the page so far: exceptions, and whatever the console and the log say."""
+        for domain in ("Page", "Runtime", "Log", "Network"):
+            self.call(f"{domain}.enable")
+
+    def call(self, method: str, **parameters: Any) -> dict[str, Any]:
+        """The answer to a call of the protocol."""
+        number = next(self._numbers)
+        self._link.send(json.dumps({"id": number, "method": method, "params": parameters}))
+        while True:
+            told = json.loads(self._link.recv(ANSWER_S))
+            if told.get("id") == number:
+                assert "error" not in told, (method, told["error"])
+                return dict(told["result"])
+            if told.get("method") in ("Runtime.exceptionThrown", "Runtime.consoleAPICalled", "Log.entryAdded"):
+                self.said.append(json.dumps(told["params"])[:2000])
+
+    def open(self, url: str, width: int, height: int, *, scale: float = 1.0, dark: bool = False) -> None:
+        """Goes to a page, in a window of that size."""
+        self.call(
+            "Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=scale, mobile=False
+        )
+        scheme = {"name": "prefers-color-scheme", "value": "dark" if dark else "light"}
+        self.call("Emulation.setEmulatedMedia", features=[scheme])
+        self.call("Page.navigate", url=url)
+
+    def run(self, script: str) -> Any:
+        """The value of an expression in the page; of a promise, what it comes to."""
+        done = self.call("Runtime.evaluate", expression=script, awaitPromise=True, returnByValue=True)
+        assert "exceptionDetails" not in done, done
+        return done["result"].get("value")
+
+    def until(self, script: str, seconds: float = ANSWER_S) -> Any:
+        """Waits until an expression is true, which it does not while it raises; its value."""
+        deadline = time.monotonic() + seconds
+        while True:
+            done = self.call("Runtime.evaluate", expression=script, awaitPromise=True, returnByValue=True)
+            value = None if "exceptionDetails" in done else done["result"].get("value")
+            if value:
+                return value
+            assert time.monotonic() < deadline, (script, done, self.said)
+            time.sleep(0.05)
+
+    def picture(self) -> bytes:
+        """What is to be seen, as PNG."""
+        return base64.b64decode(self.call("Page.captureScreenshot", format="png")["data"])
+
+
+@contextmanager
+def chromium(path: str) -> Iterator[Tab]:
+    """A browser with one empty page and nothing remembered."""
+    root = ("--no-sandbox",) if hasattr(os, "geteuid") and os.geteuid() == 0 else ()
+    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as profile:
+        browser = subprocess.Popen(
+            [path, *FLAGS, *root, f"--user-data-dir={profile}", "about:blank"],
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        try:
+            with connect(_page(_address(browser)), compression=None, max_size=None) as link:
+                yield Tab(link)
+        finally:
+            browser.kill()
+            browser.wait()
+            assert browser.stderr is not None
+            browser.stderr.close()
+
+
+def _address(browser: subprocess.Popen[str]) -> str:
+    """Host and port where it wants to be driven: it prints them."""
+    assert browser.stderr is not None
+    for line in browser.stderr:
+        found = re.search(r"DevTools listening on ws://([^/]+)/", line)
+        if found:
+            return found[1]
+    raise RuntimeError("the browser ended before it listened")
+
+
+def _page(address: str) -> str:
+    """The WebSocket address of its page."""
+    import urllib.request
+
+    deadline = time.monotonic() + START_S
+    while True:
+        with urllib.request.urlopen(f"http://{address}/json/list", timeout=START_S) as answer:
+            pages = [each for each in json.load(answer) if each["type"] == "page"]
+        if pages:
+            return str(pages[0]["webSocketDebuggerUrl"])
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
