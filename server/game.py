@@ -255,6 +255,7 @@ class Game:
                 self._refuse(session, messages.FULL, "no room to spawn")
                 return
             player = self.players[entity] = Player(entity, session.hello.name, session.subject)
+            player.edits_left = 0.0  # else leaving and joining anew would give a burst each time
             self.counters.joined += 1
             session.seat(player)
             self.stage.joined(player)

@@ -208,6 +208,7 @@ class Session:
         """This connection is the player's from now on."""
         self.player, self.entity, self.inputs = player, player.entity, player.inputs
         player.session, player.away_until = self, math.inf
+        del player.verdicts[:-SETTLED_MAX]  # who comes back time and again without reading must not pile them up
         self.hello = None
 
     def send(self, message: bytes) -> None:

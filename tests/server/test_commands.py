@@ -75,6 +75,7 @@ def test_a_command_counts_once(table: Table) -> None:
 def test_commands_are_bounded_in_number_and_rate() -> None:
     table = Table(Limits(commands_waiting_max=4, edits_per_s=1.0))
     link = table.join()
+    table.tick(128)
     tick = table.tick_number
     link.say(*[order(n, tick + 2, 18, 16, 1 + n, 5) for n in range(1, 9)])
     assert link.session.player

@@ -106,7 +106,7 @@ def test_a_command_that_fails_is_answered_and_those_after_it_are_carried_out(
     table: Table, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     link = connect(table)
-    table.tick()
+    table.tick(16)  # two edits' worth
     link.sent.clear()
     real = edits.apply
 

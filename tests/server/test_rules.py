@@ -85,6 +85,7 @@ def test_joining_and_leaving_are_told_while_the_entity_is_there(table: Table, ru
 
 def test_commands_come_with_their_data_and_are_answered(table: Table, rules: Told) -> None:
     link = table.join()
+    table.tick(16)  # two edits' worth
     data = {"at": [1, 2.5, None], "why": "because"}
     link.say(
         Command(1, 0, 0.0, "yes", msgpack.packb(data)),
