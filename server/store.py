@@ -20,8 +20,8 @@ up to there. Until it is complete the old checkpoint and its log are. The ticks 
 
 When the disk takes no more, or does not keep up by more than `BEHIND_S`, there is a gap: `trouble` says why, records
 are dropped, and the game refuses commands (`messages.UNSAVED`) while players move on. What was told "done" before is on
-disk; what was carried out and not yet answered stays unanswered. Every `RETRY_S` the file is opened anew and a fresh
-checkpoint tried. With it everything is saved, the unanswered too, and the gap is closed.
+disk; what was carried out and not yet answered stays unanswered. Then the file is opened anew and a fresh
+checkpoint tried, again and again. With it everything is saved, the unanswered too, and the gap is closed.
 
 Rejected: a transaction in the tick (a disk's hiccup would be everybody's); a log of states instead of inputs (a hundred
 times the bytes); a file per segment (no transaction spans them); a copy of the world by fork (threads, and Windows);
@@ -58,7 +58,10 @@ QUIET_S = 1.0
 BEHIND_S = 10.0
 """The disk may be so far behind the world before its records are dropped."""
 RETRY_S = 2.0
-CLOSE_S = 3.0
+"""After a failure the next attempt waits so long, twice as long after each further one,"""
+RETRY_MAX_S = 30.0
+"""but no longer than this: a disk that stays full should not fill with lines of the log, either."""
+CLOSE_S = 2.5
 """The end waits so long for the disk."""
 
 logger = logging.getLogger(__name__)
@@ -103,6 +106,7 @@ class Store(Pen):
         """How long it took from the end of a step until its record was on disk, and a checkpoint."""
         # The thread's own:
         self._chain_there = 0
+        self._retry_s = RETRY_S
         self._copying: Copy | None = None
         self._pieces: Iterator[Checkpoint | None] = iter(())
         self._began = 0.0
@@ -195,6 +199,10 @@ class Store(Pen):
         elif self._file is not None:
             self._file.close()
         self._claim.close()
+        if self.trouble:
+            logger.error(
+                "the end could not be saved: %s; what happened since tick %d is lost", self.trouble, self._written
+            )
         return not self.trouble
 
     def stats(self) -> dict[str, Any]:
@@ -250,6 +258,7 @@ class Store(Pen):
             checkpoint = next(self._pieces)
             if checkpoint is not None and self._copy is copy:
                 self._save(file, copy, checkpoint, self._chain_there)
+                self._retry_s = RETRY_S
 
     def _append(self, file: Database, records: list[tuple[int, bytes, float]], tick: int) -> int:
         """Puts records on disk, in one transaction; what the chain is after a tick."""
@@ -288,7 +297,7 @@ class Store(Pen):
     def _reopen(self) -> None:
         """After a gap: waits a while, and saves everything anew. What has come since then follows in `_write_on`."""
         with self._wake:
-            self._wake.wait_for(lambda: self._closing, RETRY_S)
+            self._wake.wait_for(lambda: self._closing, self._retry_s)
             self._copy_due = True
             self._wake.wait_for(lambda: self._copy is not None)
             copy = self._copying = self._copy
@@ -309,6 +318,7 @@ class Store(Pen):
 
     def _fail(self, reason: str) -> None:
         """The file takes nothing, for this reason."""
+        self._retry_s = min(2 * self._retry_s, RETRY_MAX_S)
         if self._file is not None:
             self._file.close()
             self._file = None
