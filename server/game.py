@@ -12,8 +12,7 @@ import dataclasses
 import hashlib
 import math
 import secrets
-from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from itertools import count
 from typing import Any
 
@@ -22,16 +21,16 @@ from server.counters import Counters
 from server.delivery import Delivery
 from server.faults import Faults
 from server.limits import Limits
+from server.orders import Orders
 from server.recorder import RecordedWorld, Saves
 from server.rewind import Past, Rewind
 from server.rules import Rules
 from server.session import Link, Player, Session
+from server.spawning import Spawns
 from server.stage import Stage
-from shared import edits, messages
-from shared.checks import Vec
+from shared import messages
 from shared.inputs import Input
 from shared.messages import (
-    AHEAD_MAX,
     Bye,
     Command,
     Hello,
@@ -45,14 +44,11 @@ from shared.messages import (
     encode,
 )
 from shared.scene import Scene
-from shared.world import OverlapError
 
 RESYNC_S = 1.0
 """A client may ask for everything anew so often."""
 AWAY_S = 1.0
 """A tick that begins so late says nothing about the clients."""
-SPAWN_RINGS = 24
-"""Where a spawn is taken, others are tried in rings around it, two blocks apart."""
 
 
 class Game:
@@ -103,14 +99,12 @@ class Game:
         self.players: dict[int, Player] = self.stage.players
         """By entity, in the order in which they joined; also those whose connection is lost, for a while."""
         self._authenticate = authenticate
-        self._saves = saves
-        self._unanswered: deque[tuple[int, Player, int, int]] = deque()
-        """Verdicts that are not on disk yet: tick, player, number, verdict."""
+        self.orders = Orders(self.world, self.stage, self.limits, self.faults, saves)
+        self._spawns = Spawns(self.world)
         self._numbers = count(1)
         self._leaving: list[Player] = []
         self._respawn: list[int] = []
         self._deadline: float | None = None
-        self._spawned = 0
         self._rules = scene.to_table()
 
     # -- what arrives is filed -----------------------------------------------------------------------------
@@ -152,7 +146,8 @@ class Game:
         elif isinstance(message, Hello) and not session.entity and session.hello is None:
             self._hello(session, message, now)
         elif isinstance(message, Command) and session.entity:
-            self._file_command(session, message)
+            assert session.player is not None
+            self.orders.file(session.player, message)
         elif isinstance(message, Resync) and session.entity:
             if now - session.resynced_at >= RESYNC_S:
                 session.resynced_at = now
@@ -184,10 +179,7 @@ class Game:
 
     def keep(self) -> list[list[Any]]:
         """What belongs to the game and is not in its world, for a checkpoint."""
-        answers = ((player.entity, number, verdict) for _, player, number, verdict in self._unanswered)
-        return keeping.whole(self.stage.kept) + [
-            [keeping.ANSWERED, entity, *answer] for entity, *answer in answers if entity in self.players
-        ]
+        return [*keeping.whole(self.stage.kept), *self.orders.notes()]
 
     def rewound(self, session: Session, seen: float) -> Past:
         """The world as a client saw it; ask between two ticks, or for a command within one.
@@ -210,7 +202,7 @@ class Game:
         self._leave(now)
         self._join()
         self._revive()
-        self._command()
+        self.orders.carry_out()
         self.stage.act()
         inputs = self._take_inputs()
         self.world.step(inputs)
@@ -250,7 +242,7 @@ class Game:
         assert session.hello is not None
         player = self._returning(session, session.hello)
         if player is None:
-            entity = self._spawn()
+            entity = self._spawns.spawn()
             if entity is None:
                 self._refuse(session, messages.FULL, "no room to spawn")
                 return
@@ -284,58 +276,9 @@ class Game:
 
     def _revive(self) -> None:
         for entity in self._respawn:
-            if entity in self.world and not self.stage.fell_out(entity):
-                self._to_spawn(entity)
+            if entity in self.world and not self.stage.fell_out(entity) and self._spawns.put_back(entity):
+                self.log.note_act(entity)
         self._respawn.clear()
-
-    def _command(self) -> None:
-        """What players do at the start of this tick, in the order in which they joined."""
-        tick = self.world.tick + 1
-        rate = self.limits.edits_per_s
-        for player in tuple(self.players.values()):
-            if player.edits_left != 2 * rate:
-                player.edits_left = min(player.edits_left + rate / self.scene.tick_rate, 2 * rate)
-            while player.commands and player.commands[0].tick <= tick:
-                if player.session is not None and player.session.closed:
-                    break
-                command = player.commands.popleft()
-                if self._saves is not None and self._saves.trouble:
-                    player.settle(command.number, messages.UNSAVED)
-                    continue
-                try:
-                    verdict = self._carry_out(player, command)
-                except Exception:
-                    self.faults.report("a command")
-                    verdict = messages.FAILED
-                self._unanswered.append((tick, player, command.number, verdict))
-                self.world.note([keeping.ANSWERED, player.entity, command.number, verdict])
-
-    def _durable_tick(self) -> int:
-        """The newest tick that no crash can undo any more."""
-        return self.world.tick if self._saves is None else self._saves.durable_tick
-
-    def _answer(self) -> None:
-        """Tells the verdicts that will last."""
-        durable = self._durable_tick()
-        while self._unanswered and self._unanswered[0][0] <= durable:
-            _, player, number, verdict = self._unanswered.popleft()
-            player.settle(number, verdict)
-
-    def _carry_out(self, player: Player, command: Command) -> int:
-        if command.name != edits.NAME:
-            return self.stage.command(player, command)
-        edit = edits.unpack(command.payload)
-        if edit is None:
-            return messages.INVALID
-        if player.edits_left < 1:
-            return messages.TOO_MANY
-        player.edits_left -= 1
-        if not self.stage.may_edit(player, edit):
-            return messages.FORBIDDEN
-        verdict = edits.apply(self.world, player.entity, edit)
-        if verdict == messages.DONE:
-            self.log.note_edit(*edit[:3])
-        return verdict
 
     def _take_inputs(self) -> dict[int, Input]:
         tick = self.world.tick + 1
@@ -350,7 +293,7 @@ class Game:
         self.counters.fell_out += len(self._respawn)
 
     def _send(self, now: float) -> None:
-        self._answer()
+        self.orders.answer()
         for session in tuple(self.sessions):
             if session.allowance < 0:
                 session.allowance = min(session.allowance + self.limits.messages_per_tick, 0.0)
@@ -365,11 +308,11 @@ class Game:
 
     def _greeted(self, session: Session, tick: int, welcome: bytes) -> bool:
         """Lets a client in once its token will last; at once, if it cannot be saved: then it plays all the same."""
-        waits = self._durable_tick() < tick and not (self._saves is not None and self._saves.trouble)
-        if not waits:
-            session.send(welcome)
-            session.greeting = None
-        return not waits
+        if self.orders.durable_tick < tick and not self.orders.trouble:
+            return False
+        session.send(welcome)
+        session.greeting = None
+        return True
 
     def _check_clocks(self, now: float) -> None:
         for session in tuple(self.sessions):
@@ -392,19 +335,6 @@ class Game:
         if self._deadline is None:
             return 1.0
         return 1.0 - (now - self._deadline) * self.scene.tick_rate
-
-    def _file_command(self, session: Session, command: Command) -> None:
-        player = session.player
-        assert player is not None
-        if command.number <= player.command:
-            if command.number in player.settled:  # asked again after a lost connection
-                player.verdicts.append((command.number, player.settled[command.number]))
-            return
-        player.command = command.number
-        if len(player.commands) >= self.limits.commands_waiting_max or command.tick > self.world.tick + AHEAD_MAX:
-            player.settle(command.number, messages.TOO_MANY)
-        else:
-            player.commands.append(command)
 
     def _hello(self, session: Session, hello: Hello, now: float) -> None:
         if hello.version != messages.VERSION:
@@ -462,37 +392,6 @@ class Game:
             session.close(code, reason)
         except Exception:
             self._break(session, "saying goodbye")
-
-    def _spawn(self) -> int | None:
-        for place in self._places():
-            try:
-                return self.world.spawn(self.scene.player, place)
-            except OverlapError:
-                continue
-        return None
-
-    def _to_spawn(self, entity: int) -> None:
-        for place in self._places():
-            try:
-                self.world.place(entity, place)
-                self.world.set_velocity(entity, (0.0, 0.0, 0.0))
-                self.log.note_act(entity)
-            except OverlapError:
-                continue
-            return
-
-    def _places(self) -> Iterator[Vec]:
-        """Where to try to spawn: the scene's spawns in turn, then ever wider around one of them."""
-        self._spawned += 1
-        spawns = self.scene.spawns
-        turn = self._spawned % len(spawns)
-        yield from spawns[turn:] + spawns[:turn]
-        x, y, z = spawns[turn]
-        for ring in range(1, SPAWN_RINGS):
-            for i in range(-ring, ring + 1):
-                for j in range(-ring, ring + 1):
-                    if max(abs(i), abs(j)) == ring:
-                        yield x + 2 * i, y + 2 * j, z
 
     def stats(self) -> dict[str, Any]:
         """Counters, with those of the clients that are connected."""
