@@ -25,9 +25,7 @@ NAMES = ("Kim", "Lou", "Mio", "Nia", "Oz", "Pia", "Quin", "Rex", "Sol", "Tess", 
 @contextlib.contextmanager
 def process(*command: str) -> Iterator[subprocess.Popen[str]]:
     """A process of this Python, whose output is read; it is told to end, and made to."""
-    running = subprocess.Popen(
-        [sys.executable, *command], cwd=ROOT, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, text=True
-    )
+    running = subprocess.Popen([sys.executable, *command], stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, text=True)
     try:
         yield running
     finally:

@@ -10,6 +10,7 @@ import random
 from collections.abc import Callable
 from itertools import count
 
+from client_sdk import bots
 from client_sdk.core import Core
 from client_sdk.events import Event
 from server.game import Game
@@ -221,6 +222,17 @@ class Match:
             act()
         self._started += 1
         self.at(self._started * self._tick_s, self._tick)
+
+
+def bot(policy: bots.Policy) -> Policy:
+    """A policy of `client_sdk.bots`, or of one's own, for a player of a match."""
+    drive = bots.Bot(policy)
+
+    def plays(core: Core, rng: random.Random) -> Input:
+        drive(core)
+        return core.wish
+
+    return plays
 
 
 def wander(core: Core, rng: random.Random) -> Input:

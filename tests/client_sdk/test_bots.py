@@ -11,7 +11,7 @@ from client_sdk.core import Core
 from shared.inputs import MOVE_MAX, NEUTRAL, Input
 from shared.scene import Scene, load_scene
 from shared.world import World
-from tests.match import Match
+from tests.match import Match, bot
 
 FLAT = load_scene("flat")
 
@@ -97,12 +97,6 @@ class Attentive(Wander):
 def test_a_policy_that_wants_to_learns_what_the_rules_say() -> None:
     match = Match(FLAT, 1)
     policy = Attentive(random.Random(1))
-    bot = Bot(policy)
-
-    def plays(core: Core, rng: random.Random) -> Input:
-        bot(core)
-        return core.wish
-
-    player = match.join(plays)
+    player = match.join(bot(policy))
     match.run(3)
     assert policy.heard == {player.core.entity: {"name": "player 0"}}

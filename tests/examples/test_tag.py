@@ -1,37 +1,22 @@
 """Tag, played by bots over slow links in simulated time: nobody errs, and a recording gives the same game again."""
 
 import io
-import random
 from itertools import pairwise
 from typing import Any
 
 import msgpack
 import pytest
 
-from client_sdk.bots import Bot
-from client_sdk.core import Core
 from client_sdk.events import Diverged, Happened, Left
 from scripts.examples.tag import Tag
 from scripts.examples.tag_brain import TagPlayer
 from server.journal import NOTE, Recording
 from server.keeping import restored
-from shared.inputs import Input
 from shared.scene import load_scene
-from tests.match import Match, Path, Player
+from tests.match import Match, Path, Player, bot
 
 TYPICAL = Path(0.05, 0.01, 0.01)
 CAUSES = {"late input", "other entity", "server act", "unknown edit", "missing terrain"}
-
-
-class Playing:
-    """A bot as a policy of a match."""
-
-    def __init__(self) -> None:
-        self._bot = Bot(TagPlayer())
-
-    def __call__(self, core: Core, rng: random.Random) -> Input:
-        self._bot(core)
-        return core.wish
 
 
 def played(count: int, seconds: float, seed: int, path: Path) -> tuple[Match, list[Player], io.BytesIO]:
@@ -39,7 +24,7 @@ def played(count: int, seconds: float, seed: int, path: Path) -> tuple[Match, li
     match = Match(load_scene(Tag.scene), seed, rules=Tag())
     recording = io.BytesIO()
     match.game.world.record(recording)
-    players = [match.join(Playing(), path) for _ in range(count)]
+    players = [match.join(bot(TagPlayer()), path) for _ in range(count)]
     match.run(seconds)
     match.game.world.end_recording()
     recording.seek(0)

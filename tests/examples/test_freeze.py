@@ -1,0 +1,72 @@
+"""The game in the README, as somebody wrote it who had read nothing else."""
+
+import re
+from pathlib import Path
+
+from client_sdk.bots import Policy
+from scripts.examples.freeze import Freeze
+from shared.inputs import NEUTRAL, Input, make_input
+from shared.scene import load_scene
+from shared.world import World
+from tests.match import Match, Player, bot
+from tests.match import Path as Line
+
+ROOT = Path(__file__).resolve().parents[2]
+TYPICAL = Line(0.05, 0.01)
+
+
+def to(number: int) -> Policy:
+    """A bot that hops to the player who joined as the `number`th."""
+
+    def policy(world: World, me: int) -> Input:
+        everybody = world.entities["id"].tolist()
+        if len(everybody) < number or everybody[number - 1] == me:
+            return NEUTRAL
+        (x, y, _), (to_x, to_y, _) = world.position(me), world.position(everybody[number - 1])
+        return make_input(to_x - x, to_y - y, jump=True)
+
+    return policy
+
+
+def heading(x: int, y: int) -> Policy:
+    """A bot that hops into one direction for ever."""
+    return lambda world, me: make_input(x, y, jump=True)
+
+
+def clean(player: Player) -> None:
+    assert player.core.stats.divergences == 0
+    assert set(player.core.stats.corrections_by_cause) <= {"server act", "other entity", "late input"}
+
+
+def test_it_stands_in_the_readme_and_is_short() -> None:
+    text = (ROOT / "scripts" / "examples" / "freeze.py").read_text("utf-8")
+    assert len(text.splitlines()) < 30
+    assert f"```python\n{text}```" in (ROOT / "README.md").read_text("utf-8")
+
+
+def test_the_test_in_the_readme_passes() -> None:
+    blocks = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text("utf-8"), re.DOTALL)
+    (test,) = [block for block in blocks if "Match(" in block]
+    exec(compile(test, "README.md", "exec"), {})
+
+
+def test_who_is_touched_freezes_and_is_thawed_by_a_friend() -> None:
+    match = Match(load_scene(Freeze.scene), seed=3, rules=Freeze())
+    ann, bob = match.join(bot(to(2)), TYPICAL), match.join(bot(heading(-1, 0)), TYPICAL)
+    match.run(1)
+    game = match.game.stage
+    assert game.template(ann.core.entity) == "freezer"
+    match.run_until(lambda: game.template(bob.core.entity) == "frozen", 20)
+    match.run(2)
+    place = game.position(bob.core.entity)
+    match.run(2)
+    assert game.position(bob.core.entity) == place
+    assert bob.core.wish.move_x == -127, "it would if it could"
+
+    ann.policy = bot(heading(-1, 0))
+    match.run(3)
+    cleo = match.join(bot(to(2)), TYPICAL)
+    match.run_until(lambda: cleo.core.entity > 0 and game.template(bob.core.entity) == "player", 20)
+    for player in (ann, bob, cleo):
+        clean(player)
+    assert match.game.counters.rules_failed == 0
