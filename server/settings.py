@@ -6,6 +6,7 @@ import os
 import tomllib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import takewhile
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -16,11 +17,18 @@ from server.log import FORMATS
 from server.tokens import KEY_VARIABLE
 from shared.checks import SceneError
 from shared.scene import SCENES, TICK_RATE_MAX, load_scene
+from shared.units import SEGMENT
 
 ENV_PREFIX = "SOVEREIGN_"
 ADDRESSES = ("none", "loopback", "private", "all")
 LOG_LEVELS = ("debug", "info", "warning", "error")
 
+DESCRIPTION = """\
+An authoritative game server: fixed ticks, WebSocket clients, one world of blocks, and the rules of a game on top.
+
+  python -m server                                    players walk, jump, dig and build on hills
+  python -m server --game scripts.examples.tag:Tag    the sample game; scripts/play opens a window on it
+"""
 EPILOG = f"""\
 Other commands: `python -m server token --help` (issue tokens), `python -m server check --help` (is it ready?).
 Each setting can also come from the environment ({ENV_PREFIX}PORT=9000) or from a TOML file (port = 9000; see
@@ -37,9 +45,9 @@ class Settings:
 
     host: str = setting("127.0.0.1", Kind(str, "address to listen on; 0.0.0.0 or :: for every interface", "ADDRESS"))
     port: int = setting(8765, Kind(int, "TCP port; 0 lets the system pick one", "PORT", 0, 65535))
-    scene: str = setting("hills", Kind(str, "a built-in scene (--list-scenes) or the path of a scene file", "SCENE"))
+    scene: str = setting("hills", Kind(str, "one of --list-scenes, or a scene file; games may have their own", "SCENE"))
     tick_rate: int | None = setting(
-        None, Kind(int, "ticks per second, instead of the scene's own", "HZ", 1, TICK_RATE_MAX)
+        None, Kind(int, "ticks per second (default: the scene's own)", "HZ", 1, TICK_RATE_MAX)
     )
     auth: str = setting(
         "none", Kind(str, "who may play: none (anyone), token (see `token --help`), or MODULE:NAME of your own", "AUTH")
@@ -61,11 +69,13 @@ class Settings:
             "ORIGIN,...",
         ),
     )
-    restart_s: float = setting(2.0, Kind(float, "when the server ends, clients come back after so long", "S", 0, 3600))
+    restart_s: float = setting(
+        2.0, Kind(float, "when it ends, clients are told to come back after so long", "S", 0, 3600)
+    )
     log_level: str = setting("info", Kind(str, "what goes to stderr", choices=LOG_LEVELS))
     log_format: str = setting("pretty", Kind(str, "how it looks", choices=FORMATS))
-    game: str | None = setting(None, Kind(str, "the rules of a game: a module and a class in it", "MODULE:CLASS"))
-    seed: int = setting(0, Kind(int, "of the randomness of those rules", "N", 0, (1 << 63) - 1))
+    game: str | None = setting(None, Kind(str, "the rules of a game (default: none)", "MODULE:CLASS"))
+    seed: int = setting(0, Kind(int, "of the randomness of its rules", "N", 0, (1 << 63) - 1))
     record: str | None = setting(None, Kind(str, "record every change of the world into a new file", "FILE"))
     data: str | None = setting(None, Kind(str, "save the world there, and go on with the one that is there", "DIR"))
     durability: str = setting(
@@ -89,6 +99,14 @@ class Settings:
         return "\n".join(lines) + "\n"
 
 
+GROUPS = {
+    "what is played": ("scene", "game", "seed", "tick_rate"),
+    "where it listens": ("host", "port", "tls_cert", "tls_key", "allowed_origins"),
+    "who may play": ("auth", "auth_key_file"),
+    "what is kept": ("data", "durability", "checkpoint_s", "record"),
+    "what is told": ("log_level", "log_format", "figures", "restart_s"),
+}
+"""The settings as `--help` shows them, those of a stranger first; all others are limits."""
 SECTIONS: dict[str, dict[str, Kind]] = {"": kinds_of(Settings), "limits": kinds_of(Limits)}
 """The settings by the table of a TOML file that they stand in. Names are unique, wherever they stand."""
 KINDS: dict[str, Kind] = {name: kind for names in SECTIONS.values() for name, kind in names.items()}
@@ -182,21 +200,25 @@ def parse(arguments: Sequence[str], environment: Mapping[str, str] = os.environ)
     """
     parser = _Parser(
         prog="python -m server",
-        description="An authoritative game server: fixed ticks, WebSocket clients, one world.",
+        usage="%(prog)s [options]",
+        description=DESCRIPTION,
         epilog=EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
         allow_abbrev=False,
     )
-    for name, kind in KINDS.items():
-        default = DEFAULTS[name]
-        parser.add_argument(
-            "--" + name.replace("_", "-"),
-            nargs="?" if kind.type is bool else None,
-            const="true" if kind.type is bool else None,
-            metavar="|".join(kind.choices) or kind.metavar or "true|false",
-            help=kind.help + ("" if default in (None, ()) else f" (default: {str(default).lower()})"),
-            default=argparse.SUPPRESS,
-        )
+    told = {name for names in GROUPS.values() for name in names}
+    for title, names in {**GROUPS, "limits": tuple(name for name in KINDS if name not in told)}.items():
+        group = parser.add_argument_group(title)
+        for name in names:
+            kind, default = KINDS[name], DEFAULTS[name]
+            group.add_argument(
+                "--" + name.replace("_", "-"),
+                nargs="?" if kind.type is bool else None,
+                const="true" if kind.type is bool else None,
+                metavar="|".join(kind.choices) or kind.metavar or "true|false",
+                help=kind.help + ("" if default in (None, ()) else f" (default: {str(default).lower()})"),
+                default=argparse.SUPPRESS,
+            )
     parser.add_argument("--config", metavar="FILE", help=f"TOML file with settings (or {ENV_PREFIX}CONFIG)")
     parser.add_argument("--list-scenes", action="store_true", help="print the built-in scenes and exit")
     parser.add_argument("--print-config", action="store_true", help="print the settings in force and exit")
@@ -209,13 +231,21 @@ def parse(arguments: Sequence[str], environment: Mapping[str, str] = os.environ)
 
 
 def list_scenes() -> str:
-    """One line for each built-in scene."""
+    """For each built-in scene its name, what its file says of it, and its size."""
     lines = []
     for path in sorted(SCENES.glob("*.toml")):
         try:
             scene = load_scene(path.stem)
         except SceneError as error:
             raise SettingsError(str(error)) from error
-        size = " x ".join(str(32 * part) for part in scene.size)
-        lines.append(f"{path.stem:<12} {size} blocks, {scene.tick_rate} ticks/s")
+        size = " x ".join(str(SEGMENT * part) for part in scene.size)
+        kinds = ", ".join(template.name for template in scene.templates)
+        lines.append(f"{path.stem:<12} {_said(path)}")
+        lines.append(f"{'':<12} {size} blocks, {scene.tick_rate} ticks/s, templates: {kinds}")
     return "\n".join(lines) + "\n"
+
+
+def _said(path: Path) -> str:
+    """The first sentence of the comment that a file begins with."""
+    comment = takewhile(lambda line: line.startswith("#"), path.read_text("utf-8").splitlines())
+    return " ".join(line[2:] for line in comment).partition(". ")[0].rstrip(".")

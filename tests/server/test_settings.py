@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from server.kinds import SettingsError, checked
 from server.limits import Limits
-from server.settings import KINDS, SECTIONS, Settings, load, parse
+from server.settings import GROUPS, KINDS, SECTIONS, Settings, load, parse
 
 
 def config(tmp_path: Path, text: str) -> str:
@@ -230,7 +230,10 @@ def test_help_and_scenes(capsys: pytest.CaptureFixture[str]) -> None:
         parse(["--help"], {})
     assert end.value.code == 0
     text = capsys.readouterr().out
+    assert all(name in KINDS for names in GROUPS.values() for name in names)
     assert all("--" + name.replace("_", "-") in text for name in KINDS)
     listed = parse(["--list-scenes"], {"SOVEREIGN_PORT": "broken"})
     assert isinstance(listed, str)
-    assert {line.split()[0] for line in listed.splitlines()} >= {"flat", "hills", "arena", "topdown"}
+    named = {line.split()[0]: line for line in listed.splitlines() if not line.startswith(" ")}
+    assert named.keys() >= {"flat", "hills", "arena", "topdown", "meadow"}
+    assert named["flat"].endswith("A plain: one floor, nothing in the way")
