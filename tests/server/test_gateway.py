@@ -15,6 +15,7 @@ import pytest_asyncio
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from websockets.frames import Frame, Opcode
+from websockets.utils import apply_mask
 
 from server import gateway as module
 from server.door import SPARE_PER_ADDRESS, Door
@@ -159,8 +160,15 @@ async def bench() -> AsyncIterator[Bench]:
     await bench.all_gone()
 
 
+MASK = b"\x5a\xc3\x0f\x99"
+
+
 def masked(opcode: Opcode, data: bytes, *, fin: bool = True) -> bytes:
-    return Frame(opcode, data, fin).serialize(mask=True)
+    """A client's frame; its mask is no secret here, so that tests are named alike every time."""
+    plain = Frame(opcode, data, fin).serialize(mask=False)
+    head = bytearray(plain[: len(plain) - len(data)])
+    head[1] |= 0x80
+    return bytes(head) + MASK + apply_mask(data, MASK)
 
 
 def binary(data: bytes) -> bytes:
