@@ -11,6 +11,7 @@ from shared.inputs import JUMP, MOVE_MAX
 
 TOWER = ((2, 0), (2, -1), (2, -2))
 """Where blocks are placed, from the player; one, two and three high."""
+FALL_S, WALK_S = 1.0, 1.2
 LAG_S = 0.15
 TOGETHER = 5
 """So many figures should be in the picture."""
@@ -43,17 +44,16 @@ class Script:
         if self._start is None:
             self._start, self._began = place, now
             window.core.lag_s, window.ghost = LAG_S, True
-        if now - self._began < 2.0:  # has fallen to the ground, and walks towards the middle
-            if now - self._began < 1.0:
-                self._start = place
-            self.done["walked"] = math.dist(place[:2], self._start[:2])
-            x, y = 32 - place[0], 32 - place[1]
-            length = math.hypot(x, y) or 1.0
-            return (x / length, y / length, False) if now - self._began > 1.0 else (0.0, 0.0, False)
-        if self.done.get("jumped", 0.0) < 0.5 or now - self._began < 3.5:
+        if now - self._began < FALL_S:
+            self._start = place
+            return 0.0, 0.0, False
+        if now - self._began < FALL_S + WALK_S:  # up on the screen, over what is in the way
+            self.done["walked"] = max(self.done.get("walked", 0.0), math.dist(place[:2], self._start[:2]))
+            return -0.7, 0.7, not all(view.me.velocity[:2])
+        if self.done.get("jumped", 0.0) < 0.5 or now - self._began < FALL_S + WALK_S + 1.5:
             self._start = min(self._start, place, key=lambda each: each[2]) if "jumped" in self.done else place
             self.done["jumped"] = max(self.done.get("jumped", 0.0), place[2] - self._start[2])
-            return 0.0, 0.0, now - self._began < 3.0
+            return 0.0, 0.0, now - self._began < FALL_S + WALK_S + 1.0
         if not self._plan and "placed" not in self.done:
             x, y, z = (int(part // 1) for part in place)
             self._plan = [(x + i, y + j, z + k) for n, (i, j) in enumerate(TOWER) for k in range(n + 1)]

@@ -12,6 +12,7 @@ from scripts.examples.tag_brain import wish
 from server.rules import Rules
 from server.session import Player
 from shared.scene import Scene
+from shared.units import SEGMENT
 from shared.world import OverlapError
 
 THINK_TICKS = 4
@@ -93,14 +94,17 @@ class Tag(Rules):
         safe = {entity for entity in places if game.tick < game.get(entity, "safe", 0)}
         for entity in places:
             if entity not in game.players:
-                x, y, jump = wish(entity, game.tick, places, game.velocity(entity), its, safe)
+                x, y, jump = wish(game.scene, entity, game.tick, places, game.velocity(entity), its, safe)
                 game.steer(entity, x, y, jump=jump)
 
     def _plant_trees(self, count: int) -> None:
         game = self.game
+        low, high = game.scene.origin[2] * SEGMENT, (game.scene.origin[2] + game.scene.size[2]) * SEGMENT
         for _ in range(count):
-            x, y = game.random.randrange(4, 60), game.random.randrange(4, 60)
-            ground = next(z for z in range(31, -1, -1) if game.block(x, y, z) or not z) + 1
+            x, y = (int(part) + game.random.randrange(-22, 23) for part in game.random.choice(game.scene.spawns)[:2])
+            ground = next((z for z in range(high - 8, low, -1) if game.block(x, y, z)), high) + 1
+            if game.block(x, y, ground - 1) == LEAVES:
+                continue
             for z in range(ground, ground + 4):
                 game.set_block(x, y, z, TRUNK)
             for i in range(-1, 2):

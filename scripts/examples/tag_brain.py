@@ -7,6 +7,8 @@ from typing import Any
 from client_sdk.bots import Random
 from shared.checks import Vec
 from shared.inputs import Input, make_input
+from shared.scene import Scene
+from shared.units import SEGMENT
 from shared.world import World
 
 AFRAID_BLOCKS = 11.0
@@ -14,7 +16,13 @@ AFRAID_BLOCKS = 11.0
 
 
 def wish(
-    me: int, tick: int, places: Mapping[int, Vec], velocity: Vec, its: Collection[int], safe: Collection[int]
+    scene: Scene,
+    me: int,
+    tick: int,
+    places: Mapping[int, Vec],
+    velocity: Vec,
+    its: Collection[int],
+    safe: Collection[int],
 ) -> tuple[float, float, bool]:
     """A direction (east, north), and whether to jump: after the nearest who can be tagged, or away from who is it.
 
@@ -37,7 +45,7 @@ def wish(
     else:
         x, y = 0.6 * math.cos(stroll), 0.6 * math.sin(stroll)
     if me not in its:  # the middle is safer than the rim
-        x, y = x + ((32 - here[0]) / 32) ** 3, y + ((32 - here[1]) / 32) ** 3
+        x, y = x - _off_middle(scene, 0, here[0]) ** 3, y - _off_middle(scene, 1, here[1]) ** 3
     blocked = (abs(x) > 0.1 and velocity[0] == 0) or (abs(y) > 0.1 and velocity[1] == 0)
     return x, y, blocked
 
@@ -58,8 +66,14 @@ class TagPlayer:
         places = {entity: world.position(entity) for entity in states[:, 0].tolist()}
         its = states[states[:, 1] == it, 0].tolist()
         safe = {entity for entity, said in self._attributes.items() if world.tick < said.get("safe", 0)}
-        x, y, jump = wish(me, world.tick, places, world.velocity(me), its, safe)
+        x, y, jump = wish(world.scene, me, world.tick, places, world.velocity(me), its, safe)
         return make_input(x, y, jump=jump)
+
+
+def _off_middle(scene: Scene, axis: int, at: float) -> float:
+    """How far off the middle of the scene a place is: 1 at its rim."""
+    half = scene.size[axis] * SEGMENT / 2
+    return (at - scene.origin[axis] * SEGMENT) / half - 1
 
 
 def _way(here: Vec, there: Vec) -> tuple[float, float]:

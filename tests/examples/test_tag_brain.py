@@ -10,13 +10,14 @@ from shared.inputs import JUMP
 from shared.scene import load_scene
 from shared.world import World
 
+MEADOW = load_scene("meadow")
 HERE = (32.0, 32.0, 9.0)
 
 
 def test_who_is_it_runs_after_the_nearest_who_can_be_tagged() -> None:
     places = {1: HERE, 2: (34.0, 32.0, 9.0), 3: (32.0, 40.0, 9.0)}
-    assert wish(1, 0, places, (1.0, 1.0, 0.0), [1], [])[:2] == (1.0, 0.0)
-    assert wish(1, 0, places, (1.0, 1.0, 0.0), [1], [2])[:2] == (0.0, 1.0)
+    assert wish(MEADOW, 1, 0, places, (1.0, 1.0, 0.0), [1], [])[:2] == (1.0, 0.0)
+    assert wish(MEADOW, 1, 0, places, (1.0, 1.0, 0.0), [1], [2])[:2] == (0.0, 1.0)
 
 
 @pytest.mark.parametrize("me", [1, 2, 3])
@@ -24,14 +25,22 @@ def test_who_is_it_runs_after_the_nearest_who_can_be_tagged() -> None:
 def test_the_others_run_away_from_whoever_is_it(me: int, angle: int) -> None:
     way = math.cos(angle), math.sin(angle)
     places = {me: HERE, 9: (32 + 6 * way[0], 32 + 6 * way[1], 9.0)}
-    x, y, _ = wish(me, 0, places, (1.0, 1.0, 0.0), [9], [])
+    x, y, _ = wish(MEADOW, me, 0, places, (1.0, 1.0, 0.0), [9], [])
     assert x * way[0] + y * way[1] < -0.5
+
+
+def test_nobody_runs_out_of_the_scene() -> None:
+    for scene in (MEADOW, load_scene("hills")):
+        east = scene.size[0] * 32.0
+        for me in range(1, 9):
+            x, _, _ = wish(scene, me, 0, {me: (east - 0.5, east / 2, 9.0)}, (1.0, 1.0, 0.0), [], [])
+            assert x < 0
 
 
 def test_who_gets_no_further_jumps() -> None:
     places = {1: HERE, 2: (36.0, 32.0, 9.0)}
-    assert not wish(1, 0, places, (5.0, 0.0, 0.0), [1], [])[2]
-    assert wish(1, 0, places, (0.0, 0.0, 0.0), [1], [])[2]
+    assert not wish(MEADOW, 1, 0, places, (5.0, 0.0, 0.0), [1], [])[2]
+    assert wish(MEADOW, 1, 0, places, (0.0, 0.0, 0.0), [1], [])[2]
 
 
 def test_a_bot_sees_in_its_world_who_is_it_and_learns_who_is_safe() -> None:
