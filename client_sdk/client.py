@@ -15,8 +15,9 @@ from collections.abc import Mapping
 from types import TracebackType
 from typing import Any, Protocol
 
-from client_sdk.core import Core
 from client_sdk.events import Event, Stats
+from client_sdk.linked import LinkedCore
+from client_sdk.links import Path
 from client_sdk.picture import View
 from client_sdk.transports.connection import Connection
 from client_sdk.transports.polling import PollingTransport
@@ -51,7 +52,7 @@ class Client:
         transport: what carries its messages.
     """
 
-    def __init__(self, core: Core, transport: Transport) -> None:
+    def __init__(self, core: LinkedCore, transport: Transport) -> None:
         self.core = core
         self._transport = transport
 
@@ -66,6 +67,7 @@ class Client:
         patience_s: float = PATIENCE_S,
         timeout: float = 5.0,
         tls: ssl.SSLContext | None = None,
+        link: str | Path | None = None,
     ) -> "Client":
         """Connects to a server, and returns once it has answered; joining goes on in `poll` and `update`.
 
@@ -77,11 +79,14 @@ class Client:
             patience_s: after a lost connection, it tries to come back for so long; 0: not at all.
             timeout: the longest that this may block, in seconds.
             tls: whom to trust for wss://; None: whom the system trusts.
+            link: see `link`.
 
         Raises:
+            ValueError: there is no such link.
             ConnectError: there is no connection; the text says why and what to do.
         """
-        core = Core(name, scene, token=token, patience_s=patience_s)
+        core = LinkedCore(name, scene, token=token, patience_s=patience_s)
+        core.link = link
         return cls(core, PollingTransport(Connection(url, core), timeout, tls))
 
     @property
@@ -108,6 +113,21 @@ class Client:
     def entity(self) -> int:
         """The own entity; 0 before the server has given one."""
         return self.core.entity
+
+    @property
+    def link(self) -> Path | None:
+        """A worse connection than there is, to feel one while developing: `client.link = "wifi"`.
+
+        Any preset of `client_sdk.links`, or a `Path` of one's own; None: none. May change at any time.
+
+        Raises:
+            ValueError: there is no preset of that name.
+        """
+        return self.core.link
+
+    @link.setter
+    def link(self, link: str | Path | None) -> None:
+        self.core.link = link
 
     @property
     def stats(self) -> Stats:

@@ -72,6 +72,7 @@ CLOCK_S = 1.0
 COME_AGAIN = (messages.TOO_SLOW, messages.GOING_AWAY)
 """The connection was at fault, not the player."""
 EVENTS_MAX = 1000
+READ_BYTES = 64 * 1024
 
 
 class _Copy(NamedTuple):
@@ -146,6 +147,11 @@ class Core:
         self._late = False
         self._wrong = ""
         self._open = False
+
+    @property
+    def appetite(self) -> int:
+        """So many bytes should be read of the connection at once."""
+        return READ_BYTES
 
     # -- what comes in -------------------------------------------------------------------------------------
 

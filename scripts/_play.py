@@ -11,16 +11,13 @@ os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
 import pygame
 
 import _play_server
-from _play_lag import LaggedCore
 from _play_script import Script
 from _play_window import Window, keyboard
 from client_sdk.client import Client
-from client_sdk.transports.connection import ConnectError, Connection
-from client_sdk.transports.polling import PollingTransport
+from client_sdk.transports.connection import ConnectError
 
 GAME = "scripts.examples.tag:Tag"
 FRAMES_PER_S = 60
-CONNECT_S = 5.0
 SCRIPT_S = 120.0
 """A scripted session that is not through by then has failed."""
 
@@ -52,11 +49,9 @@ def main(argv: list[str] | None = None) -> int:
                 url = stack.enter_context(_play_server.server(options.game, options.scene))
             count = options.bots if options.bots is not None else 0 if options.url else 4
             stack.enter_context(_play_server.bots(url, count))
-            core = LaggedCore(options.name)
-            core.lag_s = options.lag / 1000
-            client = stack.enter_context(Client(core, PollingTransport(Connection(url, core), CONNECT_S)))
+            client = stack.enter_context(Client.connect(url, name=options.name))
             title = "Sovereign Netcode" if options.url else options.game.rpartition(":")[2]
-            return play(client, core, script, title)
+            return play(client, options.lag / 1000, script, title)
     except (ConnectError, RuntimeError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 1
@@ -64,11 +59,12 @@ def main(argv: list[str] | None = None) -> int:
         return 0
 
 
-def play(client: Client, core: LaggedCore, script: Script | None, title: str) -> int:
+def play(client: Client, lag_s: float, script: Script | None, title: str) -> int:
     """Until somebody ends it; the exit code."""
     pygame.display.init()
     pygame.font.init()
-    window = Window(client, core, script or keyboard, title)
+    window = Window(client, script or keyboard, title)
+    window.lag(lag_s)
     clock, started = pygame.time.Clock(), time.monotonic()
     while not window.over:
         now = time.monotonic()

@@ -43,7 +43,8 @@ class Script:
         place = view.me.position
         if self._start is None:
             self._start, self._began = place, now
-            window.core.lag_s, window.ghost = LAG_S, True
+            window.lag(LAG_S)
+            window.ghost = True
         if now - self._began < FALL_S:
             self._start = place
             return 0.0, 0.0, False

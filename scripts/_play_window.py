@@ -9,9 +9,9 @@ import pygame
 from _play_figures import INK, OWN, TONES, WHITE, Actor, draw_ghost, label, screen
 from _play_hud import Hud, network_lines
 from _play_iso import CHOICE, Colour, Ground, Point, colour_of, project, target_of, top_of
-from _play_lag import LaggedCore
 from client_sdk.client import Client
 from client_sdk.events import Answered, Diverged, Event, Happened, Left
+from client_sdk.links import Path
 from client_sdk.picture import Figure, View
 from shared.checks import Cell, Vec
 from shared.edits import REACH_BLOCKS
@@ -42,19 +42,19 @@ class Window:
     """One player's window.
 
     Args:
-        client: connects, or has joined.
-        core: its core, whose latency the keys [ and ] change.
+        client: connects, or has joined; the keys [ and ] change its link.
         pilot: decides where to go.
         title: shown above.
     """
 
-    def __init__(self, client: Client, core: LaggedCore, pilot: Pilot, title: str) -> None:
-        self.client, self.core, self.title = client, core, title
+    def __init__(self, client: Client, pilot: Pilot, title: str) -> None:
+        self.client, self.core, self.title = client, client.core, title
         self.events: list[Event] = []
         """Those of the latest frame."""
         self.actors: list[Actor] = []
         """Everybody in sight."""
         self.ghost = False
+        self.lag_s = 0.0
         self.kind = FIRST_KIND
         self.over = ""
         """Why it is over."""
@@ -88,6 +88,11 @@ class Window:
         """Places (kind 1 to 255) or removes (0) a block; the number of the answer."""
         return self.client.edit(*cell, kind)
 
+    def lag(self, seconds: float) -> None:
+        """Adds so much to the round trip."""
+        self.lag_s = seconds
+        self.client.link = Path(seconds / 2) if seconds else None
+
     def save(self, path: str) -> None:
         """Saves what is shown as a picture."""
         pygame.image.save(self._screen, path)
@@ -119,9 +124,9 @@ class Window:
             if event.key == pygame.K_g:
                 self.ghost = not self.ghost
             elif event.key == pygame.K_LEFTBRACKET:
-                self.core.lag_s = max(self.core.lag_s - LAG_STEP_S, 0.0)
+                self.lag(max(self.lag_s - LAG_STEP_S, 0.0))
             elif event.key == pygame.K_RIGHTBRACKET:
-                self.core.lag_s = min(self.core.lag_s + LAG_STEP_S, LAG_MAX_S)
+                self.lag(min(self.lag_s + LAG_STEP_S, LAG_MAX_S))
             elif pygame.K_1 <= event.key < pygame.K_1 + len(CHOICE):
                 self.kind = FIRST_KIND + event.key - pygame.K_1
         elif event.type == pygame.MOUSEBUTTONDOWN and event.button in (1, 3):
@@ -176,7 +181,7 @@ class Window:
             title=self.title,
             left_s=left_s,
             actors=self.actors,
-            network=network_lines(self.client, now, self.core.lag_s),
+            network=network_lines(self.client, now, self.lag_s),
             choice=colour_of(self.kind),
         )
         pygame.display.flip()

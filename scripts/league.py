@@ -36,8 +36,8 @@ from rich.console import Console
 from rich.table import Table
 
 from client_sdk.clock import PRICE, SAFETY, STALL_S, LeadController, PricedLead, ServerClock, Timeline
+from client_sdk.links import PRESETS, Weather, Wire
 from controllers import RIVALS, Rival
-from tests.links import PRESETS, Weather, Wire
 
 RATE = 32
 TICK_MS = 1000 / RATE
@@ -64,7 +64,7 @@ class Trial:
     """One controller on one link.
 
     Args:
-        preset: see `tests.links.PRESETS`.
+        preset: see `client_sdk.links.PRESETS`.
         lead: the controller; a `Rival` hears of pings and snapshots, too.
         seed: everything random comes from it, and nothing of it from what the controller does.
     """
@@ -100,7 +100,7 @@ class Trial:
         self._next_ping = 0.0
 
     def at(self, when: float, act: Callable[[], None]) -> None:
-        """See `tests.links.Scheduler`."""
+        """See `client_sdk.links.Scheduler`."""
         heapq.heappush(self._queue, (when, next(self._number), act))
 
     def run(self, seconds: float) -> None:

@@ -3,8 +3,8 @@
 
     python scripts/netlab.py [--preset wifi] [--clients 10] [--minutes 10] [--seed 1] [--json OUT] [--plot OUT.png]
 
-The real server core and real SDK cores play over modelled TCP connections (`tests/links.py`). All players wander on
-`hills`, where they meet now and then. Late inputs are a share of all inputs; snapshot age is how old the newest
+The real server core and real SDK cores play over modelled TCP connections (`client_sdk/links.py`). All players wander
+on `hills`, where they meet now and then. Late inputs are a share of all inputs; snapshot age is how old the newest
 snapshot is, looked at once per tick; lead is how far ahead of the server the player's own tick is.
 """
 
@@ -26,8 +26,8 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
 import league
 from client_sdk.events import Corrected
+from client_sdk.links import PRESETS
 from shared.scene import load_scene
-from tests.links import PRESETS
 from tests.match import Match, Player, wander
 
 SETTLE_S = 10.0

@@ -1,7 +1,7 @@
 """A match in simulated time: the real server core and real SDK cores, one `now`, one seed.
 
 Nothing sleeps and nothing depends on the machine: every delivery, tick and frame is an entry in one queue, ordered
-by simulated time. The wires are those of `tests.links`: TCP, nothing lost or reordered, but sometimes late.
+by simulated time. The wires are those of `client_sdk.links`: TCP, nothing lost or reordered, but sometimes late.
 """
 
 import heapq
@@ -13,14 +13,14 @@ from itertools import count
 from client_sdk import bots
 from client_sdk.core import Core
 from client_sdk.events import Event
+from client_sdk.links import Path as Path
+from client_sdk.links import Weather, Wire
 from server.game import Game
 from server.limits import Limits
 from server.rules import Rules
 from server.session import Session
 from shared.inputs import Input
 from shared.scene import Scene
-from tests.links import Path as Path
-from tests.links import Weather, Wire
 
 Policy = Callable[[Core, random.Random], Input]
 

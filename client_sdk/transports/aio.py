@@ -8,6 +8,7 @@ Time is `time.monotonic()`: an event loop's own may be as coarse as a millisecon
 """
 
 import asyncio
+import socket
 import ssl
 import time
 from collections import deque
@@ -17,6 +18,8 @@ from typing import Any, cast
 
 from client_sdk.core import EVENTS_MAX, Core
 from client_sdk.events import Event, Stats
+from client_sdk.linked import LinkedCore
+from client_sdk.links import Path
 from client_sdk.picture import View
 from client_sdk.transports.connection import CLOSE_S, UNSENT_MAX, ConnectError, Connection, stalled, unreachable
 from shared.inputs import Input
@@ -40,14 +43,15 @@ class AsyncClient:
 
     def __init__(
         self,
-        connection: Connection,
+        core: LinkedCore,
+        url: str,
         before_update: Callable[[Core], None] | None = None,
         tls: ssl.SSLContext | None = None,
     ) -> None:
         self._tls = tls
         self._redialing: asyncio.Task[None] | None = None
-        self.core = connection.core
-        self._connection = connection
+        self.core = core
+        self._connection = Connection(url, core)
         self._before_update = before_update
         self._loop = asyncio.get_running_loop()
         self._transport: asyncio.Transport | None = None
@@ -70,6 +74,7 @@ class AsyncClient:
         patience_s: float = 30.0,
         timeout: float = TIMEOUT_S,
         tls: ssl.SSLContext | None = None,
+        link: str | Path | None = None,
         before_update: Callable[[Core], None] | None = None,
     ) -> "AsyncClient":
         """As `Client.connect`; does not block.
@@ -77,8 +82,9 @@ class AsyncClient:
         Raises:
             ConnectError: there is no connection; the text says why and what to do.
         """
-        core = Core(name, scene, token=token, patience_s=patience_s)
-        client = cls(Connection(url, core), before_update, tls)
+        core = LinkedCore(name, scene, token=token, patience_s=patience_s)
+        core.link = link
+        client = cls(core, url, before_update, tls)
         connection = client._connection
         try:
             await client._dial(timeout)
@@ -97,6 +103,21 @@ class AsyncClient:
     def entity(self) -> int:
         """The own entity; 0 before the server has given one."""
         return self.core.entity
+
+    @property
+    def link(self) -> Path | None:
+        """A worse connection than there is, to feel one while developing: `client.link = "wifi"`.
+
+        Any preset of `client_sdk.links`, or a `Path` of one's own; None: none. May change at any time.
+
+        Raises:
+            ValueError: there is no preset of that name.
+        """
+        return self.core.link
+
+    @link.setter
+    def link(self, link: str | Path | None) -> None:
+        self.core.link = link
 
     @property
     def stats(self) -> Stats:
@@ -184,9 +205,21 @@ class AsyncClient:
     def _received(self, data: bytes) -> None:
         now = time.monotonic()
         self._connection.receive(data, now)
+        self._read_on()
         self._pump(now)
         if self.core.next_update(now) < self._due - WAIT_S_MIN:
             self._schedule(now)
+
+    def _read_on(self) -> None:
+        """Reads while the core has an appetite."""
+        transport, hungry = self._transport, self.core.appetite > 0
+        if transport is None or hungry == transport.is_reading():
+            return
+        if hungry:
+            transport.resume_reading()
+        else:
+            transport.pause_reading()
+            transport.get_extra_info("socket").setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 0)
 
     async def _dial(self, timeout: float) -> None:
         """Connects, and waits until the server has answered."""
@@ -233,6 +266,7 @@ class AsyncClient:
         if self._before_update is not None and core.state == "playing":
             self._before_update(core)
         core.update(now)
+        self._read_on()
         if core.state == "away" and self._transport is None and now >= core.comeback.retry_at:
             core.comeback.trying()
             self._redialing = self._loop.create_task(self._redial())

@@ -8,9 +8,9 @@ import socket
 import ssl
 import time
 
+from client_sdk.core import READ_BYTES
 from client_sdk.transports.connection import UNSENT_MAX, ConnectError, Connection, stalled, unreachable
 
-READ_BYTES = 64 * 1024
 READS_MAX = 32
 """Reads per poll, 2 MiB: a game that was away for long does not hang in one poll."""
 NOT_NOW = (BlockingIOError, InterruptedError, ssl.SSLWantReadError, ssl.SSLWantWriteError)
@@ -141,10 +141,15 @@ class PollingTransport:
         return True
 
     def _read(self, sock: socket.socket, now: float) -> None:
-        buffer, receive = self._buffer, self._connection.receive
+        buffer, receive, core = self._buffer, self._connection.receive, self._connection.core
         for _ in range(READS_MAX):
+            room = core.appetite
+            if room < READ_BYTES:
+                sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, room)  # so that the rest stays with the server
+                if not room:
+                    return
             try:
-                n = sock.recv_into(buffer)
+                n = sock.recv_into(buffer, room)
             except NOT_NOW:
                 return
             except OSError as error:

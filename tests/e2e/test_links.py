@@ -17,12 +17,12 @@ import pytest
 from client_sdk.bots import Bot, Policy, Wander
 from client_sdk.core import Core
 from client_sdk.events import Diverged, Event, Left, Stats
+from client_sdk.links import HEADER_BYTES, PRESETS, Path, path
 from client_sdk.transports.aio import AsyncClient
 from shared.inputs import Input
 from shared.scene import load_scene
 from shared.world import World
 from tests.client_sdk.servers import real_server
-from tests.links import HEADER_BYTES, PRESETS, Path, path
 from tests.match import Match
 from tests.proxy import HIDDEN_BYTES, PACKET_BYTES, Proxy
 

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from client_sdk.client import Client
+from client_sdk.linked import LinkedCore
 from shared import kernels
 from shared.blocks import Blocks
 from shared.inputs import NEUTRAL, Input
@@ -27,7 +28,6 @@ os.environ["PYGAME_HIDE_SUPPORT_PROMPT"] = "1"
 import pygame  # noqa: E402
 
 import _play_iso as iso  # noqa: E402
-from _play_lag import LaggedCore  # noqa: E402
 from _play_window import SIZE, Window, keyboard  # noqa: E402
 from scripts.examples.tag import Tag  # noqa: E402
 
@@ -117,9 +117,9 @@ class Session:
 
     def __init__(self, latency_s: float = 0.01) -> None:
         self.match = Match(load_scene("meadow"), 5, rules=Tag())
-        self.core = LaggedCore("Ann")
+        self.core = LinkedCore("Ann")
         self.player: Player = self.match.join(self._wish, Line(latency_s), self.core)
-        self.window = Window(Client(self.core, Idle()), self.core, keyboard, "Tag")
+        self.window = Window(Client(self.core, Idle()), keyboard, "Tag")
         self.run(2)
 
     def _wish(self, core: object, rng: random.Random) -> Input:
@@ -156,10 +156,10 @@ def test_everybody_is_in_the_picture_and_the_keys_do_what_they_say() -> None:
     session.press(pygame.K_3)
     assert window.kind == 9
     session.press(pygame.K_LEFTBRACKET)
-    assert core.lag_s == 0
+    assert core.link is None
     session.press(pygame.K_RIGHTBRACKET)
     session.press(pygame.K_RIGHTBRACKET)
-    assert core.lag_s == 0.1
+    assert core.link == Line(0.05)
     session.run(3)
     assert core.stats.divergences == 0
     assert "closed" not in window.over
@@ -187,8 +187,8 @@ def test_the_mouse_places_and_digs(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_the_latency_of_the_keys_is_as_much_as_they_say() -> None:
     match = Match(load_scene("flat"), 5)
-    core = LaggedCore("Ann")
-    core.lag_s = 0.2
+    core = LinkedCore("Ann")
+    Window(Client(core, Idle()), keyboard, "").lag(0.2)
     match.join(lambda core, rng: NEUTRAL, Line(0.01), core).frame_s = 0.001
     match.run(5)
     assert core.state == "playing"

@@ -7,9 +7,9 @@ import pytest
 from client_sdk.comeback import Comeback
 from client_sdk.core import Core
 from client_sdk.events import Answered, Corrected, Disconnected, Joined, Left, Resumed
+from client_sdk.links import PRESETS, Path
 from server.limits import Limits
 from shared.scene import load_scene
-from tests.links import PRESETS, Path
 from tests.match import Match, Player, wander
 
 

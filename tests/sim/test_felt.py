@@ -3,10 +3,10 @@
 import pytest
 
 from client_sdk.events import Corrected
+from client_sdk.links import PRESETS
 from server.pacing import Pacing
 from shared.inputs import JUMP, Input
 from shared.scene import load_scene
-from tests.links import PRESETS
 from tests.match import Match, Player, wander
 
 TICK_MS = 1000 / 32

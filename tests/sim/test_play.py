@@ -6,10 +6,10 @@ import pytest
 
 from client_sdk.core import Core
 from client_sdk.events import Diverged, Left, Resynchronised, SegmentLoaded
+from client_sdk.links import PRESETS
 from shared.inputs import JUMP, Input
 from shared.messages import Command, decode_from_client
 from shared.scene import load_scene
-from tests.links import PRESETS
 from tests.match import Match, Path, Player, wander
 
 

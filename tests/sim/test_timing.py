@@ -14,9 +14,9 @@ import pytest
 
 from client_sdk.clock import PricedLead
 from client_sdk.core import Core
+from client_sdk.links import PRESETS
 from shared.inputs import Input
 from shared.scene import load_scene
-from tests.links import PRESETS
 from tests.match import Match
 
 sys.path.insert(0, str(File(__file__).parents[2] / "scripts"))

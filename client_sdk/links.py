@@ -10,11 +10,13 @@ game's thin stream hardly ever meets them: the congestion window, delayed acknow
 `Weather` is what happens to both directions of a connection at the same time; it is drawn from a seed as time goes on.
 """
 
+import heapq
 import math
 import random
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from itertools import count
 from typing import Protocol
 
 PACKET_BYTES = 1448
@@ -79,6 +81,44 @@ PRESETS = {
     "outage": replace(path(50, 2), outage=(3.0, 0.12)),
     "thin": replace(path(60, 5), rate=30e3),
 }
+
+
+def named(link: str | Path | None) -> Path | None:
+    """A preset by its name; a path, or None for no link at all, as it is.
+
+    Raises:
+        ValueError: there is no preset of that name.
+    """
+    if isinstance(link, str):
+        if link not in PRESETS:
+            raise ValueError(f"link = {link!r}: must be one of {', '.join(PRESETS)}, a Path, or None")
+        return PRESETS[link]
+    return link
+
+
+class Agenda:
+    """The scheduler of who is told the time: what is filed is done, in order, once its time has come."""
+
+    def __init__(self, now: float) -> None:
+        self.now = now
+        self._queue: list[tuple[float, int, Callable[[], None]]] = []
+        self._number = count()
+
+    @property
+    def due(self) -> float:
+        """When there is something to do."""
+        return self._queue[0][0] if self._queue else math.inf
+
+    def at(self, when: float, act: Callable[[], None]) -> None:
+        """Files something for a time."""
+        heapq.heappush(self._queue, (when, next(self._number), act))
+
+    def advance(self, now: float) -> None:
+        """Does all that was to be done up to now."""
+        while self._queue and self._queue[0][0] <= now:
+            self.now, _, act = heapq.heappop(self._queue)
+            act()
+        self.now = max(self.now, now)
 
 
 class Weather:
@@ -173,6 +213,24 @@ class Wire:
             self._waiting.append(packet)
             self._transmit(packet)
 
+    @property
+    def idle(self) -> bool:
+        """Whether everything has arrived."""
+        return not self._waiting
+
+    @property
+    def busy(self) -> bool:
+        """Whether something waits for the line."""
+        return self._free > self._time.now
+
+    def waiting(self) -> list[bytes]:
+        """The messages that have not arrived."""
+        return [packet.last_of for packet in self._waiting if packet.last_of is not None]
+
+    def follow(self, weather: Weather) -> None:
+        """Another path from here on; what is under way stays in front."""
+        self._weather, self._path = weather, weather.path
+
     def outstanding(self) -> int:
         """Bytes sent and not yet acknowledged."""
         while self._unacked and self._unacked[0][0] <= self._time.now:
@@ -221,6 +279,7 @@ class Wire:
         back = self._time.now + self._path.delay_s + self._path.jitter_s / 2
         while self._waiting and self._waiting[0].arrived:
             first = self._waiting.popleft()
+            self.outstanding()  # lets go of what has been acknowledged, where nobody asks
             self._unacked.append((back, first.bytes))
             if first.last_of is not None:
                 self._deliver(first.last_of)
