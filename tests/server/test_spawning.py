@@ -1,0 +1,52 @@
+"""Where players appear: at a spawn, or beside it in a crowd, which must not make a join dear."""
+
+import pytest
+
+from server.spawning import OFFSETS, Spawns
+from shared.world import OverlapError, World
+from tests.worlds import build, floor
+
+
+def plain() -> World:
+    return build([floor()], player="person", spawns=((0.0, 0.0, 0.0), (8.0, 0.0, 0.0)))
+
+
+def test_spawns_are_used_in_turn_and_a_crowd_stands_apart() -> None:
+    world = plain()
+    spawns = Spawns(world)
+    places = {world.position(entity) for entity in (spawns.spawn() for _ in range(20)) if entity is not None}
+    assert {(0.0, 0.0, 0.0), (8.0, 0.0, 0.0)} <= places
+    assert len(places) == 20
+
+
+def test_a_join_into_a_crowd_tries_few_places(monkeypatch: pytest.MonkeyPatch) -> None:
+    world, failed = plain(), 0
+    spawns, real = Spawns(world), world.spawn
+
+    def counted(template: str, place: tuple[float, float, float]) -> int:
+        nonlocal failed
+        try:
+            return real(template, place)
+        except OverlapError:
+            failed += 1
+            raise
+
+    monkeypatch.setattr(world, "spawn", counted)
+    assert None not in [spawns.spawn() for _ in range(300)]
+    assert failed <= 300 * 2, "no more than the spawns themselves"
+
+
+def test_a_place_is_found_above_a_crowd_that_is_somewhere_below() -> None:
+    """Somebody next to every place, but none of them in the way: such places are tried in the end."""
+    world = build([floor()], player="person", spawns=((0.0, 0.0, 12.0),))
+    world.spawn("slab", (-2.0, -2.0, 12.0))
+    for i, j in OFFSETS[:168]:
+        world.spawn("person", (2.0 * i, 2.0 * j, 0.0))
+    entity = Spawns(world).spawn()
+    assert entity is not None
+    assert world.position(entity)[2] == 12.0
+
+
+def test_there_is_no_room_where_everything_is_solid() -> None:
+    world = build([[-32, -32, -32, 32, 32, 32, 1]], player="person", spawns=((0.0, 0.0, 0.0),))
+    assert Spawns(world).spawn() is None
