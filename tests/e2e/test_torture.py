@@ -1,0 +1,142 @@
+"""A hostile crowd on the server's port while honest players play: these get what they got before, and nothing is left.
+
+What the server does with each single peer is in `test_abuse.py`. Here there are many at a time, and what counts is
+the honest players: their snapshots and the server's lateness, during an attack beside before it, in the same run.
+"""
+
+import contextlib
+import json
+import re
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+
+from server.histogram import between
+from server.settings import KINDS
+from tests.e2e.processes import END_S, ROOT, ServerProcess, running, stats, until
+
+pytestmark = [
+    pytest.mark.e2e,
+    pytest.mark.slow,
+    pytest.mark.skipif(sys.platform != "linux", reason="the generator polls with epoll"),
+]
+
+HONEST = 12
+WINDOW_S = 5.0
+WINDOWS = 3
+"""One of so many must be good."""
+SHARE_MIN = 0.9
+"""Of the snapshots that the worst served honest player got before."""
+GROWTH_MB_MAX = 24.0
+BUSY = re.compile("stalled|suspended|goes on")
+"""What the watchdog says on a machine that others keep busy."""
+GATEWAYS = KINDS["gateway"].choices if "gateway" in KINDS else ("",)
+ATTACKS: dict[str, dict[str, Any]] = {
+    "half open": {"peers": {"nothing": 100, "half_a_request": 100, "slow_loris": 100}},
+    "slow readers": {"peers": {"never_reads": 30, "one_byte_a_second": 30}},
+    "rude": {"peers": {"mid_frame": 30, "rubbish": 10, "flood": 4}},
+    "a thousand connects per second": {"peers": {}, "connects_per_s": 1000},
+}
+
+
+class Script:
+    """One of the scripts that take an order, commands on their input, and answer with lines of JSON."""
+
+    def __init__(self, name: str, order: dict[str, Any]) -> None:
+        self.process = subprocess.Popen(
+            [sys.executable, str(ROOT / "scripts" / name), json.dumps(order)],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+        )
+
+    def tell(self, command: str) -> None:
+        assert self.process.stdin is not None
+        self.process.stdin.write(command + "\n")
+        self.process.stdin.flush()
+
+    def hear(self, wanted: str, value: int | None = None) -> dict[str, Any]:
+        """The next answer that has such an entry (of at least that value)."""
+        assert self.process.stdout is not None
+        for line in self.process.stdout:
+            told: dict[str, Any] = json.loads(line)
+            if wanted in told and (value is None or told[wanted] >= value):
+                return told
+        raise AssertionError("it has ended")
+
+    def end(self) -> None:
+        assert self.process.stdin is not None
+        self.process.stdin.close()
+
+
+@contextlib.contextmanager
+def script(name: str, order: dict[str, Any]) -> Iterator[Script]:
+    """A script at work; it has ended in the end."""
+    made = Script(name, order)
+    try:
+        with made.process:
+            yield made
+            made.end()
+    finally:
+        if made.process.poll() is None:
+            made.process.kill()
+
+
+def window(address: tuple[str, int], honest: Script) -> tuple[float, float]:
+    """What comes of some seconds: the worst share of the snapshots, and the p99 of the ticks' lateness in ms."""
+    before = stats(address)
+    honest.tell("begin")
+    time.sleep(WINDOW_S)
+    honest.tell("end")
+    found = honest.hear("snapshots_worst")
+    after = stats(address)
+    assert found["gone"] == 0
+    lateness = between(before["tick_lateness_counts"], after["tick_lateness_counts"])
+    return found["snapshots_worst"] / (after["ticks"] - before["ticks"]), lateness["p99"]
+
+
+def storm(server: ServerProcess, attack: dict[str, Any], tick_ms: float) -> None:
+    address = server.address()
+    order = {"port": address[1], "seed": 1, "rate": round(1000 / tick_ms), "joins_per_s": 100}
+    with script("_generator.py", order) as honest:
+        honest.tell(f"clients {HONEST}")
+        honest.hear("playing", HONEST)
+        share_before, late_before = window(address, honest)
+        rss = stats(address)["rss_mb"]
+        with script("_hostile.py", {"port": address[1], "seed": 1} | attack) as hostile:
+            time.sleep(1.0)  # they are at it
+            share, late = 0.0, 0.0
+            for _ in range(WINDOWS):  # others on this machine can only make it worse
+                share, late = window(address, honest)
+                if share >= SHARE_MIN * share_before and late <= max(tick_ms, 4 * late_before):
+                    break
+            hostile.end()
+            told = hostile.hear("made")
+        assert told["failed"] == []
+        assert set(attack["peers"]) <= set(told["made"])
+        print(
+            f"share {share_before:.3f} {share:.3f}, lateness p99 {late_before:.1f} {late:.1f} ms, made {told['made']}"
+        )
+        assert share >= SHARE_MIN * share_before
+        assert late <= max(tick_ms, 4 * late_before)
+        until(lambda: stats(address)["connections"] == HONEST + 1, 4 * END_S)  # and the one that asks
+        assert stats(address)["clients"] == HONEST
+        assert stats(address)["rss_mb"] - rss < GROWTH_MB_MAX
+        figures = stats(address)
+        assert figures["internal_errors"] == figures["ticks_failed"] == 0
+
+
+@pytest.mark.parametrize("gateway", GATEWAYS)
+@pytest.mark.parametrize("attack", ATTACKS.values(), ids=list(ATTACKS))
+def test_honest_players_are_served_during_an_attack_and_nothing_is_left_of_it(
+    attack: dict[str, Any], gateway: str
+) -> None:
+    flags = ("--gateway", gateway) if gateway else ()
+    with running("--port", "0", "--scene", "flat", "--tick-rate", "32", "--resume-s", "2", *flags) as server:
+        storm(server, attack, 1000 / 32)
+        assert server.end(15) == 0
+        assert [entry for entry in server.log(but="info") if not BUSY.search(entry["event"])] == []
