@@ -1,0 +1,163 @@
+"""A server within the program: single player, and tests of one's own game. No socket, no thread.
+
+    client = Loopback(Game(scene, rules=rules)).join("Ann")
+
+Theory of operation. Time is what the clients' calls say: whoever polls lets the game do the ticks that have come, each
+at its own time, so a program that hands in its own `now` plays as fast as it can and the same again every time. All
+clients of one game have to go by one clock. Where nobody has called for `LEAP_S`, the program stood still and so did
+the world: players come back to it as after a lost connection.
+"""
+
+import math
+from typing import Any, Protocol
+
+from client_sdk.client import PATIENCE_S, Client
+from client_sdk.linked import LinkedCore
+from client_sdk.links import Path
+from shared.scene import Scene
+
+LEAP_S = 2.0
+GONE = 1006
+"""What WebSockets call a connection that broke off."""
+
+
+class Host(Protocol):
+    """What a game has to offer; `server.game.Game` does."""
+
+    scene: Scene
+
+    def open(self, link: Any, now: float) -> Any:
+        """A connection is there; the session that it is known by."""
+
+    def receive(self, session: Any, data: bytes, now: float) -> None:
+        """One message of a client."""
+
+    def lost(self, session: Any, now: float) -> None:
+        """The connection is gone."""
+
+    def tick(self, deadline: float, now: float) -> None:
+        """One tick, due at `deadline`."""
+
+
+class Loopback:
+    """A game and its time.
+
+    Args:
+        game: is played from the first poll of a client on, and by nobody else.
+    """
+
+    def __init__(self, game: Host) -> None:
+        self.game = game
+        self._seats: list[_Seat] = []
+        self._began = -math.inf
+        self._ticks = 0
+
+    def join(self, name: str = "", *, token: str = "", link: str | Path | None = None) -> Client:
+        """A further player, who is in after some polls and updates: half a second of them.
+
+        Args:
+            name: shown to others, up to 32 characters.
+            token: for a game that asks for one.
+            link: see `Client.link`.
+
+        Raises:
+            ValueError: there is no such link.
+        """
+        core = LinkedCore(name, token=token, patience_s=PATIENCE_S)
+        core.link = link
+        seat = _Seat(self, core)
+        self._seats.append(seat)
+        return Client(core, seat)
+
+    def advance(self, now: float) -> None:
+        """Does the ticks that have come."""
+        tick_s = 1.0 / self.game.scene.tick_rate
+        if now > self._began + self._ticks * tick_s + LEAP_S:
+            for seat in self._seats:
+                seat.leap(now)
+            self._began, self._ticks = now, 0
+        while (due := self._began + self._ticks * tick_s) <= now:
+            self._ticks += 1
+            self.game.tick(due, due)
+
+    def _leave(self, seat: "_Seat") -> None:
+        if seat in self._seats:
+            self._seats.remove(seat)
+
+
+class _Wire:
+    """The way to a client, as the game sees it."""
+
+    def __init__(self, core: LinkedCore) -> None:
+        self._core = core
+        self.inbox: list[bytes] = []
+        self.over: tuple[int, str] | None = None
+
+    def send(self, message: bytes) -> None:
+        self.inbox.append(message)
+
+    def outstanding(self) -> int:
+        return sum(map(len, self.inbox)) + self._core.outstanding()
+
+    def close(self, code: int, reason: str) -> None:
+        self.over = code, reason
+
+
+class _Seat:
+    """One client's transport."""
+
+    def __init__(self, loopback: Loopback, core: LinkedCore) -> None:
+        self._loopback, self._game, self._core = loopback, loopback.game, core
+        self._wire = _Wire(core)
+        self._session: Any = None
+        self._now = 0.0
+
+    def poll(self, now: float) -> None:
+        self._advance(now)
+        core = self._core
+        if self._session is None and (
+            core.state == "joining" or (core.state == "away" and now >= core.comeback.retry_at)
+        ):
+            core.comeback.trying()
+            self._wire = _Wire(core)
+            self._session = self._game.open(self._wire, now)
+            core.open(now)
+        self._read(now)
+        self.send(now)
+
+    def send(self, now: float) -> None:
+        self._advance(now)
+        if self._session is None:
+            return
+        for message in self._core.outgoing():
+            self._game.receive(self._session, message, now)
+        if self._core.close_request or self._core.state == "closed":
+            self._end(now)
+
+    def close(self, timeout: float) -> None:
+        self.send(self._now)
+        self._loopback._leave(self)
+
+    def leap(self, now: float) -> None:
+        """The program stood still: as if the connection had been lost, for whoever has joined."""
+        if self._session is not None and self._core.state == "playing":
+            self._end(now)
+            self._core.lost(GONE, "the program stood still", now)
+
+    def _advance(self, now: float) -> None:
+        self._now = now
+        self._loopback.advance(now)
+
+    def _read(self, now: float) -> None:
+        wire = self._wire
+        messages, wire.inbox = wire.inbox, []
+        for message in messages:
+            self._core.receive(message, now)
+        if wire.over is not None and self._session is not None:
+            self._end(now)
+            self._core.lost(*wire.over, now)
+
+    def _end(self, now: float) -> None:
+        self._game.lost(self._session, now)
+        self._session = None
+        self._wire.inbox.clear()
