@@ -15,10 +15,11 @@ from collections.abc import Mapping
 from types import TracebackType
 from typing import Any, Protocol
 
-from client_sdk.events import Event, Stats
+from client_sdk.events import Event
 from client_sdk.linked import LinkedCore
 from client_sdk.links import Path
 from client_sdk.picture import View
+from client_sdk.stats import Stats
 from client_sdk.transports.connection import Connection
 from client_sdk.transports.polling import PollingTransport
 from shared.inputs import make_input
@@ -131,8 +132,12 @@ class Client:
 
     @property
     def stats(self) -> Stats:
-        """Counters since the start."""
+        """Counters since the start, and figures of the moment."""
         return self.core.stats
+
+    def overlay(self) -> str:
+        """The figures that matter as a few lines of text, to draw over the picture (`stats.figures`: in pairs)."""
+        return self.core.stats.text()
 
     def poll(self, now: float | None = None) -> list[Event]:
         """What has happened since the last call, in order: `Joined`, `Corrected`, `Left`, ... Never blocks."""

@@ -13,15 +13,13 @@ import copy
 import math
 import struct
 from collections import deque
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from client_sdk.clock import LeadController, PricedLead, ServerClock, Timeline
 from client_sdk.comeback import Comeback
 from client_sdk.events import (
-    Answered,
-    Corrected,
     Disconnected,
     Diverged,
     Event,
@@ -31,13 +29,13 @@ from client_sdk.events import (
     Resumed,
     Resynchronised,
     SegmentLoaded,
-    Stats,
 )
+from client_sdk.orders import Orders
 from client_sdk.picture import NOTHING, Picture, View
 from client_sdk.prediction import NONDETERMINISM, Prediction, check_scene
+from client_sdk.replica import Replica
+from client_sdk.stats import Stats
 from shared import edits, messages
-from shared.blocks import unpack
-from shared.checks import Cell
 from shared.inputs import NEUTRAL, Input, clamp
 from shared.messages import (
     MARGIN_ONE,
@@ -73,14 +71,6 @@ COME_AGAIN = (messages.TOO_SLOW, messages.GOING_AWAY)
 """The connection was at fault, not the player."""
 EVENTS_MAX = 1000
 READ_BYTES = 64 * 1024
-
-
-class _Copy(NamedTuple):
-    """What a client knows of a server."""
-
-    prediction: Prediction
-    picture: Picture
-    clock: ServerClock
 
 
 class Core:
@@ -120,10 +110,9 @@ class Core:
         self.comeback = Comeback(patience_s)
         self._token = token
         self._resume = b""
-        self._filled: _Copy | None = None
+        self._filled: Replica | None = None
         """What the server's messages go into: after a return not yet what is played in."""
-        self._unanswered: dict[int, bytes] = {}
-        """Commands by number."""
+        self._orders = Orders()
         self._told = -1
         """The newest tick that the server has an input for."""
         self._compiled = compiled
@@ -133,9 +122,7 @@ class Core:
         self._out: list[bytes] = []
         self._events: deque[Event] = deque(maxlen=EVENTS_MAX)
         self._phases: Ring[float] = Ring(256)
-        self._pieces: tuple[Cell, bytearray] = ((0, 0, 0), bytearray())
         self._pings: deque[float] = deque(maxlen=16)
-        self._number = 0
         self._seen = 0.0  # of the last view; of the last update, where nothing is drawn
         self._draws = False
         self._newest = -1
@@ -187,17 +174,8 @@ class Core:
             RuntimeError: the client has not joined.
             ValueError: the name or the data are too long (32 characters, 1,024 bytes), or no MessagePack.
         """
-        if self.state not in ("playing", "away"):
-            raise RuntimeError("command: the client has not joined")
-        assert self.prediction is not None
-        if not 0 < len(name) <= messages.NAME_MAX or name == edits.NAME:
-            raise ValueError(
-                f"command {name[:80]!r}: must be 1 to {messages.NAME_MAX} characters, and not {edits.NAME!r}"
-            )
-        payload = messages.pack_value(data)
-        self._number += 1
-        self._order(Command(self._number, self.prediction.predicted.tick + self._delay + 1, self._seen, name, payload))
-        return self._number
+        tick = self._joined("command").predicted.tick + self._delay + 1
+        return self._order(self._orders.command(tick, self._seen, name, data))
 
     def edit(self, x: int, y: int, z: int, kind: int) -> int:
         """Places (kind 1 to 255) or removes (0) a block with the next tick; the number by which it is `Answered`.
@@ -205,14 +183,10 @@ class Core:
         Raises:
             RuntimeError: the client has not joined.
         """
-        if self.state not in ("playing", "away"):
-            raise RuntimeError("edit: the client has not joined")
-        assert self.prediction is not None
-        edit = edits.Edit(x, y, z, kind)
-        self._number += 1
-        tick = self.prediction.edit(self._number, edit)
-        self._order(Command(self._number, tick, self._seen, edits.NAME, edits.pack(edit)))
-        return self._number
+        prediction, edit = self._joined("edit"), edits.Edit(x, y, z, kind)
+        number = self._orders.number()
+        tick = prediction.edit(number, edit)
+        return self._order(Command(number, tick, self._seen, edits.NAME, edits.pack(edit)))
 
     def close(self) -> None:
         """Says goodbye."""
@@ -241,6 +215,7 @@ class Core:
             return
         assert self.timeline is not None
         assert self.picture is not None
+        self.stats.measure(now)
         if self.state == "playing":
             self._reconcile(now)
             shown = self.picture.advance(self.clock, now)
@@ -322,61 +297,39 @@ class Core:
             clock = ServerClock()
             clock.rate = float(scene.tick_rate)
         prediction = Prediction(scene, welcome.entity, neighbours=self._neighbours, compiled=self._compiled)
-        self._filled = _Copy(prediction, Picture(scene, prediction), clock)
+        self._filled = Replica(scene, prediction, clock)
         if self.state == "joining":
             self._play_in(self._filled)
         elif welcome.entity == self.entity:
-            self._out += self._unanswered.values()
+            self._out += self._orders.again()
         else:
-            for number in self._unanswered:
-                self._events.append(Answered(number, False, "the connection was lost"))
-            self._unanswered.clear()
+            self._events += self._orders.give_up()
 
-    def _play_in(self, filled: "_Copy") -> None:
-        self.prediction, self.picture, self.clock = filled
+    def _play_in(self, filled: Replica) -> None:
+        self.prediction, self.picture, self.clock = filled.prediction, filled.picture, filled.clock
         self.entity = filled.prediction.entity
 
     def _terrain(self, terrain: Terrain) -> None:
-        """A piece of a segment; the edits that came before the last piece are made up for."""
         if self._filled is None:
             raise ProtocolError("Terrain before Welcome")
-        prediction = self._filled.prediction
-        segment = (terrain.x, terrain.y, terrain.z)
-        if terrain.offset == 0:
-            self._pieces = (segment, bytearray())
-            prediction.expect_segment(segment)
-        if self._pieces[0] != segment or len(self._pieces[1]) != terrain.offset:
-            raise ProtocolError("Terrain: a piece is missing")
-        self._pieces[1].extend(terrain.chunk)
-        if len(self._pieces[1]) < terrain.total:
-            return
-        try:
-            kinds = unpack(bytes(self._pieces[1]))
-        except ValueError as error:
-            raise ProtocolError(f"Terrain.chunk: {error}") from error
-        prediction.load_segment(segment, kinds)
-        self._events.append(SegmentLoaded(segment))
+        segment = self._filled.terrain(terrain)
+        if segment is not None:
+            self._events.append(SegmentLoaded(segment))
 
     def _snapshot(self, snapshot: Snapshot, now: float) -> None:
         if self._filled is None:
             raise ProtocolError("Snapshot before Welcome")
-        prediction = self._filled.prediction
-        if snapshot.tick <= prediction.confirmed.tick:
-            raise ProtocolError(f"Snapshot.tick = {snapshot.tick}: not newer than the one before")
+        self.stats.snapshots_skipped += self._filled.skipped(snapshot)
         self.stats.snapshots += 1
         self._told = max(self._told, snapshot.newest)
-        if len(prediction.confirmed):
-            self.stats.snapshots_skipped += snapshot.tick - prediction.confirmed.tick - 1
         self._late |= self._fates(snapshot, now)
         for number, verdict in np.frombuffer(snapshot.verdicts, VERDICT).tolist() if snapshot.verdicts else ():
-            if self._unanswered.pop(number, None) is None:
-                continue  # asked and answered twice
-            if self.prediction is not None:
-                self.prediction.settle(number, verdict == messages.DONE)
-            text = messages.VERDICT_TEXTS[min(verdict, len(messages.VERDICT_TEXTS) - 1)]
-            self._events.append(Answered(number, verdict == messages.DONE, text))
-        self._wrong = prediction.apply(snapshot) or self._wrong
-        self._filled.picture.interpolation.push(snapshot.tick, prediction.truth)
+            answered = self._orders.answer(number, verdict)
+            if answered is not None:
+                if self.prediction is not None:
+                    self.prediction.settle(number, answered.done)
+                self._events.append(answered)
+        self._wrong = self._filled.apply(snapshot) or self._wrong
 
     def _reconcile(self, now: float) -> None:
         """Compares the prediction with the newest snapshot: once per update, however many have come."""
@@ -389,7 +342,8 @@ class Core:
         self.stats.repredictions += done.repredicted
         picture.smooth(done, now)
         if done.correction:
-            self._corrected(done.correction)
+            self.stats.corrected(done.correction)
+            self._events.append(done.correction)
             if done.correction.cause == NONDETERMINISM:
                 self._wrong = f"own {', '.join(done.correction.fields)}"
         if self._wrong:
@@ -415,34 +369,25 @@ class Core:
         self.stats.inputs_neutralised += neutralised
         return missing > 0
 
-    def _corrected(self, correction: Corrected) -> None:
-        stats = self.stats
-        stats.corrections += 1
-        stats.corrections_by_cause[correction.cause] = stats.corrections_by_cause.get(correction.cause, 0) + 1
-        stats.correction_blocks.append(correction.blocks)
-        del stats.correction_blocks[:-EVENTS_MAX]
-        self._events.append(correction)
-
     def _try_to_join(self, now: float) -> None:
-        """Begins to play once the time, the own entity and the ground around it are known."""
-        prediction = self.prediction
-        if prediction is None or self.scene is None or not self.clock.ready:
+        """Begins to play once enough is known."""
+        filled = self._filled
+        if filled is None or not filled.complete:
             return
-        if self.entity not in prediction.confirmed or not prediction.grounded():
-            return
+        assert self.scene is not None
         clock = self.clock
         self.timeline = Timeline(clock.rate, self._lead.start(clock, now), now)
         self._restart(now)
         self.state = "playing"
-        self._events.append(Joined(self.entity, self.scene, prediction.predicted.tick))
+        self._events.append(Joined(self.entity, self.scene, filled.prediction.predicted.tick))
 
-    def _try_to_come_back(self, filled: "_Copy", now: float) -> None:
+    def _try_to_come_back(self, filled: Replica, now: float) -> None:
         """Goes on in the new copy of the world once as much is known of it as for joining."""
-        prediction, _, clock = filled
+        if not filled.complete:
+            return
+        prediction, clock = filled.prediction, filled.clock
         assert self.scene is not None
         assert self.prediction is not None
-        if not clock.ready or prediction.entity not in prediction.confirmed or not prediction.grounded():
-            return
         same = prediction.entity == self.entity
         if same:
             prediction.adopt(self.prediction)
@@ -474,10 +419,18 @@ class Core:
         self.state = "away"
         self._events.append(Disconnected(left.reason, self.comeback.retry_at - now))
 
-    def _order(self, command: Command) -> None:
-        self._unanswered[command.number] = encode(command)
+    def _joined(self, what: str) -> Prediction:
+        if self.state not in ("playing", "away"):
+            raise RuntimeError(f"{what}: the client has not joined")
+        assert self.prediction is not None
+        return self.prediction
+
+    def _order(self, command: Command) -> int:
+        """Sends it, now or with the next connection; its number."""
+        message = self._orders.file(command)
         if self._open:
-            self._out.append(self._unanswered[command.number])
+            self._out.append(message)
+        return command.number
 
     def set_input_delay(self, ticks: int) -> None:
         """Shows the effect of inputs so many ticks (0 to 3) later than they are sent: fewer and shorter replays.
@@ -523,6 +476,8 @@ class Core:
             self.stats.inputs_sent += to + 1 - first
             self.stats.rtt_s = self.clock.rtt_s
             self.stats.lead_ticks = timeline.phase - self.clock.phase
+            self.stats.lead_s = self.stats.lead_ticks / self.clock.rate
+            self.stats.snapshot_age_s = max(self.clock.tick(now) - prediction.confirmed.tick, 0.0) / self.clock.rate
             row = bytes(part & 0xFF for part in self.wish)
             if self.state == "playing":
                 self._send(Inputs(first, prediction.confirmed.tick, row * (to + 1 - first)))

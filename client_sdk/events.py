@@ -1,6 +1,6 @@
 """What happens to a client, as values: `poll()` gives them in order, a `match` statement tells them apart."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 from shared.checks import Cell
@@ -109,28 +109,3 @@ class SegmentLoaded:
 Event = (
     Joined | Disconnected | Resumed | Left | Corrected | Answered | Happened | Diverged | Resynchronised | SegmentLoaded
 )
-
-
-@dataclass
-class Stats:
-    """Counters since the start. Lengths in blocks, times in seconds."""
-
-    snapshots: int = 0
-    snapshots_skipped: int = 0
-    bytes_down: int = 0
-    bytes_up: int = 0
-    inputs_sent: int = 0
-    inputs_late: int = 0
-    inputs_substituted: int = 0
-    inputs_neutralised: int = 0
-    corrections: int = 0
-    corrections_by_cause: dict[str, int] = field(default_factory=dict)
-    correction_blocks: list[float] = field(default_factory=list)
-    repredictions: int = 0
-    replayed_ticks: int = 0
-    resyncs: int = 0
-    reconnects: int = 0
-    divergences: int = 0
-    inputs_refused: int = 0
-    rtt_s: float = 0.0
-    lead_ticks: float = 0.0

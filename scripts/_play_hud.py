@@ -18,21 +18,9 @@ TOAST_S = 4.0
 MARGIN = 14
 
 
-def network_lines(client: Client, now: float, lag_s: float) -> list[tuple[str, str]]:
+def network_lines(client: Client, lag_s: float) -> list[tuple[str, str]]:
     """The figures of the connection, by name."""
-    stats, core = client.stats, client.core
-    rate = core.clock.rate
-    age = core.clock.tick(now) - core.prediction.confirmed.tick if core.prediction and core.clock.ready else 0.0
-    causes = [(f"   {cause}", f"{count}") for cause, count in sorted(stats.corrections_by_cause.items())]
-    return [
-        ("round trip", f"{stats.rtt_s * 1000:.0f} ms"),
-        ("added by [ ]", f"{lag_s * 1000:.0f} ms"),
-        ("lead", f"{stats.lead_ticks / rate * 1000:.0f} ms"),
-        ("snapshot age", f"{max(age, 0.0) / rate * 1000:.0f} ms"),
-        ("late inputs", f"{100 * stats.inputs_late / max(stats.inputs_sent, 1):.2f} %"),
-        ("corrections", f"{stats.corrections}"),
-        *causes,
-    ]
+    return [("added by [ ]", f"{lag_s * 1000:.0f} ms"), *client.stats.figures()]
 
 
 class Hud:

@@ -181,7 +181,7 @@ class Window:
             title=self.title,
             left_s=left_s,
             actors=self.actors,
-            network=network_lines(self.client, now, self.lag_s),
+            network=network_lines(self.client, self.lag_s),
             choice=colour_of(self.kind),
         )
         pygame.display.flip()

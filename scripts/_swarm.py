@@ -16,7 +16,8 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from client_sdk.bots import POLICIES, Bot
-from client_sdk.events import Left, Stats
+from client_sdk.events import Left
+from client_sdk.stats import Stats
 from client_sdk.transports.aio import AsyncClient
 from client_sdk.transports.connection import ConnectError
 

@@ -17,10 +17,11 @@ from types import TracebackType
 from typing import Any, cast
 
 from client_sdk.core import EVENTS_MAX, Core
-from client_sdk.events import Event, Stats
+from client_sdk.events import Event
 from client_sdk.linked import LinkedCore
 from client_sdk.links import Path
 from client_sdk.picture import View
+from client_sdk.stats import Stats
 from client_sdk.transports.connection import CLOSE_S, UNSENT_MAX, ConnectError, Connection, stalled, unreachable
 from shared.inputs import Input
 from shared.scene import Scene
@@ -121,8 +122,12 @@ class AsyncClient:
 
     @property
     def stats(self) -> Stats:
-        """Counters since the start."""
+        """Counters since the start, and figures of the moment."""
         return self.core.stats
+
+    def overlay(self) -> str:
+        """The figures that matter as a few lines of text, to draw over the picture (`stats.figures`: in pairs)."""
+        return self.core.stats.text()
 
     def set_input(self, wish: Input) -> None:
         """What the player wishes from now on (see `shared.inputs.make_input`)."""

@@ -1,0 +1,54 @@
+"""What the player has asked of the server: each order is answered once, and asked again after a lost connection."""
+
+from typing import Any
+
+from client_sdk.events import Answered
+from shared import edits, messages
+from shared.messages import Command, encode
+
+
+class Orders:
+    """Those that are not answered yet."""
+
+    def __init__(self) -> None:
+        self._number = 0
+        self._unanswered: dict[int, bytes] = {}
+
+    def number(self) -> int:
+        """That of a further order."""
+        self._number += 1
+        return self._number
+
+    def command(self, tick: int, seen: float, name: str, data: Any) -> Command:
+        """An order to the game's rules.
+
+        Raises:
+            ValueError: the name or the data are too long (32 characters, 1,024 bytes), or no MessagePack.
+        """
+        if not 0 < len(name) <= messages.NAME_MAX or name == edits.NAME:
+            raise ValueError(
+                f"command {name[:80]!r}: must be 1 to {messages.NAME_MAX} characters, and not {edits.NAME!r}"
+            )
+        payload = messages.pack_value(data)
+        return Command(self.number(), tick, seen, name, payload)
+
+    def file(self, command: Command) -> bytes:
+        """Keeps an order until it is answered; what to send."""
+        return self._unanswered.setdefault(command.number, encode(command))
+
+    def answer(self, number: int, verdict: int) -> Answered | None:
+        """The server's word on an order; None: it was asked twice, and this is the second answer."""
+        if self._unanswered.pop(number, None) is None:
+            return None
+        text = messages.VERDICT_TEXTS[min(verdict, len(messages.VERDICT_TEXTS) - 1)]
+        return Answered(number, verdict == messages.DONE, text)
+
+    def again(self) -> list[bytes]:
+        """What to send once more, to a server that knows which of them it has carried out."""
+        return list(self._unanswered.values())
+
+    def give_up(self) -> list[Answered]:
+        """Nobody will answer any more."""
+        numbers = list(self._unanswered)
+        self._unanswered.clear()
+        return [Answered(number, False, "the connection was lost") for number in numbers]
