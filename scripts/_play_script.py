@@ -11,7 +11,7 @@ from shared.inputs import JUMP, MOVE_MAX
 
 TOWER = ((2, 0), (2, -1), (2, -2))
 """Where blocks are placed, from the player; one, two and three high."""
-FALL_S, WALK_S = 1.0, 1.2
+WALK_BLOCKS, JUMP_BLOCKS = 3.0, 1.2
 LAG_S = 0.15
 TOGETHER = 5
 """So many figures should be in the picture."""
@@ -29,6 +29,7 @@ class Script:
         self._asked: set[int] = set()
         self._player = TagPlayer()
         self._start: tuple[float, float, float] | None = None
+        self._lowest = math.inf
         self._began = self._placed_at = self._tagged_at = 0.0
 
     def __call__(self, window: Window, view: View, now: float) -> Wish:
@@ -45,17 +46,19 @@ class Script:
             self._start, self._began = place, now
             window.lag(LAG_S)
             window.ghost = True
-        if now - self._began < FALL_S:
-            self._start = place
-            return 0.0, 0.0, False
-        if now - self._began < FALL_S + WALK_S:  # up on the screen, over what is in the way
-            self.done["walked"] = max(self.done.get("walked", 0.0), math.dist(place[:2], self._start[:2]))
+        if "walked" not in self.done:  # up on the screen, over what is in the way
+            way = math.dist(place[:2], self._start[:2])
+            if way > WALK_BLOCKS:
+                self.done["walked"] = way
             return -0.7, 0.7, not all(view.me.velocity[:2])
-        if self.done.get("jumped", 0.0) < 0.5 or now - self._began < FALL_S + WALK_S + 1.5:
-            self._start = min(self._start, place, key=lambda each: each[2]) if "jumped" in self.done else place
-            self.done["jumped"] = max(self.done.get("jumped", 0.0), place[2] - self._start[2])
-            return 0.0, 0.0, now - self._began < FALL_S + WALK_S + 1.0
-        if not self._plan and "placed" not in self.done:
+        if "jumped" not in self.done:
+            self._lowest = min(self._lowest, place[2])
+            if place[2] - self._lowest > JUMP_BLOCKS:
+                self.done["jumped"] = place[2] - self._lowest
+            return 0.0, 0.0, True
+        if not self._asked and not self._plan:
+            if view.me.velocity[2] != 0:
+                return 0.0, 0.0, False
             x, y, z = (int(part // 1) for part in place)
             self._plan = [(x + i, y + j, z + k) for n, (i, j) in enumerate(TOWER) for k in range(n + 1)]
             self._placed_at = now

@@ -10,7 +10,7 @@ from _play_figures import INK, OWN, TONES, WHITE, Actor, draw_ghost, label, scre
 from _play_hud import Hud, network_lines
 from _play_iso import CHOICE, Colour, Ground, Point, colour_of, project, target_of, top_of
 from client_sdk.client import Client
-from client_sdk.events import Answered, Diverged, Event, Happened, Left
+from client_sdk.events import Answered, Disconnected, Diverged, Event, Happened, Left, Resumed
 from client_sdk.links import Path
 from client_sdk.picture import Figure, View
 from shared.checks import Cell, Vec
@@ -112,6 +112,10 @@ class Window:
                 self._hud.say(_sentence(name, data, view), now)
             case Answered(done=False, verdict=verdict):
                 self._hud.say(f"not possible: {verdict}", now)
+            case Disconnected(reason=reason, wait_s=wait_s):
+                self._hud.say(f"{reason}: back in {wait_s:.0f} s", now)
+            case Resumed(away_s=away_s):
+                self._hud.say(f"back after {away_s:.1f} s", now)
             case Diverged(what=what):
                 self._hud.say(f"ALARM, the two worlds differ: {what}", now)
             case _:
