@@ -242,15 +242,10 @@ class Game:
         assert session.hello is not None
         player = self._returning(session, session.hello)
         if player is None:
-            entity = self._spawns.spawn()
-            if entity is None:
+            player = self.enter(session, session.hello.name)
+            if player is None:
                 self._refuse(session, messages.FULL, "no room to spawn")
                 return
-            player = self.players[entity] = Player(entity, session.hello.name, session.subject)
-            player.edits_left = 0.0  # else leaving and joining anew would give a burst each time
-            self.counters.joined += 1
-            session.seat(player)
-            self.stage.joined(player)
         else:
             self.counters.resumed += 1
             session.seat(player)
@@ -259,6 +254,18 @@ class Game:
         self.world.note(keeping.note_of(player))
         welcome = encode(Welcome(messages.VERSION, self.world.tick, player.entity, self._rules, token))
         session.greeting = (self.world.tick + 1, welcome)
+
+    def enter(self, session: Session, name: str) -> Player | None:
+        """A new player at a spawn, with that connection; ask between two ticks. None: there is no room."""
+        entity = self._spawns.spawn()
+        if entity is None:
+            return None
+        player = self.players[entity] = Player(entity, name, session.subject)
+        player.edits_left = 0.0  # else leaving and joining anew would give a burst each time
+        self.counters.joined += 1
+        session.seat(player)
+        self.stage.joined(player)
+        return player
 
     def _returning(self, session: Session, hello: Hello) -> Player | None:
         """The player that this is, if it was here before and still is; a connection that it still has is closed."""

@@ -1,0 +1,311 @@
+"""The game as an environment for learning agents: PettingZoo's parallel API, in one process, as fast as it computes.
+
+    env = Arena("meadow", agents=4, rules=Tag, reward="score", seconds=60)
+    observations, infos = env.reset(seed=1)
+    while env.agents:
+        actions = {agent: env.action_space(agent).sample() for agent in env.agents}
+        observations, rewards, terminations, truncations, infos = env.step(actions)
+
+It is the server's own `Game`, tick by tick, with nobody connected: what an agent learns here holds on a server. Bots'
+policies play in it as they are: `policy(env.world, env.entity(agent))` is an action. One seed reproduces an episode.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from server.game import Game
+from server.limits import Limits
+from server.recorder import RecordedWorld
+from server.rules import Rules
+from server.session import InputQueue, Session
+from server.stage import Stage
+from shared.inputs import MOVE_MAX, NEUTRAL, Input, clamp
+from shared.layout import FALLING, FLAGS, ID, TEMPLATE, VX, Int64s, X
+from shared.messages import Command, pack_value
+from shared.scene import Scene, load_scene
+from shared.units import BLOCK, BLOCK_SHIFT, RANGE_BLOCKS, SEGMENT, SEGMENT_SHIFT, SPEED, SPEED_MAX
+from shared.world import World
+
+try:
+    from gymnasium import spaces
+    from pettingzoo import ParallelEnv
+except ImportError as missing:
+    raise ImportError("agents need PettingZoo: pip install sovereign-netcode[agents]") from missing
+
+OTHERS = 8
+"""So many of the nearest entities an agent sees,"""
+OTHER_COLUMNS = 8
+"""each as its position and velocity relative to the own, its template, and 1 (0 in rows that stand for nobody)."""
+OWN_COLUMNS = 8
+"""The own position and velocity, template, and whether it falls."""
+AROUND = (-3, 4), (-3, 4), (-1, 4)
+"""The blocks that an agent sees, from the one with its feet in it: along x, y, z, the end excluded."""
+NO_BLOCK = 255
+"""Stands for what is not loaded: it stops everybody."""
+
+Array = npt.NDArray[Any]
+Observation = dict[str, Array]
+Reward = Callable[[Stage, int], float]
+
+
+class Arena(ParallelEnv):  # type: ignore[misc]  # it says nothing of its types
+    """A game with so many agents, which join at the start and play until the time is over.
+
+    Observations are a `Dict` of "own" [8] and "others" [8, 8] (float32; blocks and blocks/s), and "blocks" [5, 7, 7]
+    (uint8; kinds by z, y, x around the feet). An action is three whole numbers: move_x (east) and move_y (north) in
+    -127..127, and 1 to jump; any `Input` is one.
+
+    Args:
+        scene: the name or path of a scene, or one; None: the rules' own, else "flat".
+        agents: how many.
+        rules: makes the rules of the game, anew for each episode.
+        reward: the name of an attribute whose change is the reward, or a function of the game and the entity.
+        over: the name of an attribute which, once it is true of an agent's entity, ends the agent's part: it leaves.
+        seconds: the length of an episode.
+        repeat: so many ticks go by with one action.
+        compiled: as for `World`.
+
+    Raises:
+        SceneError: the scene cannot be used.
+        ValueError: a number is not positive.
+    """
+
+    metadata = {"name": "sovereign", "render_modes": []}  # noqa: RUF012 - as PettingZoo wants it
+    render_mode = None
+
+    def __init__(
+        self,
+        scene: str | Scene | None = None,
+        agents: int = 4,
+        *,
+        rules: Callable[[], Rules] = Rules,
+        reward: str | Reward = "score",
+        over: str = "over",
+        seconds: float = 30.0,
+        repeat: int = 1,
+        compiled: bool | None = None,
+    ) -> None:
+        if min(agents, seconds, repeat) <= 0:
+            raise ValueError(f"agents = {agents}, seconds = {seconds}, repeat = {repeat}: must be positive")
+        first = rules()
+        named = scene if scene is not None else first.scene or "flat"
+        self._bare = load_scene(named) if isinstance(named, str) else named
+        self.scene = first.prepare(self._bare)
+        self.possible_agents = [f"player_{i}" for i in range(agents)]
+        self.agents: list[str] = []
+        self._rules, self._over, self._repeat = rules, over, repeat
+        self._reward = reward if callable(reward) else _attribute(reward)
+        self._scores_change = not callable(reward)
+        self._ticks = max(round(seconds * self.scene.tick_rate), 1)
+        self._blank = World(self.scene, compiled=compiled)
+        self._blank.load_terrain()
+        self._seed = 0
+        self._spaces = _observations(len(self.scene.templates))
+        self._actions = {
+            agent: spaces.Box(np.array([-MOVE_MAX, -MOVE_MAX, 0]), np.array([MOVE_MAX, MOVE_MAX, 1]), dtype=np.int64)
+            for agent in self.possible_agents
+        }
+        self._table, self._corner, self._loaded = np.zeros((1, 1, 1), np.int64), np.zeros(3, np.int64), -1
+
+    def observation_space(self, agent: str) -> spaces.Dict:
+        """See the class."""
+        return self._spaces
+
+    def action_space(self, agent: str) -> spaces.Box:
+        """See the class."""
+        return self._actions[agent]
+
+    @property
+    def world(self) -> World:
+        """The world as it is: for policies. Not to be changed."""
+        return self._game.world
+
+    @property
+    def stage(self) -> Stage:
+        """The running game, as its rules see it."""
+        return self._game.stage
+
+    def entity(self, agent: str) -> int:
+        """An agent's entity."""
+        return self._seats[agent].entity
+
+    def reset(
+        self, seed: int | None = None, options: Mapping[str, Any] | None = None
+    ) -> tuple[dict[str, Observation], dict[str, dict[str, Any]]]:
+        """A new game; without a seed that of the episode before, plus one. `options` are ignored."""
+        self._seed = self._seed + 1 if seed is None else seed
+        world = RecordedWorld(self.scene, compiled=self._blank.compiled)
+        world.restore(self._blank)
+        rules = self._rules()
+        rules.prepare(self._bare)
+        game = self._game = Game(self.scene, limits=Limits(resume_s=0.0), world=world, rules=rules, seed=self._seed)
+        game.tick(0.0, 0.0)  # the rules set their scene before anybody comes
+        self.agents = list(self.possible_agents)
+        self._seats = {agent: Session(0, _Nobody(), 0.0) for agent in self.agents}
+        self._wheels: dict[str, _Wheel] = {}
+        for agent, seat in self._seats.items():
+            player = game.enter(seat, agent)
+            if player is None:
+                raise ValueError(f"{len(self.agents)} agents: no room to spawn {agent} in {self.scene.name}")
+            player.inputs = self._wheels[agent] = _Wheel()
+        self._number, self._end = 0, game.world.tick + self._ticks
+        self._scores = {agent: self._reward(game.stage, self.entity(agent)) for agent in self.agents}
+        return self._look(), {agent: {"verdicts": []} for agent in self.agents}
+
+    def command(self, agent: str, name: str, data: Any = None) -> int:
+        """Asks for something with the next step, as `Client.command` does; "edit" is one, of [x, y, z, kind].
+
+        Returns:
+            Its number. The verdict is in the next step's `infos[agent]["verdicts"]`, as (number, verdict).
+        """
+        player = self._seats[agent].player
+        assert player is not None
+        self._number += 1
+        tick = self.world.tick
+        self._game.orders.file(player, Command(self._number, tick + 1, float(tick), name, pack_value(data)))
+        return self._number
+
+    def step(
+        self, actions: Mapping[str, Sequence[int] | Array]
+    ) -> tuple[
+        dict[str, Observation],
+        dict[str, float],
+        dict[str, bool],
+        dict[str, bool],
+        dict[str, dict[str, Any]],
+    ]:
+        """Everybody acts, `repeat` ticks go by; who gives no action stands still."""
+        for agent in self.agents:
+            given = actions.get(agent)
+            self._wheels[agent].wish = NEUTRAL if given is None else clamp(Input(*map(int, given)))
+        for _ in range(self._repeat):
+            self._game.tick(0.0, 0.0)
+        truncated, stage = self.world.tick >= self._end, self._game.stage
+        rewards, over, infos = {}, {}, {}
+        for agent in self.agents:
+            player = self._seats[agent].player
+            assert player is not None
+            score = self._reward(stage, player.entity)
+            rewards[agent] = score - self._scores[agent] if self._scores_change else score
+            self._scores[agent] = score
+            over[agent] = bool(stage.get(player.entity, self._over))
+            infos[agent] = {"verdicts": list(player.verdicts)}
+            player.verdicts.clear()
+        observations = self._look()
+        truncations = dict.fromkeys(self.agents, truncated)
+        for agent in [agent for agent in self.agents if over[agent] or truncated]:
+            self.agents.remove(agent)
+            self._game.lost(self._seats[agent], 0.0)
+        return observations, rewards, over, truncations, infos
+
+    # -- inside --------------------------------------------------------------------------------------------
+
+    def _look(self) -> dict[str, Observation]:
+        """What everybody sees, for all at once."""
+        states = self.world.states()
+        own = np.searchsorted(states[:, ID], [self.entity(agent) for agent in self.agents])
+        seen = _in_blocks(states)
+        others, blocks = _nearest(seen, own), self._around(states[own, X : X + 3])
+        return {
+            agent: {"own": seen[at].astype(np.float32), "others": others[i], "blocks": blocks[i]}
+            for i, (agent, at) in enumerate(zip(self.agents, own, strict=True))
+        }
+
+    def _around(self, places: Int64s) -> npt.NDArray[np.uint8]:
+        """The kinds of the blocks around positions [n, 3] in grid steps: [n, z, y, x]."""
+        blocks = self.world.blocks
+        if self._loaded != len(blocks.rows):
+            self._loaded = len(blocks.rows)
+            rows = np.fromiter(blocks.rows.values(), np.int64, self._loaded)
+            self._corner = blocks.segments[rows].min(axis=0) - 1
+            at = blocks.segments[rows] - self._corner
+            self._table = np.zeros(at.max(axis=0) + 2, np.int64)
+            self._table[tuple(at.T)] = rows
+        inside = SEGMENT - 1
+        index: list[Int64s] = []
+        offsets: list[Int64s] = []
+        for axis, (low, span) in enumerate(zip(self._corner, AROUND, strict=True)):
+            at = (places[:, axis, None] >> BLOCK_SHIFT) + np.arange(*span)  # [n, blocks along this axis]
+            shape = [len(at), 1, 1, 1]
+            shape[3 - axis] = at.shape[1]
+            segment = np.clip((at >> SEGMENT_SHIFT) - low, 0, self._table.shape[axis] - 1)
+            index.append(segment.reshape(shape))
+            offsets.append(((at & inside) << SEGMENT_SHIFT * axis).reshape(shape))
+        found = self._table[tuple(index)]
+        kinds: npt.NDArray[np.uint8] = blocks.kinds[found, offsets[0] | offsets[1] | offsets[2]]
+        kinds[found == 0] = NO_BLOCK
+        return kinds
+
+
+class _Nobody:
+    """The link of a player without a client."""
+
+    def send(self, message: bytes) -> None:
+        """Nobody reads it."""
+
+    def outstanding(self) -> int:
+        return 0
+
+    def close(self, code: int, reason: str) -> None:
+        """There is nothing to close."""
+
+
+class _Wheel(InputQueue):
+    """The inputs of a player who is always in time."""
+
+    wish = NEUTRAL
+
+    def take(self, tick: int) -> Input:
+        self.used += 1
+        return self.wish
+
+
+def _attribute(name: str) -> Reward:
+    def value(stage: Stage, entity: int) -> float:
+        found = stage.get(entity, name, 0.0)
+        return float(found) if isinstance(found, int | float) else 0.0
+
+    return value
+
+
+def _observations(templates: int) -> spaces.Dict:
+    place, speed = [float(RANGE_BLOCKS)] * 3, [SPEED_MAX] * 3
+    own = np.array([*place, *speed, templates - 1, 1], np.float32)
+    low = np.array([*(-own[:6]), 0, 0], np.float32)
+    others = np.repeat(np.array([[*(2 * own[:6]), templates - 1, 1]], np.float32), OTHERS, axis=0)
+    below = np.repeat(np.array([[*(2 * low[:6]), 0, 0]], np.float32), OTHERS, axis=0)
+    return spaces.Dict(
+        {
+            "own": spaces.Box(low, own),
+            "others": spaces.Box(below, others),
+            "blocks": spaces.Box(0, NO_BLOCK, [high - low for low, high in reversed(AROUND)], np.uint8),
+        }
+    )
+
+
+def _in_blocks(states: Int64s) -> npt.NDArray[np.float64]:
+    """States [n, 12] as positions, velocities, template and whether it falls, [n, 8]."""
+    seen = np.empty((len(states), OWN_COLUMNS))
+    seen[:, :3] = states[:, X : X + 3] / BLOCK
+    seen[:, 3:6] = states[:, VX : VX + 3] / SPEED
+    seen[:, 6] = states[:, TEMPLATE]
+    seen[:, 7] = states[:, FLAGS] & FALLING
+    return seen
+
+
+def _nearest(seen: npt.NDArray[np.float64], own: Int64s) -> npt.NDArray[np.float32]:
+    """For each row in `own` the nearest others, nearest first, [n, 8, 8]."""
+    away = seen[own, None, :3] - seen[None, :, :3]
+    way = np.einsum("ijk,ijk->ij", away, away)
+    way[np.arange(len(own)), own] = np.inf
+    near = np.argsort(way, axis=1, kind="stable")[:, :OTHERS]
+    there = np.take_along_axis(way, near, axis=1) < np.inf
+    found = np.zeros((len(own), OTHERS, OTHER_COLUMNS), np.float32)
+    rows = seen[near]
+    rows[..., :6] -= seen[own, None, :6]
+    rows[..., 7] = 1
+    found[:, : near.shape[1]] = np.where(there[..., None], rows, 0)
+    return found

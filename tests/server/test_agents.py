@@ -1,0 +1,239 @@
+"""The game as an environment: PettingZoo's own test, what agents see, and policies that play here and over the wire."""
+
+import asyncio
+import random
+import re
+import subprocess
+import sys
+import warnings
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+pytest.importorskip("pettingzoo", reason="needs the extra [agents]")
+with warnings.catch_warnings(action="ignore", category=DeprecationWarning):  # of its own examples
+    from pettingzoo.test import parallel_api_test, parallel_seed_test
+
+from client_sdk.bots import POLICIES, Bot, Builder, Policy, Wander
+from client_sdk.core import Core
+from client_sdk.transports.aio import AsyncClient
+from scripts.examples.tag import Tag
+from server.agents import NO_BLOCK, OTHERS, Arena, Observation
+from server.rules import Rules
+from server.session import Player
+from shared.messages import DONE, OUT_OF_REACH
+from tests.client_sdk.servers import real_server
+from tests.worlds import scene
+
+ROOT = Path(__file__).resolve().parents[2]
+YARD = scene(
+    [[-8, -8, -1, 8, 8, 0, 1], [2, 0, 0, 3, 1, 1, 7]],
+    spawns=[(0.0, 0.0, 0.0), (4.0, 0.0, 0.0), (0.0, -4.0, 0.0)],
+    tick_rate=32,
+)
+
+
+class Race(Rules):
+    """The further east, the better; who falls out of the yard is out."""
+
+    def on_join(self, player: Player) -> None:
+        self.game.set(player.entity, "score", self.game.position(player.entity)[0])
+
+    def on_tick(self) -> None:
+        for entity in self.game.players:
+            self.game.set(entity, "score", self.game.position(entity)[0])
+
+    def on_fell_out(self, entity: int) -> bool:
+        self.game.set(entity, "over", True)
+        return False
+
+
+def arena(**changes: Any) -> Arena:
+    values: dict[str, Any] = {"scene": YARD, "agents": 3, "rules": Race, "seconds": 2.0, "compiled": False}
+    return Arena(**(values | changes))
+
+
+@pytest.mark.parametrize("rules", [Rules, Race])
+def test_it_is_what_pettingzoo_takes_for_an_environment(rules: type[Rules]) -> None:
+    parallel_api_test(arena(rules=rules), num_cycles=200)
+    parallel_seed_test(lambda: arena(rules=rules))
+
+
+def test_what_an_agent_sees() -> None:
+    env = arena()
+    seen, infos = env.reset(seed=1)
+    assert list(seen) == list(infos) == env.agents == ["player_0", "player_1", "player_2"]
+    for agent in env.agents:
+        assert env.observation_space(agent).contains(seen[agent])
+    places = [env.world.position(env.entity(agent)) for agent in env.agents]
+    mine = seen["player_0"]
+    assert mine["own"].tolist() == [*places[0], 0, 0, 0, 0, 0]
+    others = sorted(places[1:], key=lambda place: np.linalg.norm(np.subtract(place, places[0])))
+    for row, place in zip(mine["others"], others, strict=False):
+        assert row.tolist() == [*np.subtract(place, places[0]), 0, 0, 0, 0, 1]
+    assert mine["others"].shape == (OTHERS, 8)
+    assert not mine["others"][2:].any(), "there is nobody else"
+    for agent, place in zip(env.agents, places, strict=True):
+        x, y, z = (int(part // 1) for part in place)
+        found = [
+            [[env.world.blocks.get(x + i, y + j, z + k) for i in range(-3, 4)] for j in range(-3, 4)]
+            for k in range(-1, 4)
+        ]
+        assert seen[agent]["blocks"].tolist() == found
+    assert 7 in mine["blocks"]
+
+
+def test_what_is_not_loaded_is_told_from_air() -> None:
+    env = arena(scene=scene(origin=(0, 0, 0), size=(1, 1, 1), spawns=[(1.0, 31.0, 0.0)], gravity=0.0), agents=1)
+    seen, _ = env.reset()
+    blocks = seen["player_0"]["blocks"]
+    outside = np.zeros((5, 7, 7), bool)
+    outside[0], outside[:, 4:], outside[:, :, :2] = True, True, True
+    assert ((blocks == NO_BLOCK) == outside).all()
+    assert not blocks[~outside].any()
+
+
+def walk(env: Arena, steps: int, **actions: tuple[int, int, int]) -> tuple[dict[str, float], dict[str, bool]]:
+    """Everybody does one thing all the time; the sums of the rewards, and who is over in the end."""
+    sums: dict[str, float] = dict.fromkeys(env.agents, 0.0)
+    over: dict[str, bool] = {}
+    for _ in range(steps):
+        _, rewards, over, truncations, _ = env.step(actions)
+        assert rewards.keys() == over.keys() == truncations.keys()
+        for agent, reward in rewards.items():
+            sums[agent] += reward
+        if any(over.values()):
+            break
+    return sums, over
+
+
+def test_actions_move_and_attributes_reward() -> None:
+    env = arena()
+    env.reset()
+    start = {agent: env.world.position(env.entity(agent)) for agent in env.agents}
+    sums, _ = walk(env, 32, player_1=(127, 0, 0), player_2=(-1000, 0, 1))
+    env.step({})  # the rules see the latest move only now
+    now = {agent: env.world.position(env.entity(agent)) for agent in env.agents}
+    assert now["player_0"] == start["player_0"]
+    assert now["player_1"][0] - start["player_1"][0] == 3.0, "3 blocks/s for a second"
+    assert now["player_2"][0] - start["player_2"][0] == -3.0, "more than the most is the most"
+    assert sums["player_0"] == 0.0
+    assert sums["player_1"] == 3.0 - 3 / 32
+    custom = arena(reward=lambda game, entity: float(entity))
+    custom.reset()
+    assert custom.step({})[1] == {agent: float(custom.entity(agent)) for agent in custom.possible_agents}
+
+
+def test_who_is_over_leaves_and_the_others_go_on_until_the_time_is_over() -> None:
+    env = arena(seconds=8.0)
+    env.reset()
+    out = env.entity("player_1")
+    _, over = walk(env, 256, player_1=(127, 0, 0))
+    assert over == {"player_0": False, "player_1": True, "player_2": False}
+    assert env.agents == ["player_0", "player_2"]
+    env.step({})
+    assert out not in env.world
+    truncations: dict[str, bool] = {}
+    while env.agents:
+        _, _, over, truncations, _ = env.step({})
+    assert truncations == {"player_0": True, "player_2": True}
+    assert env.world.tick == 1 + 8 * 32
+
+
+def test_commands_are_answered() -> None:
+    env = arena(agents=1)
+    env.reset()
+    for _ in range(8):  # edits have a pace
+        env.step({})
+    near, far = env.command("player_0", "edit", [2, 0, 0, 0]), env.command("player_0", "edit", [-8, -8, 0, 5])
+    infos: dict[str, Any] = {}
+    verdicts: list[tuple[int, int]] = []
+    for _ in range(8):
+        _, _, _, _, infos = env.step({})
+        verdicts += infos["player_0"]["verdicts"]
+    assert verdicts == [(near, DONE), (far, OUT_OF_REACH)]
+    assert env.world.blocks.get(2, 0, 0) == 0
+
+
+def played(env: Arena, policies: dict[str, Policy], seed: int | None = None) -> tuple[bytes, dict[str, Observation]]:
+    """A whole episode; the hash of its world, and what was seen last."""
+    seen, _ = env.reset(seed=seed)
+    while env.agents:
+        actions = {agent: policies[agent](env.world, env.entity(agent)) for agent in env.agents}
+        for agent in env.agents:
+            assert env.observation_space(agent).contains(seen[agent])
+            assert env.action_space(agent).contains(np.array(actions[agent]))
+            policy = policies[agent]
+            edit = policy.edit(env.world, env.entity(agent)) if isinstance(policy, Builder) else None
+            if edit is not None:
+                env.command(agent, "edit", list(edit))
+        seen, *_ = env.step(actions)
+    return env.world.state_hash(), seen
+
+
+def test_one_seed_is_one_episode_of_tag() -> None:
+    def episode(seed: int | None) -> bytes:
+        policies: dict[str, Policy] = {agent: Wander(random.Random(i)) for i, agent in enumerate(env.possible_agents)}
+        return played(env, policies, seed)[0]
+
+    env = Arena(agents=3, rules=Tag, seconds=4.0)
+    first, second, third = episode(5), episode(None), episode(6)
+    assert first == episode(5)
+    assert second == third, "an episode without a seed has that of the one before, plus one"
+    assert first != second
+
+
+@pytest.mark.e2e
+async def test_the_same_policies_play_here_and_over_the_wire() -> None:
+    env = Arena("flat", agents=len(POLICIES), seconds=1.0, compiled=False)
+    policies = [make(random.Random(i)) for i, make in enumerate(POLICIES.values())]
+    _, seen = played(env, dict(zip(env.possible_agents, policies, strict=True)))
+    speeds = {name: float(np.abs(seen[agent]["own"][3:5]).sum()) for name, agent in zip(POLICIES, seen, strict=True)}
+    assert speeds["stand"] == 0.0
+    assert speeds["run-and-jump"] > 1.0
+
+    async def plays(url: str, policy: Policy) -> None:
+        """Until the policy has decided about a second of ticks over the wire."""
+        asked: set[int] = set()
+        enough = asyncio.Event()
+        bot = Bot(policy)
+
+        def act(core: Core) -> None:
+            bot(core)
+            if core.state == "playing" and core.prediction is not None:
+                asked.add(core.prediction.predicted.tick)
+                if len(asked) >= 32:
+                    enough.set()
+
+        client = await AsyncClient.connect(url, before_update=act, timeout=60.0)
+        await asyncio.wait_for(enough.wait(), 60.0)
+        await client.close()
+        assert client.core.stats.inputs_sent >= 31
+        assert client.core.stats.divergences == 0
+
+    with real_server("--scene", "flat") as url:
+        await asyncio.gather(*(plays(url, policy) for policy in policies))
+
+
+def test_the_example_of_the_readme() -> None:
+    text = (ROOT / "README.md").read_text("utf-8")
+    (example,) = re.findall(r"^## Agents.*?^```python\n(.*?)^```$", text, re.MULTILINE | re.DOTALL)
+    found: dict[str, Any] = {}
+    exec(example, found)
+    assert found["truncations"] == {f"player_{i}": True for i in range(4)}
+
+
+def test_without_pettingzoo_it_says_what_to_install() -> None:
+    program = "import sys; sys.modules['pettingzoo'] = None; import server.agents"
+    done = subprocess.run(
+        [sys.executable, "-c", program],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 1
+    last = done.stderr.splitlines()[-1]
+    assert last == "ImportError: agents need PettingZoo: pip install sovereign-netcode[agents]"
