@@ -10,6 +10,7 @@ Each peer does its attack, again and again, whatever the server makes of it.
 import asyncio
 import contextlib
 import json
+import logging
 import os
 import random
 import socket
@@ -168,4 +169,5 @@ async def main(order: dict[str, object]) -> None:
 
 
 if __name__ == "__main__":
+    logging.getLogger("asyncio").setLevel(logging.ERROR)  # that a connection is gone is what they are here for
     asyncio.run(main(json.loads(sys.argv[1])))

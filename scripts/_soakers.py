@@ -1,0 +1,251 @@
+"""Honest players for `soak.py`: lean, on the wire alone; they walk, build, lose connections, come back, leave and join.
+
+Each has blocks of its own that nobody else edits, so that what a block may be follows from what its player was told.
+"""
+
+import asyncio
+import contextlib
+import math
+import random
+from collections import Counter
+from typing import Any
+
+import msgpack
+import numpy as np
+
+from _generator import REQUEST, frame
+from shared import edits, messages
+from shared.layout import ID, X
+from shared.messages import Bye, Command, Hello, Inputs, Ping, Snapshot, Welcome, decode_from_server, encode
+from shared.snapshot import VERDICT, decode_parts
+from shared.units import BLOCK
+from shared.world import World
+
+LEAD_TICKS = 2
+CONNECT_S = 5.0
+AWAY_S = 13.0
+"""Who was away for longer may find another entity: the server keeps it for 15 s, and notices a loss in its own time."""
+TEMPLATES = 256
+Cell = tuple[int, int, int]
+
+
+class Cells:
+    """What each edited block may be: the kind last told to be done, and those asked for since without an answer."""
+
+    def __init__(self) -> None:
+        self.asked: dict[Cell, list[int | None]] = {}
+        """None: what the terrain has there."""
+        self.owner: dict[Cell, int] = {}
+        self.verdicts: Counter[int] = Counter()
+        self.settled: set[Cell] = set()
+        """Those about which something has been acknowledged."""
+
+    def ask(self, player: int, cell: Cell, rng: random.Random) -> int | None:
+        """A kind to ask for that tells this edit from others that are open; None: the block is another's."""
+        if self.owner.setdefault(cell, player) != player:
+            return None
+        kinds = self.asked.setdefault(cell, [None])
+        kind = rng.choice([kind for kind in range(256) if kind not in kinds])
+        kinds.append(kind)
+        return kind
+
+    def answered(self, cell: Cell, kind: int, verdict: int) -> None:
+        self.verdicts[verdict] += 1
+        kinds = self.asked[cell]
+        if verdict == messages.DONE:
+            self.settled.add(cell)
+            del kinds[: kinds.index(kind)]
+        else:
+            kinds.remove(kind)
+
+    def lost(self, world: World, untouched: World) -> list[str]:
+        """Blocks that are not what they may be."""
+        found = []
+        for cell, kinds in self.asked.items():
+            kind = world.blocks.get(*cell)
+            if kind not in [untouched.blocks.get(*cell) if each is None else each for each in kinds]:
+                found.append(f"block {cell} is {kind}; could be {kinds}")
+        return found
+
+
+class Link(asyncio.Protocol):
+    """One connection: whole messages go to the player."""
+
+    def __init__(self, player: "Honest") -> None:
+        self.player = player
+        self.transport: asyncio.Transport | None = None
+        self.ended: asyncio.Future[None] = asyncio.get_running_loop().create_future()
+        self.answer = b""
+        self._open = False
+        self._rest = b""
+
+    def connection_made(self, transport: Any) -> None:
+        self.transport = transport
+        transport.write(REQUEST)
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        self.transport = None
+        if not self.ended.done():
+            self.ended.set_result(None)
+
+    def send(self, *said: messages.Message) -> None:
+        if self.transport is not None:
+            self.transport.write(b"".join(frame(encode(message)) for message in said))
+
+    def data_received(self, data: bytes) -> None:
+        data = self._rest + data
+        at = 0
+        if not self._open:
+            end = data.find(b"\r\n\r\n")
+            if end < 0:
+                self._rest = data
+                return
+            self._open, at, self.answer = True, end + 4, data[:end]
+            self.player.hello(self)
+        while len(data) - at >= 2 and self.transport is not None:
+            length, start = data[at + 1], at + 2
+            if length == 126:
+                length, start = int.from_bytes(data[at + 2 : at + 4], "big"), at + 4
+            elif length == 127:
+                length, start = int.from_bytes(data[at + 2 : at + 10], "big"), at + 10
+            if start + length > len(data):
+                break
+            if data[at] != 0x82:  # the server closes
+                self.transport.abort()
+                break
+            self.player.take(self, data[start : start + length])
+            at = start + length
+        self._rest = data[at:]
+
+
+class Honest:
+    """One player, from its first join until the task is cancelled.
+
+    Args:
+        number: its own.
+        port: of the server.
+        cells: common to all.
+        lossy: it is cut off every few seconds.
+    """
+
+    def __init__(self, number: int, port: int, seed: int, cells: Cells, *, lossy: bool) -> None:
+        self.number, self.port, self.cells, self.lossy = number, port, cells, lossy
+        self.rng = random.Random(f"{seed} {number}")
+        self.entity, self.resume = 0, b""
+        self.unexplained: list[str] = []
+        self.counts: Counter[str] = Counter()
+        self.got = self.due = 0
+        """Snapshots that came, and that the server made, between the first and the last of each connection."""
+        self.playing = False
+        self._waiting: dict[int, tuple[Cell, int, Command]] = {}
+        self._asked = 0
+        self._tick = self._sent = -1
+        self._row = bytes(3)
+        self._lost_at = -math.inf
+
+    async def play(self) -> None:
+        """Connection after connection."""
+        loop, failed = asyncio.get_running_loop(), 0
+        while True:
+            try:
+                async with asyncio.timeout(CONNECT_S):
+                    _, link = await loop.create_connection(lambda: Link(self), "127.0.0.1", self.port)
+            except (OSError, TimeoutError):
+                self.counts["connects failed"] += 1
+                failed += 1
+                await asyncio.sleep(min(0.25 * 2**failed, 2.0) * self.rng.uniform(0.5, 1.0))
+                continue
+            failed = 0
+            await self._connected(link)
+            await asyncio.sleep(self.rng.uniform(0.1, 2.0))
+
+    async def _connected(self, link: Link) -> None:
+        """Until it is over, by the server's doing or one's own."""
+        stay = self.rng.uniform(4, 15) if self.lossy else self.rng.uniform(20, 90)
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(stay):
+                await asyncio.shield(link.ended)
+        self.playing, self._tick = False, -1
+        self._lost_at = asyncio.get_running_loop().time()
+        if link.transport is None:
+            self.counts["lost"] += 1
+            status = link.answer.partition(b"\r\n")[0]
+            if status and b" 101 " not in status:
+                self.unexplained.append(f"refused: {status!r}")
+        elif self.lossy or self.rng.random() < 0.5:
+            self.counts["cut off"] += 1
+            link.transport.abort()
+        else:
+            self.counts["left"] += 1
+            link.send(Bye(1000, "", -1.0))
+            self.entity, self.resume, self._waiting = 0, b"", {}
+            with contextlib.suppress(TimeoutError):
+                async with asyncio.timeout(CONNECT_S):
+                    await asyncio.shield(link.ended)
+            if link.transport is not None:
+                link.transport.abort()
+
+    def hello(self, link: Link) -> None:
+        """The WebSocket is open."""
+        link.send(Hello(messages.VERSION, {}, f"honest {self.number}", resume=self.resume))
+
+    def take(self, link: Link, data: bytes) -> None:
+        """One message."""
+        message = decode_from_server(data)
+        if isinstance(message, Snapshot):
+            self._snapshot(link, message)
+        elif isinstance(message, Welcome):
+            self._welcome(link, message)
+        elif isinstance(message, Bye) and message.code != messages.GOING_AWAY:
+            self.unexplained.append(f"told to go: {message.code} {message.reason}")
+
+    def _welcome(self, link: Link, welcome: Welcome) -> None:
+        away_s = asyncio.get_running_loop().time() - self._lost_at
+        if self.resume and welcome.entity == self.entity:
+            self.counts["came back"] += 1
+            link.send(*[command for _, _, command in self._waiting.values()])  # each is done once, and answered
+        else:
+            if self.resume and away_s < AWAY_S:
+                self.unexplained.append(f"another entity after {away_s:.1f} s")
+            self.counts["joined"] += 1
+            self._waiting = {}
+        self.entity, self.resume, self._sent = welcome.entity, welcome.resume, -1
+        self.playing = True
+
+    def _snapshot(self, link: Link, snapshot: Snapshot) -> None:
+        tick, rng = snapshot.tick, self.rng
+        if self._tick >= 0:
+            self.got += 1
+            self.due += tick - self._tick
+        self._tick = tick
+        for number, verdict in np.frombuffer(snapshot.verdicts, VERDICT).tolist():
+            asked = self._waiting.pop(number, None)
+            if asked is not None:
+                self.cells.answered(asked[0], asked[1], verdict)
+        if rng.random() < 1 / 32:
+            angle = rng.random() * math.tau
+            self._row = bytes((int(127 * math.cos(angle)) & 255, int(127 * math.sin(angle)) & 255, rng.random() < 0.1))
+            link.send(Ping(0.0))
+        due = tick + LEAD_TICKS
+        n = min(due - self._sent, messages.INPUT_ROWS_MAX) if self._sent >= 0 else 1
+        if n > 0:
+            self._sent = due
+            link.send(Inputs(due - n + 1, tick, self._row * n))
+        if rng.random() < 1 / 32 and snapshot.segments:
+            self._edit(link, snapshot)
+
+    def _edit(self, link: Link, snapshot: Snapshot) -> None:
+        """A block next to where the player is, if this snapshot says where that is."""
+        states = decode_parts(snapshot.segments, TEMPLATES)[1]
+        own = states[states[:, ID] == self.entity]
+        if not len(own):
+            return
+        x, y, z = (int(part) // BLOCK + self.rng.randint(-3, 3) for part in own[0, X : X + 3])
+        cell = (x, y, z + 2)
+        kind = self.cells.ask(self.number, cell, self.rng)
+        if kind is not None:
+            self._asked += 1
+            payload = msgpack.packb((*cell, kind))
+            command = Command(self._asked, snapshot.tick + 1, float(snapshot.tick), edits.NAME, payload)
+            self._waiting[self._asked] = (cell, kind, command)
+            link.send(command)
