@@ -49,6 +49,8 @@ RESYNC_S = 1.0
 """A client may ask for everything anew so often."""
 AWAY_S = 1.0
 """A tick that begins so late says nothing about the clients."""
+UNHEARD_S = 2.0
+"""Who is cut off before it has acknowledged anything is kept for no longer than this."""
 
 
 class Game:
@@ -166,10 +168,11 @@ class Game:
             self.sessions.remove(session)
         player = session.player
         if player is not None and player.session is session:
+            known = session.acked >= 0 or len(player.tokens) > 1
             if session.acked >= 0:
                 player.heard()
             player.session = None
-            player.away_until = now + self.limits.resume_s
+            player.away_until = now + (self.limits.resume_s if known else min(UNHEARD_S, self.limits.resume_s))
 
     def shut_down(self, reason: str, wait: float) -> None:
         """Tells every client, with the seconds after which to come back, and closes the connections."""
@@ -223,12 +226,15 @@ class Game:
             if player.session is None and player.away_until == math.inf:  # the server has been away
                 player.away_until = now + self.limits.resume_s
         self._leaving += [player for player in self.players.values() if now >= player.away_until]
-        for player in self._leaving:
+        self._let_go(self._leaving)
+        self._leaving.clear()
+
+    def _let_go(self, leaving: list[Player]) -> None:
+        for player in leaving:
             if self.players.pop(player.entity, None) is not None:
                 self.counters.left += 1
                 self.counters.add(player.inputs)
                 self.stage.left(player)
-        self._leaving.clear()
 
     def _join(self) -> None:
         joining = [session for session in self.sessions if session.hello is not None and not session.closed]
@@ -257,6 +263,7 @@ class Game:
 
     def enter(self, session: Session, name: str) -> Player | None:
         """A new player at a spawn, with that connection; ask between two ticks. None: there is no room."""
+        self._make_room()
         entity = self._spawns.spawn()
         if entity is None:
             return None
@@ -266,6 +273,13 @@ class Game:
         session.seat(player)
         self.stage.joined(player)
         return player
+
+    def _make_room(self) -> None:
+        """Lets go of those whose time to come back ends first, where there are as many players as there may be."""
+        excess = len(self.players) + 1 - self.limits.clients_max
+        if excess > 0:
+            away = [player for player in self.players.values() if player.session is None]
+            self._let_go(sorted(away, key=lambda player: player.away_until)[:excess])
 
     def _returning(self, session: Session, hello: Hello) -> Player | None:
         """The player that this is, if it was here before and still is; a connection that it still has is closed."""

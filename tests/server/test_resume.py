@@ -2,6 +2,8 @@
 
 import pytest
 
+from server.game import UNHEARD_S
+from server.limits import Limits
 from server.session import SETTLED_MAX
 from shared import messages
 from shared.messages import Bye, Hello, Inputs, Snapshot, Welcome
@@ -146,3 +148,33 @@ def test_only_the_latest_verdicts_are_kept(table: Table) -> None:
     for number in range(SETTLED_MAX + 10):
         player.settle(number, 0)
     assert list(player.settled) == list(range(10, SETTLED_MAX + 10))
+
+
+def test_who_was_never_heard_of_is_kept_for_a_moment_only() -> None:
+    """Else whoever joins and goes, time and again, would fill the world with the entities of nobody."""
+    table = Table(resume_s=10.0)
+    silent, known = table.join(), table.join()
+    heard(table, known)
+    table.lose(silent)
+    table.lose(known)
+    table.tick(int(UNHEARD_S / table.tick_s) + 1)
+    assert list(table.game.players) == [known.session.entity]
+    again = back(table, token(known))
+    table.lose(again)  # cut off before it was heard of over this connection, but it is known
+    table.tick(int(UNHEARD_S / table.tick_s) + 1)
+    assert list(table.game.players) == [known.session.entity]
+
+
+def test_those_away_make_room_where_there_are_as_many_players_as_there_may_be() -> None:
+    table = Table(Limits(clients_max=3), resume_s=10.0)
+    links = [table.join() for _ in range(3)]
+    for link in (links[1], links[0]):
+        heard(table, link)
+        table.lose(link)
+        table.tick()
+    newcomer = table.join()
+    assert list(table.game.players) == [link.session.entity for link in (links[0], links[2], newcomer)]
+    assert len(table.game.world) == 3
+    table.lose(links[2])
+    assert back(table, token(links[0])).session.entity == links[0].session.entity, "who comes back needs no room"
+    assert len(table.game.players) == 3
