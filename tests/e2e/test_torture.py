@@ -6,6 +6,7 @@ the honest players: their snapshots and the server's lateness, during an attack 
 
 import contextlib
 import json
+import os
 import re
 import subprocess
 import sys
@@ -140,3 +141,26 @@ def test_honest_players_are_served_during_an_attack_and_nothing_is_left_of_it(
         storm(server, attack, 1000 / 32)
         assert server.end(15) == 0
         assert [entry for entry in server.log(but="info") if not BUSY.search(entry["event"])] == []
+
+
+def test_a_neighbour_that_takes_all_the_processor_delays_and_breaks_nothing() -> None:
+    """One busy process per core and one more: ticks come late and are made up for; then all is as it was."""
+    with running("--port", "0", "--scene", "flat", "--tick-rate", "32") as server, contextlib.ExitStack() as stack:
+        address = server.address()
+        order = {"port": address[1], "seed": 1, "rate": 32, "joins_per_s": 100}
+        honest = stack.enter_context(script("_generator.py", order))
+        honest.tell(f"clients {HONEST}")
+        honest.hear("playing", HONEST)
+        before, _ = window(address, honest)
+        with contextlib.ExitStack() as busy:
+            for _ in range((os.cpu_count() or 1) + 1):
+                process = busy.enter_context(subprocess.Popen([sys.executable, "-c", "while True: pass"]))
+                busy.callback(process.kill)
+            during, late = window(address, honest)
+        after = max(window(address, honest)[0] for _ in range(2))
+        print(f"share {before:.3f} {during:.3f} {after:.3f}, lateness p99 {late:.1f} ms")
+        assert during > 0.5 * before
+        assert after >= SHARE_MIN * before
+        figures = stats(address)
+        assert (figures["clients"], figures["ticks_failed"], figures["internal_errors"]) == (HONEST, 0, 0)
+        assert figures["closed"] == {}
