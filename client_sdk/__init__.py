@@ -1,1 +1,53 @@
-"""The client: prediction, reconciliation, interpolation."""
+"""Play on a Sovereign Netcode server: prediction, reconciliation, interpolation.
+
+    from client_sdk import Client, Joined, Left
+
+`Client` is for a game's own loop, `AsyncClient` for asyncio, `Loopback` for a server within the program. What they tell
+of are the events (`client_sdk.events`); what there is to draw is a `View` of `Figure`s.
+"""
+
+from client_sdk.client import Client
+from client_sdk.events import (
+    Answered,
+    Corrected,
+    Disconnected,
+    Diverged,
+    Event,
+    Happened,
+    Joined,
+    Left,
+    Resumed,
+    Resynchronised,
+    SegmentLoaded,
+)
+from client_sdk.links import Path
+from client_sdk.picture import Figure, View
+from client_sdk.stats import Stats
+from client_sdk.transports.aio import AsyncClient
+from client_sdk.transports.connection import ConnectError
+from client_sdk.transports.loopback import Loopback
+from shared.inputs import Input, make_input
+
+__all__ = [
+    "Answered",
+    "AsyncClient",
+    "Client",
+    "ConnectError",
+    "Corrected",
+    "Disconnected",
+    "Diverged",
+    "Event",
+    "Figure",
+    "Happened",
+    "Input",
+    "Joined",
+    "Left",
+    "Loopback",
+    "Path",
+    "Resumed",
+    "Resynchronised",
+    "SegmentLoaded",
+    "Stats",
+    "View",
+    "make_input",
+]

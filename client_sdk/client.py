@@ -11,18 +11,16 @@ with Client.connect("ws://localhost:8765", name="Ann") as client:
 
 import ssl
 import time
-from collections.abc import Mapping
 from types import TracebackType
 from typing import Any, Protocol
 
+from client_sdk.base import BaseClient
 from client_sdk.events import Event
 from client_sdk.linked import LinkedCore
 from client_sdk.links import Path
 from client_sdk.picture import View
-from client_sdk.stats import Stats
 from client_sdk.transports.connection import Connection
 from client_sdk.transports.polling import PollingTransport
-from shared.inputs import make_input
 from shared.scene import Scene
 
 PATIENCE_S = 30.0
@@ -42,7 +40,7 @@ class Transport(Protocol):
         """Sends, and ends within so many seconds."""
 
 
-class Client:
+class Client(BaseClient):
     """A player on a server.
 
     Call `poll`, `set_input`, `update` and `view` once per frame, at any frame rate. Times are float seconds of
@@ -54,7 +52,7 @@ class Client:
     """
 
     def __init__(self, core: LinkedCore, transport: Transport) -> None:
-        self.core = core
+        super().__init__(core)
         self._transport = transport
 
     @classmethod
@@ -90,67 +88,10 @@ class Client:
         core.link = link
         return cls(core, PollingTransport(Connection(url, core), timeout, tls))
 
-    @property
-    def joining(self) -> bool:
-        """Whether the world is still being fetched: there is nothing to draw yet."""
-        return self.core.state == "joining"
-
-    @property
-    def playing(self) -> bool:
-        """Whether inputs count and there is a world to draw."""
-        return self.core.state == "playing"
-
-    @property
-    def away(self) -> bool:
-        """Whether the connection is lost and the client tries to come back: `Disconnected`, then `Resumed`."""
-        return self.core.state == "away"
-
-    @property
-    def closed(self) -> bool:
-        """Whether it is over; `Left` says why."""
-        return self.core.state == "closed"
-
-    @property
-    def entity(self) -> int:
-        """The own entity; 0 before the server has given one."""
-        return self.core.entity
-
-    @property
-    def link(self) -> Path | None:
-        """A worse connection than there is, to feel one while developing: `client.link = "wifi"`.
-
-        Any preset of `client_sdk.links`, or a `Path` of one's own; None: none. May change at any time.
-
-        Raises:
-            ValueError: there is no preset of that name.
-        """
-        return self.core.link
-
-    @link.setter
-    def link(self, link: str | Path | None) -> None:
-        self.core.link = link
-
-    @property
-    def stats(self) -> Stats:
-        """Counters since the start, and figures of the moment."""
-        return self.core.stats
-
-    def overlay(self) -> str:
-        """The figures that matter as a few lines of text, to draw over the picture (`stats.figures`: in pairs)."""
-        return self.core.stats.text()
-
     def poll(self, now: float | None = None) -> list[Event]:
         """What has happened since the last call, in order: `Joined`, `Corrected`, `Left`, ... Never blocks."""
         self._transport.poll(time.monotonic() if now is None else now)
         return self.core.events()
-
-    def set_input(self, x: float, y: float, *, jump: bool = False) -> None:
-        """What the player wishes from now on: a direction (east, north) of length 0 to 1, and whether to jump.
-
-        Raises:
-            ValueError: the direction is not finite.
-        """
-        self.core.set_input(make_input(x, y, jump=jump))
 
     def edit(self, x: int, y: int, z: int, kind: int) -> int:
         """Places (`kind` 1 to 255) or removes (0) the block (x, y, z) with the next tick, at once in the own picture.
@@ -173,22 +114,6 @@ class Client:
             ValueError: the name or the data are too long (32 characters, 1,024 bytes), or no MessagePack.
         """
         return self.core.command(name, data)
-
-    @property
-    def shared(self) -> Mapping[str, Any]:
-        """The values that the game shares with all clients."""
-        return self.core.shared
-
-    def set_input_delay(self, ticks: int) -> None:
-        """Shows the effect of inputs so many ticks (0 to 3) after `set_input`; may change at any time.
-
-        The more, the fewer and smaller the corrections caused by others on a slow connection, and the slower the
-        controls feel: 2 ticks at 32 a second are 63 ms.
-
-        Raises:
-            ValueError: not 0 to 3.
-        """
-        self.core.set_input_delay(ticks)
 
     def update(self, now: float | None = None) -> None:
         """Predicts up to now and sends the inputs of the ticks that have come."""

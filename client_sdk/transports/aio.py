@@ -12,18 +12,17 @@ import socket
 import ssl
 import time
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from types import TracebackType
 from typing import Any, cast
 
+from client_sdk.base import BaseClient
 from client_sdk.core import EVENTS_MAX, Core
 from client_sdk.events import Event
 from client_sdk.linked import LinkedCore
 from client_sdk.links import Path
 from client_sdk.picture import View
-from client_sdk.stats import Stats
 from client_sdk.transports.connection import CLOSE_S, UNSENT_MAX, ConnectError, Connection, stalled, unreachable
-from shared.inputs import Input
 from shared.scene import Scene
 
 TIMEOUT_S = 5.0
@@ -32,7 +31,7 @@ WAIT_S_MIN = 0.001
 WAIT_S_MAX = 3600.0
 
 
-class AsyncClient:
+class AsyncClient(BaseClient):
     """A player on a server, which lives in an event loop: it predicts and sends by itself.
 
     Use `connect`. `async for event in client` gives what happens and ends after `Left`; whoever does not ask
@@ -51,7 +50,7 @@ class AsyncClient:
     ) -> None:
         self._tls = tls
         self._redialing: asyncio.Task[None] | None = None
-        self.core = core
+        super().__init__(core)
         self._connection = Connection(url, core)
         self._before_update = before_update
         self._loop = asyncio.get_running_loop()
@@ -100,39 +99,6 @@ class AsyncClient:
                 client._drop()
         return client
 
-    @property
-    def entity(self) -> int:
-        """The own entity; 0 before the server has given one."""
-        return self.core.entity
-
-    @property
-    def link(self) -> Path | None:
-        """A worse connection than there is, to feel one while developing: `client.link = "wifi"`.
-
-        Any preset of `client_sdk.links`, or a `Path` of one's own; None: none. May change at any time.
-
-        Raises:
-            ValueError: there is no preset of that name.
-        """
-        return self.core.link
-
-    @link.setter
-    def link(self, link: str | Path | None) -> None:
-        self.core.link = link
-
-    @property
-    def stats(self) -> Stats:
-        """Counters since the start, and figures of the moment."""
-        return self.core.stats
-
-    def overlay(self) -> str:
-        """The figures that matter as a few lines of text, to draw over the picture (`stats.figures`: in pairs)."""
-        return self.core.stats.text()
-
-    def set_input(self, wish: Input) -> None:
-        """What the player wishes from now on (see `shared.inputs.make_input`)."""
-        self.core.set_input(wish)
-
     def edit(self, x: int, y: int, z: int, kind: int) -> int:
         """Places (`kind` 1 to 255) or removes (0) a block, as `Client.edit`; the number by which it is `Answered`.
 
@@ -153,19 +119,6 @@ class AsyncClient:
         number = self.core.command(name, data)
         self._pump(time.monotonic())
         return number
-
-    @property
-    def shared(self) -> Mapping[str, Any]:
-        """The values that the game shares with all clients."""
-        return self.core.shared
-
-    def set_input_delay(self, ticks: int) -> None:
-        """Shows the effect of inputs so many ticks (0 to 3) later, as `Client.set_input_delay`.
-
-        Raises:
-            ValueError: not 0 to 3.
-        """
-        self.core.set_input_delay(ticks)
 
     def view(self) -> View:
         """What to draw now; positions in blocks."""

@@ -15,7 +15,6 @@ from client_sdk.events import Answered, Event, Joined, Left
 from client_sdk.transports.aio import AsyncClient
 from client_sdk.transports.connection import ConnectError
 from shared import messages
-from shared.inputs import make_input
 from tests.client_sdk.servers import accept, real_server, scripted_server
 
 pytestmark = pytest.mark.e2e
@@ -60,7 +59,7 @@ def test_a_player_joins_walks_and_leaves(url: str, run: Run) -> None:
             joined = await first(client, Joined)
             assert joined.entity == client.entity
             before = client.view().me
-            client.set_input(make_input(1, 0))
+            client.set_input(1, 0)
             goal = client.stats.inputs_sent + 32
             await until(lambda: client.stats.inputs_sent >= goal)
             after = client.view().me
