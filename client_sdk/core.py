@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 
+from client_sdk.advice import advised
 from client_sdk.clock import LeadController, PricedLead, ServerClock, Timeline
 from client_sdk.comeback import Comeback
 from client_sdk.events import (
@@ -276,7 +277,7 @@ class Core:
             case messages.Shared():
                 self.shared = message.values
             case Bye():
-                left = Left(message.code, message.reason, message.wait)
+                left = Left(message.code, advised(message.code, message.reason), message.wait)
                 if self.state in ("playing", "away") and (message.wait >= 0 or message.code in COME_AGAIN):
                     self._cut_off(left, now)
                 else:

@@ -359,13 +359,14 @@ class Game:
 
     def _hello(self, session: Session, hello: Hello, now: float) -> None:
         if hello.version != messages.VERSION:
-            reason = f"protocol version {hello.version}: this server speaks {messages.VERSION}"
+            newer = "older" if hello.version < messages.VERSION else "newer"
+            reason = f"the client is {newer}: protocol version {hello.version}, the server speaks {messages.VERSION}"
             self._refuse(session, messages.WRONG_VERSION, reason)
             return
         mine = self.scene.digests
         differ = sorted(name for name in mine | hello.scene if mine.get(name) != hello.scene.get(name))
         if hello.scene and differ:
-            reason = f"another scene: {', '.join(name[:40] for name in differ)} differ(s)"
+            reason = f"the server plays another scene ({', '.join(name[:40] for name in differ)} differ)"
             self._refuse(session, messages.WRONG_SCENE, reason)
             return
         if len(hello.name) > self.limits.name_max:

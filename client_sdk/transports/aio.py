@@ -22,7 +22,15 @@ from client_sdk.events import Event
 from client_sdk.linked import LinkedCore
 from client_sdk.links import Path
 from client_sdk.picture import View
-from client_sdk.transports.connection import CLOSE_S, UNSENT_MAX, ConnectError, Connection, stalled, unreachable
+from client_sdk.transports.connection import (
+    CLOSE_S,
+    UNSENT_MAX,
+    ConnectError,
+    Connection,
+    insecure,
+    stalled,
+    unreachable,
+)
 from shared.scene import Scene
 
 TIMEOUT_S = 5.0
@@ -91,7 +99,7 @@ class AsyncClient(BaseClient):
         except ConnectError:
             raise
         except ssl.SSLError as error:
-            raise ConnectError(f"{url}: no secure connection ({error.reason or error})") from error
+            raise insecure(connection, error) from error
         except OSError as error:  # a TimeoutError is one
             raise unreachable(connection, error) from error
         finally:

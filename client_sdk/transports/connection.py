@@ -9,6 +9,7 @@ websockets does the framing (its Sans-I/O `ClientProtocol`); this is all that bo
 they are left with a socket each. Nothing is compressed: no extension is offered.
 """
 
+import ssl
 from urllib.parse import urlsplit
 
 from websockets.client import ClientProtocol
@@ -17,6 +18,7 @@ from websockets.frames import CloseCode, Frame, Opcode
 from websockets.protocol import CLOSED, OPEN
 from websockets.uri import WebSocketURI, parse_uri
 
+from client_sdk.advice import TLS_ALERT, untrusted
 from client_sdk.core import Core
 from shared.messages import MESSAGE_MAX, REASON_MAX, TEXT, TOO_SLOW
 
@@ -59,6 +61,7 @@ class Connection:
         """Why there will be no connection; None: there is one, or there may be one."""
         self._protocol = ClientProtocol(self.uri, max_size=MESSAGE_MAX)
         self._protocol.send_request(self._protocol.connect())
+        self._began = b""  # how the answer begins
         self._fragments = bytearray()
         self._ending_since: float | None = None
 
@@ -78,6 +81,7 @@ class Connection:
         protocol = self._protocol
         if protocol.reader.eof:
             return
+        self._began = self._began or bytes(data[:2])
         protocol.receive_data(data)  # type: ignore[arg-type]  # it appends, so a view does as well
         for event in protocol.events_received():
             if isinstance(event, Frame):
@@ -94,7 +98,7 @@ class Connection:
     def broke(self, reason: str, now: float, code: int = CloseCode.ABNORMAL_CLOSURE) -> None:
         """The stream is unusable: nothing more will be read from it or written to it."""
         self._protocol.receive_eof()
-        self.refused = self.refused or (None if self.opened else ConnectError(f"{self.url}: {reason}"))
+        self.refused = self.refused or (None if self.opened else self._refusal(reason))
         self.core.lost(code, reason, now)
         self._check(now)
 
@@ -125,11 +129,17 @@ class Connection:
             self._protocol.fail(TEXT, "text message: binary ones only")
             self.core.lost(TEXT, f"{self.url} is not a Sovereign Netcode server: it sends text", now)
 
+    def _refusal(self, reason: str = "") -> ConnectError | None:
+        """Why there was no answer, or none of HTTP; None: there was one."""
+        if not self.uri.secure and self._began in (b"", TLS_ALERT):
+            reason = f"{reason or 'no answer, the connection was closed'}; if the server speaks TLS, use wss://"
+        return ConnectError(f"{self.url}: {reason}") if reason else None
+
     def _check(self, now: float) -> None:
         """Tells the core, at once, that it is over; and why there is no connection, if it never began."""
         protocol = self._protocol
         if protocol.handshake_exc is not None and self.refused is None:
-            self.refused = _refusal(self.url, protocol.handshake_exc)
+            self.refused = self._refusal() or _refusal(self.url, protocol.handshake_exc)
         if self._ending_since is not None or not (protocol.close_expected() or protocol.state is CLOSED):
             return
         self._ending_since = now
@@ -162,6 +172,12 @@ def unreachable(connection: Connection, error: OSError) -> ConnectError:
     return ConnectError(f"{connection.url}: {why}")
 
 
+def insecure(connection: Connection, error: ssl.SSLError) -> ConnectError:
+    """An error for a stream over which no TLS could be spoken."""
+    why = getattr(error, "verify_message", "")
+    return ConnectError(untrusted(connection.url, error.reason or str(error), why))
+
+
 def _parse(url: str) -> WebSocketURI:
     hint = "a server's address looks like ws://localhost:8765"
     try:
@@ -183,6 +199,7 @@ def _refusal(url: str, error: Exception) -> ConnectError:
         kind, retry = (" ".join(response.headers.get_all(name)) for name in ("Content-Type", "Retry-After"))
         if response.status_code in REFUSALS and response.body and kind.startswith("text/plain"):
             said = response.body.decode(errors="replace").strip()[:REASON_MAX]
-            return ConnectError(f"{url}: {said}", float(retry) if retry.isdecimal() and retry.isascii() else -1.0)
+            wait = float(retry) if retry.isdecimal() and retry.isascii() else -1.0
+            return ConnectError(f"{url}: {said}" + (f"; try again in {wait:g} s" if wait >= 0 else ""), wait)
     what = f"something is there, but it is not a Sovereign Netcode server ({answer})"
     return ConnectError(f"{url}: {what}; are host, port and path right?")

@@ -9,7 +9,7 @@ import ssl
 import time
 
 from client_sdk.core import READ_BYTES
-from client_sdk.transports.connection import UNSENT_MAX, ConnectError, Connection, stalled, unreachable
+from client_sdk.transports.connection import UNSENT_MAX, Connection, insecure, stalled, unreachable
 
 READS_MAX = 32
 """Reads per poll, 2 MiB: a game that was away for long does not hang in one poll."""
@@ -190,7 +190,7 @@ def _connected(connection: Connection, timeout: float, tls: ssl.SSLContext | Non
                 tls = tls or ssl.create_default_context()
                 sock = undo.enter_context(tls.wrap_socket(sock, server_hostname=uri.host))
         except ssl.SSLError as error:
-            raise ConnectError(f"{connection.url}: no secure connection ({error.reason or error})") from error
+            raise insecure(connection, error) from error
         except OSError as error:
             raise unreachable(connection, error) from error
         undo.pop_all()

@@ -58,7 +58,7 @@ def test_who_says_hello_is_welcomed_and_shown_the_world_in_the_next_tick(table: 
 
 def test_a_client_of_another_version_is_told_which_one_is_spoken(table: Table) -> None:
     code, reason = table.connect(Hello(7, {}, "")).refusal()
-    assert (code, reason) == (messages.WRONG_VERSION, "protocol version 7: this server speaks 1")
+    assert (code, reason) == (messages.WRONG_VERSION, "the client is newer: protocol version 7, the server speaks 1")
 
 
 def test_a_client_of_the_same_scene_may_say_so(table: Table) -> None:
@@ -70,13 +70,16 @@ def test_a_client_of_the_same_scene_may_say_so(table: Table) -> None:
 def test_a_client_of_another_scene_is_told_which_fields_differ(table: Table) -> None:
     other = scene(gravity=9.0, tick_rate=32, origin=(0, 0, 0), size=(1, 1, 1), spawns=((16.0, 16.0, 1.0),))
     code, reason = table.connect(Hello(1, other.digests, "")).refusal()
-    assert (code, reason) == (messages.WRONG_SCENE, "another scene: gravity, terrain, tick_rate differ(s)")
+    assert (code, reason) == (
+        messages.WRONG_SCENE,
+        "the server plays another scene (gravity, terrain, tick_rate differ)",
+    )
 
 
 def test_a_field_that_only_one_side_has_differs_too(table: Table) -> None:
     mine = table.game.scene.digests
     code, reason = table.connect(Hello(1, mine | {"wind": b"1"}, "")).refusal()
-    assert (code, reason) == (messages.WRONG_SCENE, "another scene: wind differ(s)")
+    assert (code, reason) == (messages.WRONG_SCENE, "the server plays another scene (wind differ)")
     long = {f"{i:02}" + "x" * 200: b"" for i in range(32)}
     assert len(table.connect(Hello(1, long, "")).refusal()[1]) <= messages.REASON_MAX
 
