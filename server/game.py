@@ -289,7 +289,7 @@ class Game:
             if old is not None and old.acked >= 0:
                 player.heard()
             if wanted in player.tokens and player.subject == session.subject:
-                del player.tokens[player.tokens.index(wanted) + 1 :]
+                player.tokens[:] = [wanted]  # the ones before it are used up, and one after it was never heard of
                 if old is not None and not old.closed:
                     self._end(old, messages.TAKEN_OVER, "the player goes on over another connection")
                 return player

@@ -87,6 +87,21 @@ def test_a_welcome_that_was_lost_on_its_way_costs_nothing(table: Table) -> None:
     assert back(table, first).session.entity == me
 
 
+def test_a_token_that_is_shown_uses_up_those_before_it(table: Table) -> None:
+    """Though its welcome has not been acknowledged: who shows it has read it."""
+    link = table.join()
+    me, tokens = link.session.entity, [token(link)]
+    for _ in range(5):
+        table.lose(link)
+        link = back(table, tokens[-1])
+        assert link.session.entity == me
+        tokens.append(token(link))
+    assert len(table.game.players[me].tokens) == 2
+    for old in tokens[:-2]:
+        assert back(table, old).session.entity != me
+    assert back(table, tokens[-2]).session.entity == me
+
+
 def test_a_guessed_token_is_worth_nothing(table: Table) -> None:
     link = table.join()
     table.lose(link)
