@@ -6,28 +6,21 @@ A promise that is broken is an `AssertionError`; any other exception is one that
 import atexit
 import contextlib
 import io
-import random
 import re
 import shutil
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
-from server.game import Game
+from _house import House
 from server.kinds import SettingsError
-from server.limits import Limits
-from server.rules import Rules
-from server.session import Player, Session
 from server.settings import KINDS, Settings, parse
-from shared import edits, messages
+from shared import edits
 from shared.messages import (
-    AHEAD_MAX,
     CLIENT_KINDS,
     CLIENT_LIST_MAX,
     CLIENT_MESSAGE_MAX,
     COMMAND_MAX,
-    FATES_MAX,
     TICK_MAX,
     Bye,
     Command,
@@ -49,14 +42,11 @@ from shared.messages import (
     encode,
     unpack_value,
 )
-from shared.scene import Scene, Template
 from shared.snapshot import STATE_HIGH, STATE_LOW, decode_parts
 
 Target = Callable[[bytes], str]
 WORDS = re.compile(r"[A-Za-z_.]* ?[A-Za-z]*")
 TEMPLATES = 3
-WELCOME = 17
-KINDS_OF_CLIENTS = {messages.KINDS[kind][0].__name__ for kind in CLIENT_KINDS}
 
 PART = [0, -1, 2, 7, b"\1" + bytes(32), bytes(4), bytes(3), 0, [1, {"name": "Ann"}]]
 FROM_CLIENT: tuple[Message, ...] = (
@@ -137,145 +127,6 @@ def edit(data: bytes) -> str:
         assert all(type(part) is int and abs(part) < 1 << 28 for part in found[:3])
         assert 0 <= found.kind <= 255
     return str(found is None)
-
-
-class _Shooting(Rules):
-    """Looks into the past for every command."""
-
-    def on_command(self, player: Player, name: str, payload: Any) -> bool | None:
-        self.game.rewound(player).ray(self.game.position(player.entity), (1.0, 0.5, -0.25), 16.0)
-        self.game.set(player.entity, "last", name)
-        self.game.send("heard", [name, self.game.tick])
-        return None
-
-
-class _Deaf:
-    """A link; now and then it takes nothing, and it may call back while it is being closed."""
-
-    def __init__(self, house: "House", number: int) -> None:
-        self.house, self.number, self.waiting = house, number, 0
-
-    def send(self, message: bytes) -> None:
-        assert len(message) <= messages.MESSAGE_MAX
-        if message[1] == WELCOME:
-            welcome = decode_from_server(message)
-            assert isinstance(welcome, Welcome)
-            self.house.tokens.append(welcome.resume)
-
-    def outstanding(self) -> int:
-        return self.waiting
-
-    def close(self, code: int, reason: str) -> None:
-        if self.number % 2:
-            self.house.lose(self.number)
-
-
-class House:
-    """A game with players at work; each input is one client's next message."""
-
-    PLAYERS = 6
-    LIFE = 4000
-    """After so many messages there is a new game, so that each can be had again soon."""
-
-    def __init__(self) -> None:
-        self.made = 0
-        self._begin()
-
-    def _begin(self) -> None:
-        template = Template("person", (-0.3, -0.3, 0), (0.6, 0.6, 1.8), walk_speed=5, jump_speed=8)
-        scene = Scene(
-            name="fuzz",
-            templates=(template,),
-            player="person",
-            tick_rate=32,
-            gravity=16.0,
-            origin=(-1, -1, -1),
-            size=(2, 2, 2),
-            spawns=((0.5, 0.5, 1.0),),
-            terrain={"generator": "boxes", "fill": [[-32, -32, 0, 32, 32, 1, 1]]},
-        )
-        limits = Limits(resume_s=1.0, silence_s=4.0, stalled_s=2.0, hello_s=1.0, edits_per_s=200.0)
-        self.rng = random.Random(self.made)
-        self.now = 0.0
-        self.game = Game(scene, limits=limits, compiled=False, rules=_Shooting())
-        self.links: dict[int, _Deaf] = {}
-        self.tokens = [b""]
-        self.sessions: dict[int, Session] = {}
-
-    def lose(self, number: int) -> None:
-        session = self.sessions.pop(number, None)
-        if session is not None:
-            self.game.lost(session, self.now)
-
-    def _open(self, number: int) -> None:
-        self.links[number] = link = _Deaf(self, number)
-        self.sessions[number] = self.game.open(link, self.now)
-
-    def __call__(self, data: bytes) -> str:
-        self.made += 1
-        if self.made % self.LIFE == 0:
-            self._begin()
-        rng, game = self.rng, self.game
-        number = int(rng.random() * self.PLAYERS)
-        if number not in self.sessions or self.sessions[number].closed:
-            self.lose(number)
-            self._open(number)
-            if rng.random() < 0.95:
-                hello = Hello(messages.VERSION, {}, "Ann", resume=rng.choice(self.tokens[-8:]))  # anybody's
-                game.receive(self.sessions[number], encode(hello), self.now)
-        session = self.sessions[number]
-        before = game.counters.kicked
-        if client(data) not in KINDS_OF_CLIENTS and rng.random() < 0.98:
-            data = self._plausible()  # what is no message ends the session: of that there is enough
-        if not session.entity and rng.random() < 0.9:
-            data = encode(Ping(0.0))
-        game.receive(session, data, self.now)
-        told = f"{bool(session.entity)} {session.closed} {game.counters.kicked - before}"
-        if rng.random() < 0.02:
-            self.lose(number)
-        if rng.random() < 0.02 and number in self.links:
-            self.links[number].waiting = rng.choice((0, 0, 1 << 20))
-        if self.made % 4 == 0:
-            self.now += 1 / 32 if rng.random() < 0.999 else 3.0
-            game.tick(self.now, self.now + rng.choice((0.0, 0.01)))
-            self._check()
-        return told
-
-    def _plausible(self) -> bytes:
-        """A message as a client might send it now, more or less."""
-        rng, tick = self.rng, self.game.world.tick
-        x, y, z = (rng.randint(-8, 8) for _ in range(3))
-        return encode(
-            rng.choice(
-                (
-                    Inputs(max(0, tick + rng.randint(-70, 70)), tick, rng.randbytes(3 * rng.randrange(20))),
-                    Inputs(tick + 1, tick - rng.randrange(3), rng.randbytes(6)),
-                    Command(
-                        rng.randrange(COMMAND_MAX) if rng.random() < 0.01 else self.made,
-                        tick + rng.randint(-3, 70),
-                        rng.choice((tick - 2.5, 1e300, -1e300)),
-                        rng.choice(("edit", "shoot")),
-                        edits.pack(edits.Edit(x, y, z, rng.randrange(256))),
-                    ),
-                    Ping(rng.random(), rng.randrange(9)),
-                    Resync() if rng.random() < 0.2 else Ping(0.0),
-                )
-            )
-        )
-
-    def _check(self) -> None:
-        game, limits = self.game, self.game.limits
-        assert game.faults.total == 0
-        assert game.counters.rules_failed == 0
-        assert len(game.sessions) <= self.PLAYERS
-        for player in game.players.values():
-            assert len(player.commands) <= limits.commands_waiting_max
-            assert len(player.inputs._waiting) <= AHEAD_MAX
-            assert max(len(player.inputs.margins), len(player.inputs.fates)) <= FATES_MAX
-            assert len(player.verdicts) <= 32 * limits.messages_per_tick * (1 + limits.stalled_s)
-            assert len(player.tokens) <= 2
-        for session in game.sessions:
-            assert len(session.outbox) <= limits.outbox_max + 64
 
 
 class Desk:
