@@ -159,7 +159,9 @@ class Live:
         said = ((entity, game.stage.get(entity, "name")) for entity in ids)
         return {
             "scene": scene.name,
-            "templates": [[each.name, *each.box_offset, *each.box_size] for each in scene.templates],
+            "templates": [
+                [each.name, *each.box_offset, *each.box_size, each.walk_speed > 0] for each in scene.templates
+            ],
             "map": {
                 "origin": [part * SEGMENT for part in scene.origin],
                 "size": [part * SEGMENT for part in scene.size],

@@ -68,7 +68,7 @@ def test_who_is_where_and_what_they_are_called() -> None:
     assert before["away"] == []
     assert entities(before)[slab] == [3, 425, 750, 200]
     assert entities(before)[1] == [0, *(int(100 * part // 1) for part in game.world.position(1))]
-    assert before["templates"][3] == ["slab", 0.0, 0.0, 0.0, 4.0, 4.0, 1.0]
+    assert before["templates"][3] == ["slab", 0.0, 0.0, 0.0, 4.0, 4.0, 1.0, False]
     assert before["figures"]["clients"] == 2
     assert "pid" not in before["figures"]
     ann.say(Inputs(table.tick_number + 1, -1, bytes((127, 0, 0)) * 8))
