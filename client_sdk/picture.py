@@ -44,6 +44,11 @@ class View:
     others: list[Figure]
     seen: float = 0.0
 
+    @property
+    def figures(self) -> list[Figure]:
+        """All in sight, the own one last."""
+        return self.others if self.me is None else [*self.others, self.me]
+
 
 NOTHING = View(0.0, None, [])
 NONE_SAID: Mapping[str, Any] = MappingProxyType({})
