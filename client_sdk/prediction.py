@@ -1,9 +1,10 @@
 """The two worlds of a client, and how the one catches the other's mistakes.
 
 Theory of operation. *Confirmed* is the server's world as of the newest snapshot, as far as this client sees it. It
-is written, never stepped. *Predicted* is confirmed plus a replay: stepped by the same function with the own inputs,
-while everybody else goes on with the latest input known of them. For every predicted tick the states are kept. When
-the snapshot for tick T comes, it is compared with what was predicted for T, `==` on every bit of every entity:
+is never stepped: what happens in it is told, and what goes on as it did goes on. *Predicted* is confirmed plus a
+replay: stepped by the same function with the own inputs, while everybody else goes on with the latest input known of
+them. For every predicted tick the states are kept. When the snapshot for tick T comes, it is compared with what was
+predicted for T, `==` on every bit of every entity:
 
     equal     the prediction stands; nothing is done (nor where only those differ who are too far away to be met
               before the next replay: they are put right with it)
@@ -36,6 +37,8 @@ from shared.world import World
 
 HISTORY = 256
 """Ticks for which predictions and inputs are kept."""
+FOLLOW_MAX = 64
+"""After more ticks without a snapshot, everything is sent anew."""
 MEET_BLOCKS = 12
 """Whoever is further away cannot be met before a replay, at the speeds that legs have."""
 NEAR_BLOCKS = 5.0
@@ -119,7 +122,15 @@ class Prediction:
             ProtocolError: a part of it is malformed.
         """
         world = self.confirmed
-        parts, states = decode_parts(snapshot.segments, self._templates, compiled=world.compiled)
+        parts, states, turns = decode_parts(snapshot.segments, self._templates, compiled=world.compiled)
+        ticks = snapshot.tick - world.tick
+        wrong = ""
+        if len(turns):
+            if ticks != 1:
+                raise ProtocolError("segment.heads: the tick before was not told")
+            known = [entity in world for entity in turns[:, 0].tolist()]
+            if not all(known):
+                turns, wrong = turns[known], "entities are missing"
         here = set(states[:, ID].tolist())
         if max(states[:, FLAGS].tolist(), default=0) >= ACTED:
             self._acted.update(states[states[:, FLAGS] & ACTED != 0, ID].tolist())
@@ -127,7 +138,8 @@ class Prediction:
         drops: set[Cell] = set()
         if snapshot.drops:
             drops = {(x, y, z) for x, y, z in np.frombuffer(snapshot.drops, "<i4").reshape(-1, 3).tolist()}
-        if drops or any(part.gone or part.since == KEYFRAME for part in parts):
+        world.follow(turns, min(ticks, FOLLOW_MAX))
+        if drops or any(part.gone or part.ago == KEYFRAME for part in parts):
             self._take_away(parts, drops, here)
         for part in parts:
             if len(part.edits):
@@ -153,7 +165,7 @@ class Prediction:
         for part in parts:
             if part.check and part.segment in world.blocks and checksum(world, part.segment) != part.check:
                 return f"segment {part.segment} is not the server's"
-        return ""
+        return wrong
 
     def _near(self, segment: Cell, offsets: Int64s) -> bool:
         """Whether one of these blocks is so near to the own entity that it may have met it."""
@@ -176,7 +188,7 @@ class Prediction:
     def _take_away(self, parts: list[SegmentPart], drops: set[Cell], here: set[int]) -> None:
         """Removes who is gone, or was in a segment that is not seen any more or sent whole, and is not `here`."""
         segments = (self.truth[:, X : X + 3] >> (BLOCK_SHIFT + SEGMENT_SHIFT)).tolist()
-        whole = drops | {part.segment for part in parts if part.since == KEYFRAME}
+        whole = drops | {part.segment for part in parts if part.ago == KEYFRAME}
         gone = {(part.segment, entity) for part in parts for entity in part.gone}
         for entity, (x, y, z) in zip(self.truth[:, ID].tolist(), segments, strict=True):
             home = (x, y, z)

@@ -114,12 +114,13 @@ class Rig:
         }
         if "samples" in after:
             told["samples"] = {name: n - before["samples"][name] for name, n in after["samples"].items()}
+        told["entities_in_view"] = after.get("entities_in_view")
         for name in ("inputs_late", "inputs_used"):
             if name in after:
                 told[name] = after[name] - before[name]
         return told | {f"generator_{name}" if name in ("cpu_share", "late_ms") else name: figures[name] for name in (
             "snapshot_age_ms", "inputs_per_client_per_s", "bytes_down_per_client_per_s", "bytes_up_per_client_per_s",
-            "rows_per_snapshot", "cpu_share", "late_ms",
+            "cpu_share", "late_ms",
         )}  # fmt: skip
 
     def stats(self) -> Figures:
@@ -209,7 +210,6 @@ def search(
 def packed(stage: Figures) -> Figures:
     """A crowd's stage by the names of the report; `fairness` is the least served over the best served."""
     return stage | {
-        "entities_in_view": stage["rows_per_snapshot"],
         "bytes_per_client_per_s": stage["bytes_down_per_client_per_s"],
         "fairness": stage["snapshots_share_worst"] / max(stage["snapshots_share_best"], 1e-9),
     }

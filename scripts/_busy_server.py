@@ -7,9 +7,12 @@ _busy_server.py echo SCENE BYTES   the product's gateway and ticker without a ga
 """
 
 import asyncio
+import collections
+import functools
 import signal
 import sys
 import time
+from collections.abc import Callable
 from types import FrameType, FunctionType
 from typing import Any, cast
 
@@ -25,8 +28,10 @@ from server.rewind import Rewind
 from server.session import Link, Session
 from server.settings import Settings
 from server.warmup import warm_up
+from shared.layout import X
 from shared.messages import Hello, Ping, Pong, Welcome, decode_from_client, encode, join_snapshot
 from shared.scene import load_scene
+from shared.units import BLOCK_SHIFT, SEGMENT_SHIFT
 from shared.world import World
 
 
@@ -118,6 +123,14 @@ class Profile:
         self._latest = now
 
 
+def in_view(game: Game) -> float:
+    """Entities in the segments that a client sees, on average."""
+    cells = game.world.states()[:, X : X + 3] >> (BLOCK_SHIFT + SEGMENT_SHIFT)
+    inhabitants = collections.Counter(map(tuple, cells.tolist()))
+    views = [sum(inhabitants[segment] for segment in session.sight.sees) for session in game.sessions]
+    return sum(views) / max(len(views), 1)
+
+
 def serve(served: Game) -> None:
     """As `python -m server` does, on a port that the system picks."""
     settings = Settings(port=0, log_level="warning")
@@ -133,12 +146,13 @@ def main(argv: list[str]) -> int:
         return 0
     rules = load_scene(scene)
     warm_up(rules)
-    if kind == "game":
-        serve(Game(rules))
-        return 0
     made = Game(rules)
-    profile, plain_stats = Profile(), made.stats
-    cast("Any", made).stats = lambda: plain_stats() | {"samples": dict(profile.samples)}
+    plain_stats = made.stats
+    more: list[Callable[[], dict[str, Any]]] = [lambda: {"entities_in_view": in_view(made)}]
+    if kind == "profile":
+        profile = Profile()
+        more.append(lambda: {"samples": dict(profile.samples)})
+    cast("Any", made).stats = lambda: functools.reduce(lambda stats, each: stats | each(), more, plain_stats())
     serve(made)
     return 0
 

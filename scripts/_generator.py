@@ -6,7 +6,7 @@ stdout    a JSON object per line: {"playing", "gone"} at the reports, and the wi
 
 Every client says hello, pings once a second, acknowledges, and sends the input of each tick at a moment of its own
 within the tick, whether or not snapshots come: `LEAD_TICKS` ahead of the server's time. It wanders: a new direction
-about once a second, a jump now and then. Of what comes, heads are read; one snapshot in `SAMPLE` is decoded whole.
+about once a second, a jump now and then. Of what comes, heads are read.
 """
 
 import contextlib
@@ -24,14 +24,12 @@ from typing import Any
 from websockets.speedups import apply_mask
 
 from shared import messages
-from shared.messages import Hello, Inputs, Ping, Snapshot, decode_from_server, encode
-from shared.snapshot import ROW
+from shared.messages import Hello, Inputs, Ping, decode_from_server, encode
 
 LEAD_TICKS = 2
 """An input goes out at most so long before the deadline of its tick, and up to a tick later."""
 REPORT_S = 0.2
 PING_S = 1.0
-SAMPLE = 997
 SLOT_S = 0.001
 """The clock of what is sent: late by more than this is told."""
 CATCH_UP_SLOTS = 16
@@ -92,7 +90,6 @@ class Swarm:
         self.bytes_down = self.bytes_up = self.inputs = self.stuck = 0
         self.ages_ms: list[int] = [0] * 2048
         self.late_ms: list[int] = [0] * 2048
-        self.rows: list[int] = []
         for player in self.players.values():
             player.snapshots = 0
 
@@ -155,10 +152,6 @@ class Swarm:
             if self.server_tick_0 > -math.inf:
                 age_ms = int((now * self.rate + self.server_tick_0 - tick) / self.rate * 1e3)
                 self.ages_ms[min(max(age_ms, 0), 2047)] += 1
-            if (tick + 31 * player.number) % SAMPLE == 0:
-                snapshot = decode_from_server(data[start:end])
-                assert isinstance(snapshot, Snapshot)
-                self.rows.append(sum(len(segment[4]) for segment in snapshot.segments) // ROW.itemsize)
         elif data[start + 1] == PONG:
             pong = decode_from_server(data[start:end])
             assert isinstance(pong, messages.Pong)
@@ -293,7 +286,6 @@ class Swarm:
             "inputs_per_client_per_s": self.inputs / n / seconds,
             "bytes_down_per_client_per_s": self.bytes_down / n / seconds,
             "bytes_up_per_client_per_s": self.bytes_up / n / seconds,
-            "rows_per_snapshot": sum(self.rows) / len(self.rows) if self.rows else None,
             "cpu_share": (time.process_time() - self.cpu_0) / seconds,
             "late_ms": quantiles(self.late_ms),
         }

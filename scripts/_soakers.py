@@ -14,18 +14,16 @@ import msgpack
 import numpy as np
 
 from _generator import REQUEST, frame
+from client_sdk.prediction import Prediction, check_scene
 from shared import edits, messages
-from shared.layout import ID, X
 from shared.messages import Bye, Command, Hello, Inputs, Ping, Snapshot, Welcome, decode_from_server, encode
-from shared.snapshot import VERDICT, decode_parts
-from shared.units import BLOCK
+from shared.snapshot import VERDICT
 from shared.world import World
 
 LEAD_TICKS = 2
 CONNECT_S = 5.0
 AWAY_S = 13.0
 """Who was away for longer may find another entity: the server keeps it for 15 s, and notices a loss in its own time."""
-TEMPLATES = 256
 Cell = tuple[int, int, int]
 
 
@@ -138,6 +136,8 @@ class Honest:
         """Snapshots that came, and that the server made, between the first and the last of each connection."""
         self.playing = False
         self._waiting: dict[int, tuple[Cell, int, Command]] = {}
+        self._copy: Prediction | None = None
+        """What it knows of the world, but for the terrain."""
         self._asked = 0
         self._tick = self._sent = -1
         self._row = bytes(3)
@@ -210,6 +210,7 @@ class Honest:
             self.counts["joined"] += 1
             self._waiting = {}
         self.entity, self.resume, self._sent = welcome.entity, welcome.resume, -1
+        self._copy = Prediction(check_scene(welcome.scene), welcome.entity)
         self.playing = True
 
     def _snapshot(self, link: Link, snapshot: Snapshot) -> None:
@@ -218,6 +219,8 @@ class Honest:
             self.got += 1
             self.due += tick - self._tick
         self._tick = tick
+        if self._copy is not None and (wrong := self._copy.apply(snapshot)):
+            self.unexplained.append(wrong)
         for number, verdict in np.frombuffer(snapshot.verdicts, VERDICT).tolist():
             asked = self._waiting.pop(number, None)
             if asked is not None:
@@ -231,16 +234,14 @@ class Honest:
         if n > 0:
             self._sent = due
             link.send(Inputs(due - n + 1, tick, self._row * n))
-        if rng.random() < 1 / 32 and snapshot.segments:
+        if rng.random() < 1 / 32:
             self._edit(link, snapshot)
 
     def _edit(self, link: Link, snapshot: Snapshot) -> None:
-        """A block next to where the player is, if this snapshot says where that is."""
-        states = decode_parts(snapshot.segments, TEMPLATES)[1]
-        own = states[states[:, ID] == self.entity]
-        if not len(own):
+        """A block next to where the player is."""
+        if self._copy is None or self.entity not in self._copy.confirmed:
             return
-        x, y, z = (int(part) // BLOCK + self.rng.randint(-3, 3) for part in own[0, X : X + 3])
+        x, y, z = (int(part // 1) + self.rng.randint(-3, 3) for part in self._copy.confirmed.position(self.entity))
         cell = (x, y, z + 2)
         kind = self.cells.ask(self.number, cell, self.rng)
         if kind is not None:

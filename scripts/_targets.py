@@ -16,12 +16,14 @@ from _house import House
 from server.kinds import SettingsError
 from server.settings import KINDS, Settings, parse
 from shared import edits
+from shared.layout import STOP_X, TOLD, WHOLE
 from shared.messages import (
     CLIENT_KINDS,
     CLIENT_LIST_MAX,
     CLIENT_MESSAGE_MAX,
     COMMAND_MAX,
     TICK_MAX,
+    VERSION,
     Bye,
     Command,
     Happened,
@@ -48,10 +50,11 @@ Target = Callable[[bytes], str]
 WORDS = re.compile(r"[A-Za-z_.]* ?[A-Za-z]*")
 TEMPLATES = 3
 
-PART = [0, -1, 2, 7, b"\1" + bytes(32), bytes(4), bytes(3), 0, [1, {"name": "Ann"}]]
+HEADS = b"\2\0\0\0" + bytes([TOLD | STOP_X])
+PART = [0, -1, 2, 1, HEADS, bytes(7), b"\1" + bytes(32), bytes(4), 0, bytes(3), [1, {"name": "Ann"}]]
 FROM_CLIENT: tuple[Message, ...] = (
-    Hello(1, {}, "Ann"),
-    Hello(1, {"gravity": bytes(8)}, "", "token", bytes(16)),
+    Hello(VERSION, {}, "Ann"),
+    Hello(VERSION, {"gravity": bytes(8)}, "", "token", bytes(16)),
     Inputs(5, 3, bytes((127, 0, 1)) * 4),
     Inputs(TICK_MAX - 64, TICK_MAX, bytes(192)),
     Ping(-0.5, COMMAND_MAX),
@@ -62,7 +65,7 @@ FROM_CLIENT: tuple[Message, ...] = (
 )
 FROM_SERVER: tuple[Message, ...] = (
     Bye(1001, "going down", 2.0),
-    Welcome(1, 7, 1, {"name": "flat"}, bytes(16)),
+    Welcome(VERSION, 7, 1, {"name": "flat"}, bytes(16)),
     Snapshot(9, 8, bytes(4), 7, bytes(2), bytes(5), bytes(12), (PART, PART)),
     Snapshot(9, -1, b"", 0, b"", b"", b"", ()),
     Terrain(0, -1, 2, 0, 4, b"\1\2\3\4"),
@@ -100,7 +103,7 @@ def server(data: bytes) -> str:
         message = decode_from_server(data)
         if not isinstance(message, Snapshot):
             return type(message).__name__
-        parts, states = decode_parts(message.segments, TEMPLATES)
+        parts, states, turns = decode_parts(message.segments, TEMPLATES)
     except ProtocolError as error:
         return said(error)
     assert sum(part.entities for part in parts) == len(states)
@@ -109,7 +112,8 @@ def server(data: bytes) -> str:
         assert 0 <= state[1] < TEMPLATES
         assert all(STATE_LOW[6:] <= state[6:])
         assert all(state[6:] <= STATE_HIGH[6:])
-    return f"parts {min(len(parts), 3)} {min(len(states), 3)}"
+    assert all(0 <= events < WHOLE for events in turns[:, 1].tolist())
+    return f"parts {min(len(parts), 3)} {min(len(states), 3)} {min(len(turns), 3)}"
 
 
 def value(data: bytes) -> str:

@@ -8,6 +8,9 @@ entities in view, beside what the same gateway holds without a game. It needs th
 work, ticks are late for their sake. The CPU time per client and tick is told as well, and what it comes to.
 `server --crowd` puts 300 players (or N) into one segment instead, each seeing all: the fairness is what the worst
 served of them gets of what the best served gets.
+
+`bytes` tells what one client is sent at 20 Hz while 100 entities (or N) move in its view, and that its copy of them is
+exact in every tick.
 """
 
 import argparse
@@ -22,6 +25,7 @@ from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
+import _bench_bytes as wire
 import _bench_physics as physics
 import _bench_server as server
 import _step_c
@@ -168,7 +172,7 @@ def run_server(args: argparse.Namespace, console: Console) -> int:
                 "clients_by_cpu": int(1e6 / server.RATE / cpu_us),
                 **bound(echoed),
                 "parts": {name: share * cpu_us for name, share in shares.items()},
-                "entities_in_view": by["rows_per_snapshot"],
+                "entities_in_view": by["entities_in_view"],
                 "bytes_per_client_per_s": by["bytes_down_per_client_per_s"],
                 "snapshot_age_ms": by["snapshot_age_ms"],
                 "generator_cpu_share": by["generator_cpu_share"],
@@ -225,6 +229,27 @@ def run_crowd(args: argparse.Namespace, console: Console, seconds: float) -> int
     return 0
 
 
+def run_bytes(args: argparse.Namespace, console: Console) -> int:
+    """What a client is sent, by how the others move; some of them pause, so there are more in view than move."""
+    ticks, seeds = (200, 1) if args.quick else (600, 3)
+    runs = [
+        wire.run(motion, round(args.entities * more), ticks, seed)
+        for motion, more in (("wander", 1.4), ("run-and-jump", 1.0), ("restless", 1.0))
+        for seed in range(1, seeds + 1)
+    ]
+    made = Table("motion", "seed", title=f"bytes: one client, {args.entities} entities move in its view, 20 Hz")
+    forms = {"moving": "{:.0f}", "in_view": "{:.0f}", "bytes_per_s": "{:,.0f}", "differing": "{}"}
+    forms |= {"server_us_per_tick": "{:.0f}", "client_us_per_tick": "{:.0f}"}
+    for name in forms:
+        made.add_column(name.replace("_", " "), justify="right")
+    for run in runs:
+        made.add_row(run["motion"], str(run["seed"]), *(form.format(run[name]) for name, form in forms.items()))
+    console.print(made)
+    if args.json:
+        args.json.write_text(json.dumps({"rate": wire.RATE, "runs": runs}, indent=1) + "\n", encoding="utf-8")
+    return int(any(run["differing"] for run in runs))
+
+
 def capacity_table(runs: list[dict[str, Any]], bounds: list[dict[str, Any]]) -> Table:
     made = Table("figure", title="server: 30 Hz, one process; each search apart")
     for number in range(len(runs)):
@@ -275,6 +300,11 @@ def main(argv: list[str] | None = None) -> int:
         "--crowd", type=int, nargs="?", const=300, metavar="N", help="N players in one segment instead (300)"
     )
     command.set_defaults(run=run_server)
+    command = commands.add_parser("bytes", help="what a client is sent")
+    command.add_argument("--entities", type=int, default=100, metavar="N", help="how many of them move (100)")
+    command.add_argument("--json", type=Path, metavar="OUT", help="write all figures to this file")
+    command.add_argument("--quick", action="store_true", help="ten seconds of one seed each")
+    command.set_defaults(run=run_bytes)
     args = parser.parse_args(argv)
     return int(args.run(args, Console()))
 

@@ -1,8 +1,9 @@
 """What changed, by tick and by segment, and its bytes: encoded once, shared by all who see the segment.
 
-A client is sent what changed since the last snapshot it was sent. Most were sent the previous tick's, so one
-encoding serves them all; one that skipped some gets the union of those ticks; one that is more than `HISTORY`
-ticks behind, or has just begun to see the segment, gets a keyframe. Nothing is computed per entity and client.
+A client is sent what has happened since the last snapshot it was sent; an entity that goes on as it did, it takes on by
+itself (`shared.snapshot`). Most were sent the previous tick's, so one encoding serves them all; one that skipped some
+gets the whole states of those to which anything happened in those ticks; one that is more than `HISTORY` ticks behind,
+or has just begun to see the segment, gets a keyframe. Nothing is computed per entity and client.
 """
 
 from collections import defaultdict
@@ -14,9 +15,9 @@ import numpy as np
 from server.faults import Faults
 from shared.blocks import offset_of, pack, segment_of
 from shared.checks import Cell
-from shared.layout import ID, Int64s, X
+from shared.layout import CHANGED, EVENT_BITS, ID, WHOLE, X
 from shared.ring import Ring
-from shared.snapshot import KEYFRAME, ROW, checksum, encode_part, encode_rows, join_part
+from shared.snapshot import KEYFRAME, News, checksum, encode_part, encode_rows, join_part
 from shared.units import BLOCK_SHIFT, SEGMENT_SHIFT
 from shared.world import World
 
@@ -26,14 +27,14 @@ PACKS_PER_TICK = 8
 """So many segments are packed anew in a tick, 0.25 to 0.7 ms each: who joins where nobody was waits for terrain, not
 everybody for the tick."""
 CHECK_TICKS = 32
-"""How often a segment in which something changes is sent with its checksum."""
+"""How often a segment in which something changes is sent with its checksum; a power of two."""
 
 
 class _Tick:
     """One tick's changes."""
 
     def __init__(self) -> None:
-        self.ids: list[int] = []  # of what has changed, in the order of segments
+        self.ids: list[int] = []  # of those to which something happened, in the order of segments
         self.changed: dict[Cell, range] = {}  # where in them a segment's are
         self.gone: dict[Cell, list[int]] = defaultdict(list)
         self.edited: dict[Cell, set[int]] = defaultdict(set)  # block offsets by segment
@@ -98,15 +99,14 @@ class ChangeLog:
         self._home: dict[int, Cell] = {
             entity: (x, y, z) for entity, (x, y, z) in zip(states[:, ID].tolist(), homes, strict=True)
         }
-        self._known: Int64s = np.zeros(
-            (0, 4), np.int64
-        )  # by row of the world: id and segment when it was recorded last
         self._spans: dict[int, _Span | None] = {}
         self._parts: dict[int, _Parts] = {}
         self._packed: dict[Cell, tuple[int, bytes]] = {}
         self._packs_left = PACKS_PER_TICK
-        self._latest: bytes | None = None
-        """The packed rows of the entities that the newest tick changed, until something is removed."""
+        self._due: set[Cell] = set()
+        """The segments that are to be sent with their checksums now."""
+        self._latest: News | None = None
+        """Of the entities to which something happened in the newest tick, until something is removed."""
 
     def segment(self, entity: int) -> Cell:
         """Where an entity was at the end of the latest recorded tick."""
@@ -132,26 +132,27 @@ class ChangeLog:
             self._now.gone[home].append(entity)
 
     def record(self) -> None:
-        """Takes in what the step has changed: all of it is packed at once, in the order of segments.
+        """Takes in what has happened in the step: all of it is packed at once, in the order of segments.
 
         So a part of the newest tick, which nearly all are, is a slice of that: 4.9 us per client and tick became 1.7.
-        And Python looks at those only that are new to their segment: of 10,000 walkers in 2,300 segments among 100,000
-        entities, 11.3 ms became 5.0, and with a full garbage collection in it 53 ms became 22.
+        And Python looks at those only that are new to their segment.
         """
         now, homes = self._now, self._home
-        indices = self._world.changed_rows
-        rows = self._world.matrix[indices]
-        alive = rows[:, ID] != 0
-        indices, rows = indices[alive], rows[alive]
+        rows = self._world.changed
         cells = rows[:, X : X + 3] >> (BLOCK_SHIFT + SEGMENT_SHIFT)
+        turns = cells @ (1, 3, 5) + self._world.tick
+        self._due = {(x, y, z) for x, y, z in cells[turns % CHECK_TICKS == 0].tolist()}
+        told = rows[:, CHANGED] & (1 << EVENT_BITS) - 1 != 0
+        rows, cells = rows[told], cells[told]
         order = np.lexsort((rows[:, ID], *cells.T))
-        indices, rows, cells = indices[order], rows[order], cells[order]
-        now.ids, self._latest = rows[:, ID].tolist(), encode_rows(rows, now.acted)
+        rows, cells = rows[order], cells[order]
+        now.ids, self._latest = rows[:, ID].tolist(), News(rows, now.acted)
         starts = np.flatnonzero(np.any(cells[1:] != cells[:-1], axis=1)) + 1
         bounds = [0, *starts.tolist(), len(rows)] if len(rows) else [0]
         firsts = map(tuple, cells[bounds[:-1]].tolist())
         now.changed = dict(zip(firsts, map(range, bounds, bounds[1:]), strict=True))
-        for entity, x, y, z in self._news(indices, np.column_stack((rows[:, ID], cells))):
+        whole = rows[:, CHANGED] & WHOLE != 0
+        for entity, (x, y, z) in zip(rows[whole, ID].tolist(), cells[whole].tolist(), strict=True):
             home, segment = homes.get(entity), (x, y, z)
             if home != segment:
                 if home is not None:
@@ -199,23 +200,13 @@ class ChangeLog:
             known = self._packed[segment] = (digest, pack(self._world.blocks.segment(segment)))
         return known[1]
 
-    def _news(self, indices: Int64s, now: Int64s) -> list[list[int]]:
-        """Those of the rows (`now`: id and segment) that were not there the last time; from now on they are known."""
-        if len(self._known) < len(self._world.matrix):
-            more = np.zeros((2 * len(self._world.matrix), 4), np.int64)
-            more[: len(self._known)] = self._known
-            self._known = more
-        news: list[list[int]] = now[np.any(self._known[indices] != now, axis=1)].tolist()
-        self._known[indices] = now
-        return news
-
     def _span(self, since: int) -> _Span | None:
         if since not in self._spans:
             newest, span = self._world.tick, None
             if newest - since <= HISTORY:
                 ticks = [tick for at in range(since + 1, newest + 1) if (tick := self._ticks.get(at)) is not None]
                 more = set().union(*(tick.more() for tick in ticks))
-                span = _Span(ticks, more.union(*(tick.changed for tick in ticks)), more)
+                span = _Span(ticks, more.union(self._due, *(tick.changed for tick in ticks)), more)
             self._spans[since] = span
         return self._spans[since]
 
@@ -228,17 +219,17 @@ class ChangeLog:
         return encode_part(segment, KEYFRAME, rows, attributes=self._of(rows[:, ID].tolist()))
 
     def _changes(self, segment: Cell, since: int, span: _Span) -> bytes:
-        due = (self._world.tick + hash(segment)) % CHECK_TICKS == 0 and segment in self._world.blocks
+        due = segment in self._due and segment in self._world.blocks
         check = checksum(self._world, segment) if due else 0
         ticks = span.ticks
-        rows = self._rows(segment, since, ticks)
+        ago, news = self._world.tick - since, self._share(segment, since, ticks)
         if segment not in span.more:
-            return join_part(segment, since, rows, check=check)
+            return join_part(segment, ago, news, check=check)
         gone = {entity for tick in ticks for entity in tick.gone.get(segment, ()) if self._home.get(entity) != segment}
         edited = {offset for tick in ticks for offset in tick.edited.get(segment, ())}
         kinds = self._kinds(segment, sorted(edited))
         said = {entity for tick in ticks for entity in tick.said.get(segment, ()) if self._home.get(entity) == segment}
-        return join_part(segment, since, rows, sorted(gone), kinds, check, self._of(sorted(said)))
+        return join_part(segment, ago, news, sorted(gone), kinds, check, self._of(sorted(said)))
 
     def _of(self, entities: list[int]) -> list[Any]:
         """The attributes of these entities, for the wire."""
@@ -248,14 +239,14 @@ class ChangeLog:
             part for entity in entities if (all_ := self._attributes.get(entity)) is not None for part in (entity, all_)
         ]
 
-    def _rows(self, segment: Cell, since: int, ticks: list[_Tick]) -> bytes:
-        """What changed and is still there, packed."""
+    def _share(self, segment: Cell, since: int, ticks: list[_Tick]) -> tuple[bytes, bytes, bytes]:
+        """Of those to which something happened and which are still there: heads, tails and rows, packed."""
         if self._latest is not None and since == self._world.tick - 1:
             span = ticks[-1].changed.get(segment, range(0))
-            return self._latest[span.start * ROW.itemsize : span.stop * ROW.itemsize]
+            return self._latest.share(span.start, span.stop)
         here = {entity for tick in ticks for entity in tick.changed_in(segment) if self._home.get(entity) == segment}
         acted = {entity for tick in ticks for entity in tick.acted if entity in here}
-        return encode_rows(self._world.rows(sorted(here)), acted)
+        return b"", b"", encode_rows(self._world.rows(sorted(here)), acted)
 
     def _kinds(self, segment: Cell, offsets: list[int]) -> list[tuple[int, int]]:
         if not offsets:

@@ -32,13 +32,18 @@ from shared.layout import (
     CELLS,
     CELLS_SHIFT,
     CHANGED,
+    EVENT_BITS,
     EXACT,
+    FALL,
     FALLING,
     FLAGS,
     FLOOR,
+    GO_X,
+    GO_Y,
     GRAVITY,
     ID,
     JUMP_SPEED,
+    LAUNCH,
     LO_X,
     MEAN,
     MOVE_X,
@@ -59,13 +64,19 @@ from shared.layout import (
     REACH_LO,
     SIZE_X,
     SOLID,
+    STOP_X,
+    STOP_Y,
+    STOP_Z,
     TEMPLATE,
     TEMPLATE_COLUMNS,
     TERMINAL,
+    TOLD,
+    TURN,
     VX,
     VY,
     VZ,
     WALKS,
+    WHOLE,
     WIDTH_SHIFT,
     Arrays,
     X,
@@ -101,6 +112,7 @@ TO_CELL_Z = BLOCK_SHIFT + CELL_SHIFT_Z
 CELL_TO_SEGMENT = SEGMENT_SHIFT - CELL_SHIFT
 CELL_TO_SEGMENT_Z = SEGMENT_SHIFT - CELL_SHIFT_Z
 MOVES = 2 * MOVE_MAX + 1
+IN_SEGMENT = (1 << TO_SEGMENT) - 1
 
 
 # -- looking things up ---------------------------------------------------------------------------------------
@@ -436,6 +448,7 @@ def turn(w: Arrays, row: int, key: int, tick: int) -> bool:
     meets = p[PAIRS] != 0 and t[kind + SOLID] != 0
     walks = False
     jumps = False
+    events = 0
 
     if t[kind + WALKS] != 0:
         east = e[at + MOVE_X]
@@ -452,8 +465,10 @@ def turn(w: Arrays, row: int, key: int, tick: int) -> bool:
                 if jumps:
                     vz = t[kind + JUMP_SPEED]
                     falling = FALLING
-            else:
+                    events = LAUNCH
+            elif falling == 0:
                 falling = FALLING
+                events = FALL
         from_vz = vz
         if falling != 0:
             vz = max(vz - p[GRAVITY], -p[TERMINAL])
@@ -461,6 +476,10 @@ def turn(w: Arrays, row: int, key: int, tick: int) -> bool:
             from_vz = vz
 
     moved = False
+    dx = 0
+    dy = 0
+    went_x = 0
+    went_y = 0
     if from_vz != 0 or vz != 0 or vx != 0 or vy != 0:
         dx = displacement(p, 2 * vx)
         dy = displacement(p, 2 * vy)
@@ -472,13 +491,12 @@ def turn(w: Arrays, row: int, key: int, tick: int) -> bool:
                 x0 + min(dx, 0), y0 + min(dy, 0), z0 + min(dz, 0),
                 x1 + max(dx, 0), y1 + max(dy, 0), z1 + max(dz, 0),
             )  # fmt: skip
-        went_x = 0
-        went_y = 0
         went_z = 0
         if dz != 0:
             went_z = sweep(w, 2, dz, n, z0, z1, x0, x1, y0, y1)
             if went_z != dz:
                 vz = 0
+                events |= STOP_Z
                 if dz < 0:
                     falling = 0
         if dx != 0:
@@ -497,18 +515,32 @@ def turn(w: Arrays, row: int, key: int, tick: int) -> bool:
             e[at + X] = x + went_x
             e[at + Y] = y + went_y
             e[at + Z] = z + went_z
-            if (x ^ x + went_x | y ^ y + went_y | z ^ z + went_z) >> TO_CELL != 0:
+            borders = x ^ x + went_x | y ^ y + went_y | z ^ z + went_z
+            if borders >> TO_CELL != 0:
                 relink(w, row)
+                if borders >> TO_SEGMENT != 0:
+                    events |= WHOLE
             if n > 0 and p[GRAVITY] != 0:
                 wake_riders(w, n, x0, y0, x1, y1, z1, key)
             z0 += went_z
 
-    if moved or vx != e[at + VX] or vy != e[at + VY] or vz != e[at + VZ] or falling != e[at + FLAGS] & FALLING:
+    told = e[at + CHANGED] == tick << EVENT_BITS | TOLD
+    if went_x != dx:
+        if told or went_x != 0 or e[at + VX] != 0:
+            events |= STOP_X
+    elif vx != e[at + VX] and not told:
+        events |= GO_X
+    if went_y != dy:
+        if told or went_y != 0 or e[at + VY] != 0:
+            events |= STOP_Y
+    elif vy != e[at + VY] and not told:
+        events |= GO_Y
+    if moved or told or events != 0 or vz != e[at + VZ]:
         e[at + VX] = vx
         e[at + VY] = vy
         e[at + VZ] = vz
         e[at + FLAGS] = (e[at + FLAGS] & ~FALLING) | falling
-        mark(w, row, tick)
+        mark(w, row, tick, events)
     if z0 >> BLOCK_SHIFT < p[FLOOR]:
         w.fell[w.lengths[N_FELL]] = e[at + ID]
         w.lengths[N_FELL] += 1
@@ -516,16 +548,17 @@ def turn(w: Arrays, row: int, key: int, tick: int) -> bool:
 
 
 @inlined
-def mark(w: Arrays, row: int, tick: int) -> None:
-    """Notes that the state of an entity changed in this tick, or before its step."""
+def mark(w: Arrays, row: int, tick: int, events: int) -> None:
+    """Notes that the state of an entity changed in this tick, or before its step, and by what."""
     if w.lengths[N_STEPPED] != 0:
         w.lengths[N_STEPPED] = 0
         w.lengths[N_CHANGED] = 0
     at = row << WIDTH_SHIFT
-    if w.entities[at + CHANGED] != tick:
-        w.entities[at + CHANGED] = tick
+    if w.entities[at + CHANGED] >> EVENT_BITS != tick:
+        w.entities[at + CHANGED] = tick << EVENT_BITS
         w.changed[w.lengths[N_CHANGED]] = row
         w.lengths[N_CHANGED] += 1
+    w.entities[at + CHANGED] |= events
 
 
 # -- the tick ------------------------------------------------------------------------------------------------
@@ -548,7 +581,7 @@ def step(w: Arrays, inputs: Any, n_inputs: int, tick: int) -> None:
                 wish = min(max(wish, -MOVE_MAX), MOVE_MAX)
             if e[wishes + k] != wish:
                 e[wishes + k] = wish
-                mark(w, row, tick)
+                mark(w, row, tick, TOLD)
         wake(w, row, -1)
 
     at = 0
@@ -610,7 +643,7 @@ def write(w: Arrays, row: int, states: Any, i: int, tick: int) -> None:
     for k in range(CELL):
         e[at + k] = states[i + k]
     e[at + FLAGS] = e[at + FLAGS] & FALLING | awake
-    mark(w, row, tick)
+    mark(w, row, tick, WHOLE)
     relink(w, row)
     wake(w, row, -1)
 
@@ -642,6 +675,92 @@ def settle(w: Arrays, rows: Any, states: Any, n: int, tick: int) -> int:
                     return i
         write(w, rows[i], states, CELL * i, tick)
     return n
+
+
+# -- turns taken again ---------------------------------------------------------------------------------------
+
+
+@inlined
+def advance(w: Arrays, row: int, events: int, turns: Any, i: int) -> None:
+    """The turn of an entity in a world that is written, not stepped: `turn`, with its decisions told.
+
+    Without any, it goes on as before. What would leave its segment stays: that is told by the whole state.
+    """
+    e, p, t = w.entities, w.parameters, w.templates
+    at = row << WIDTH_SHIFT
+    kind = e[at + TEMPLATE] * TEMPLATE_COLUMNS
+    vx = e[at + VX]
+    vy = e[at + VY]
+    vz = e[at + VZ]
+    falling = e[at + FLAGS] & FALLING
+    if events & TOLD != 0:
+        e[at + MOVE_X] = min(max(turns[i + 2], -MOVE_MAX), MOVE_MAX)
+        e[at + MOVE_Y] = min(max(turns[i + 3], -MOVE_MAX), MOVE_MAX)
+        e[at + BUTTONS] = turns[i + 4]
+    if t[kind + WALKS] != 0:
+        walk = e[at + TEMPLATE] * MOVES + MOVE_MAX
+        if events & (TOLD | GO_X) != 0:
+            vx = w.walk[walk + e[at + MOVE_X]]
+        if events & (TOLD | GO_Y) != 0:
+            vy = w.walk[walk + e[at + MOVE_Y]]
+    if events & LAUNCH != 0:
+        vz = t[kind + JUMP_SPEED]
+    if events & (LAUNCH | FALL) != 0:
+        falling = FALLING
+    from_vz = vz
+    if p[GRAVITY] != 0:
+        if falling != 0:
+            vz = max(vz - p[GRAVITY], -p[TERMINAL])
+        if p[MEAN] == 0:
+            from_vz = vz
+    x = e[at + X]
+    y = e[at + Y]
+    z = e[at + Z]
+    if events & STOP_X != 0:
+        to_x = x & ~IN_SEGMENT | turns[i + 5] & IN_SEGMENT
+        vx = 0
+    else:
+        to_x = x + displacement(p, 2 * vx)
+    if events & STOP_Y != 0:
+        to_y = y & ~IN_SEGMENT | turns[i + 6] & IN_SEGMENT
+        vy = 0
+    else:
+        to_y = y + displacement(p, 2 * vy)
+    if events & STOP_Z != 0:
+        to_z = z & ~IN_SEGMENT | turns[i + 7] & IN_SEGMENT
+        if from_vz + vz < 0:
+            falling = 0
+        vz = 0
+    else:
+        to_z = z + displacement(p, from_vz + vz)
+    borders = x ^ to_x | y ^ to_y | z ^ to_z
+    if borders >> TO_SEGMENT != 0:
+        return
+    e[at + X] = to_x
+    e[at + Y] = to_y
+    e[at + Z] = to_z
+    e[at + VX] = vx
+    e[at + VY] = vy
+    e[at + VZ] = vz
+    e[at + FLAGS] = (e[at + FLAGS] & ~FALLING) | falling
+    if borders >> TO_CELL != 0:
+        relink(w, row)
+
+
+@jit
+def follow(w: Arrays, turns: Any, n: int, rows: int, ticks: int, tick: int) -> None:
+    """Takes the first `rows` rows on by `ticks`, the last of which is `tick`; those `n` in `turns`, which are told, by
+    one."""
+    e = w.entities
+    for i in range(0, n * TURN, TURN):
+        mark(w, turns[i], tick, turns[i + 1])
+        advance(w, turns[i], turns[i + 1], turns, i)
+    for row in range(rows):
+        at = row << WIDTH_SHIFT
+        moves = e[at + VX] != 0 or e[at + VY] != 0 or e[at + VZ] != 0 or e[at + FLAGS] & FALLING != 0
+        if moves and e[at + ID] != 0 and e[at + CHANGED] >> EVENT_BITS != tick:
+            for _ in range(ticks):
+                advance(w, row, 0, turns, 0)
 
 
 # -- reading -------------------------------------------------------------------------------------------------

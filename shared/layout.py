@@ -13,7 +13,8 @@ COLUMNS = "id template flags x y z vx vy vz move_x move_y buttons cell next prev
 ID, TEMPLATE, FLAGS, X, Y, Z, VX, VY, VZ, MOVE_X, MOVE_Y, BUTTONS, CELL, NEXT, PREV, CHANGED = range(16)
 ENTITY = np.dtype([(name, np.int64) for name in COLUMNS])
 """An entity. `id` 0 is a free row; position and velocity in grid steps; `cell` its place in the index of
-cells (-1: none) with its `next` and `prev` neighbour rows; `changed` the tick that last changed it."""
+cells (-1: none) with its `next` and `prev` neighbour rows; `changed` the tick that last changed it, and above
+what was to be foreseen of that (`tick << EVENT_BITS | events`; see `kernel.advance`)."""
 
 WIDTH_SHIFT = 4
 """In the kernel's flat view the row r of an entity begins at r << WIDTH_SHIFT."""
@@ -22,6 +23,13 @@ FALLING = 1
 """Flag: gravity acts."""
 AWAKE = 2
 """Flag (bookkeeping): the row is in the list of the awake."""
+
+EVENT_BITS = 9
+STOP_X, STOP_Y, STOP_Z, GO_X, GO_Y, FALL, LAUNCH, TOLD, WHOLE = (1 << bit for bit in range(EVENT_BITS))
+"""What a turn decided: stopped along an axis, walks as wished again, nothing stands under it, jumped; its wish is
+another one; it was written from outside or came into another segment."""
+TURN = 8
+"""Numbers of a turn that is told: row, events, the wish (3), the position (3)."""
 
 # A template's row: the box relative to the position, and what it may do.
 LO_X, LO_Y, LO_Z, SIZE_X, SIZE_Y, SIZE_Z, SOLID, WALKS, JUMP_SPEED = range(9)

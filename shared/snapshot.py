@@ -1,7 +1,11 @@
 """One segment's part of a snapshot: encoded once per tick, read by every client that sees the segment.
 
-    segment   [x, y, z, since, rows, gone, edits, check, attributes]   an array inside the snapshot's array
-    since     what follows is what changed after this tick; -1 (`KEYFRAME`): rows are all entities of the segment
+    segment   [x, y, z, ago, heads, tails, rows, gone, check, edits, attributes]   an array inside the snapshot's array,
+              without the fields at its end that are empty
+    ago       what follows is what happened in so many ticks; -1 (`KEYFRAME`): rows are all entities of the segment
+    heads     n * [u32 id, u8 events]: entities that did not go on as they had, where `ago` is 1
+    tails     for each of them, as its events say: i8 move_x, move_y u8 buttons if it was `TOLD` another wish; then i32
+              for each axis along which it stopped, in grid steps from the segment's low corner
     rows      n * 33 bytes, the whole exact state of an entity:
               u32 id  u8 template  u8 flags  i32 x, y, z (grid steps from the segment's low corner)
               i32 vx, vy, vz  i8 move_x, move_y  u8 buttons
@@ -12,6 +16,12 @@
               that has changed, or the entity has come into the segment, since then
 
 On the wire the flags have one bit more: `ACTED` says that the server's rules moved the entity, not the physics.
+
+Theory of operation. The physics is the same on both sides, so what an entity does as long as nothing happens to it is
+not sent: whoever has its state of a tick has that of the next, by `World.follow`. What is sent is what took place in
+its turn (`layout.STOP_X` ...): it stopped, walks on, falls, jumps, wishes something else. That is all that a turn takes
+from its surroundings, so the result is exact whether the client knows them or not. An entity that was written, or
+changed its segment, is sent whole, as is all that something has happened to in a span of more ticks than one.
 """
 
 import zlib
@@ -23,7 +33,25 @@ import numpy as np
 
 from shared import kernels
 from shared.checks import Cell
-from shared.layout import BUTTONS, CELL, FALLING, ID, MOVE_X, TEMPLATE, Int64s, X
+from shared.layout import (
+    BUTTONS,
+    CELL,
+    CHANGED,
+    EVENT_BITS,
+    FALLING,
+    ID,
+    MOVE_X,
+    STOP_X,
+    STOP_Y,
+    STOP_Z,
+    TEMPLATE,
+    TOLD,
+    TURN,
+    VX,
+    WHOLE,
+    Int64s,
+    X,
+)
 from shared.messages import ENTITY_MAX, ProtocolError, shown
 from shared.units import BLOCK, SEGMENT
 from shared.world import World
@@ -40,9 +68,18 @@ COLUMNS_BY_SIZE = (
     (ID, "id"), (slice(TEMPLATE, X), "kind"), (slice(X, MOVE_X), "place"), (slice(MOVE_X, BUTTONS), "move"),
     (BUTTONS, "buttons"),
 )  # fmt: skip
+HEAD = np.dtype([("id", "<u4"), ("events", "u1")])
+TAIL = np.dtype([("move", "i1", 2), ("buttons", "u1"), ("place", "<i4", 3)])
+TAILS_KEEP = np.array(
+    [np.repeat([bool(events & part) for part in (TOLD, STOP_X, STOP_Y, STOP_Z)], (3, 4, 4, 4)) for events in range(256)]
+)
+"""Which bytes of its `TAIL` an entity has, by its events."""
 VERDICT = np.dtype([("number", "<u4"), ("verdict", "u1")])
 EDIT = np.dtype([("block", "<u2"), ("kind", "u1")])
 NO_EDITS = np.zeros(0, EDIT)
+NO_TURNS = np.zeros((0, TURN), np.int64)
+NO_FIELDS: list[Any] = [b"", b"", b"", b"", 0, b"", []]
+"""What the fields of a part from `heads` on are where they are left out."""
 SIDE = SEGMENT * BLOCK
 """Grid steps along one side of a segment."""
 FIELDS = ("id", "template", "flags", "x", "y", "z", "vx", "vy", "vz", "move_x", "move_y", "buttons")
@@ -52,7 +89,7 @@ FAR = 1 << 23
 """No index of a segment is further from 0 along an axis."""
 
 KEYFRAME = -1
-"""The `since` of a part that holds everything."""
+"""The `ago` of a part that holds everything."""
 ACTED = 4
 """Flag on the wire: the server's rules placed or threw this entity."""
 PART_MAX = 200 * 1024
@@ -70,7 +107,7 @@ class SegmentPart(NamedTuple):
     """A decoded part: how many of the `states` are its `entities`, `gone` ids, `edits` (`EDIT` records)."""
 
     segment: Cell
-    since: int
+    ago: int
     entities: int
     gone: list[int]
     edits: np.ndarray[Any, np.dtype[Any]]
@@ -91,9 +128,42 @@ def encode_rows(rows: Int64s, acted: Collection[int] = ()) -> bytes:
     return packed.tobytes()
 
 
+class News:
+    """What has happened to entities in a tick, packed all at once; a segment's share is a slice of that.
+
+    Args:
+        rows: [n, 16], in the order of segments; those to which nothing happened are left out already.
+        acted: ids that the rules placed or threw.
+    """
+
+    def __init__(self, rows: Int64s, acted: Collection[int]) -> None:
+        events = rows[:, CHANGED] & (1 << EVENT_BITS) - 1
+        whole = events >= WHOLE
+        self._rows = encode_rows(rows[whole], acted)
+        events[whole] = 0
+        heads = np.empty(len(rows) - np.count_nonzero(whole), HEAD)
+        heads["id"], heads["events"] = rows[~whole, ID], events[~whole]
+        tails = np.empty(len(rows), TAIL)
+        tails["move"], tails["buttons"] = rows[:, MOVE_X:BUTTONS], rows[:, BUTTONS]
+        tails["place"] = rows[:, X:VX] & (SIDE - 1)
+        keep = TAILS_KEEP[events]
+        self._heads, self._tails = heads.tobytes(), tails.view(np.uint8).reshape(keep.shape)[keep].tobytes()
+        self._rows_at = [0, *np.cumsum(whole).tolist()]
+        self._tails_at = [0, *np.cumsum(np.count_nonzero(keep, axis=1)).tolist()]
+
+    def share(self, start: int, stop: int) -> tuple[bytes, bytes, bytes]:
+        """The fields `heads`, `tails` and `rows` for some of the rows."""
+        first, end = self._rows_at[start], self._rows_at[stop]
+        return (
+            self._heads[(start - first) * HEAD.itemsize : (stop - end) * HEAD.itemsize],
+            self._tails[self._tails_at[start] : self._tails_at[stop]],
+            self._rows[first * ROW_BYTES : end * ROW_BYTES],
+        )
+
+
 def encode_part(
     segment: Cell,
-    since: int,
+    ago: int,
     rows: Int64s,
     gone: Sequence[int] = (),
     edits: Sequence[tuple[int, int]] = (),
@@ -103,22 +173,25 @@ def encode_part(
     attributes: Sequence[Any] = (),
 ) -> bytes:
     """One segment's part, ready to be joined into any client's snapshot."""
-    return join_part(segment, since, encode_rows(rows, acted), gone, edits, check, attributes)
+    return join_part(segment, ago, (b"", b"", encode_rows(rows, acted)), gone, edits, check, attributes)
 
 
 def join_part(
     segment: Cell,
-    since: int,
-    packed: bytes,
+    ago: int,
+    news: tuple[bytes, bytes, bytes],
     gone: Sequence[int] = (),
     edits: Sequence[tuple[int, int]] = (),
     check: int = 0,
     attributes: Sequence[Any] = (),
 ) -> bytes:
-    """The same from rows that are packed already."""
+    """The same from heads, tails and rows that are packed already."""
     packed_gone = np.array(gone, "<u4").tobytes() if gone else b""
     packed_edits = np.array(edits, EDIT).tobytes() if edits else b""
-    return msgpack.packb((*segment, since, packed, packed_gone, packed_edits, check, attributes))  # type: ignore[no-any-return]
+    fields = [*news, packed_gone, check, packed_edits, attributes]
+    while fields and not fields[-1]:
+        del fields[-1]
+    return msgpack.packb((*segment, ago, *fields))  # type: ignore[no-any-return]
 
 
 def checksum(world: World, segment: Cell) -> int:
@@ -129,19 +202,21 @@ def checksum(world: World, segment: Cell) -> int:
 
 def decode_parts(
     segments: Sequence[Any], templates: int, *, compiled: bool = False
-) -> tuple[list[SegmentPart], Int64s]:
+) -> tuple[list[SegmentPart], Int64s, Int64s]:
     """Checks and unpacks `Snapshot.segments`, in a scene of so many templates; `compiled` by Numba, or not.
 
     Returns:
-        The parts, and the states ([n, 12], as `World.put` takes them but for `ACTED`) of all their entities, part
-        after part.
+        The parts, the states ([n, 12], as `World.put` takes them but for `ACTED`) of all their entities, part after
+        part, and all their turns ([n, 8], as `World.follow` takes them).
 
     Raises:
         ProtocolError: anything is not as drawn above.
     """
     corners: list[int] = []
-    parts = [_decode_part(segment, corners) for segment in segments]
-    packed = np.frombuffer(b"".join([segment[4] for segment in segments]), ROW_BY_SIZE)
+    news: tuple[list[bytes], list[bytes], list[bytes]] = ([], [], [])
+    parts = [_decode_part(segment, corners, news) for segment in segments]
+    heads, tails, rows = map(b"".join, news)
+    packed = np.frombuffer(rows, ROW_BY_SIZE)
     states = np.empty((len(packed), CELL), np.int64)
     if len(packed):
         for columns, name in COLUMNS_BY_SIZE:
@@ -150,24 +225,41 @@ def decode_parts(
         flat, of_parts = kernels.lent(states, compiled), kernels.lent(np.array(corners, np.int64), compiled)
         if not kernel.admit(flat, of_parts, len(parts), *BOUNDS[compiled], templates):
             raise ProtocolError("segment.rows: a value is out of range")
-    return parts, states
+    return parts, states, _decode_turns(heads, tails) if heads or tails else NO_TURNS
 
 
-def _decode_part(part: Any, corners: list[int]) -> SegmentPart:
-    """One part; its low corner in grid steps and its number of rows go to the `corners`."""
-    if type(part) is not list or len(part) != 9:
-        raise ProtocolError("segment: not nine fields")
-    x, y, z, since, rows, gone, edits, check, attributes = part
+def _decode_turns(packed: bytes, tails: bytes) -> Int64s:
+    heads = np.frombuffer(packed, HEAD)
+    keep = TAILS_KEEP[heads["events"]]
+    if len(tails) != np.count_nonzero(keep):
+        raise ProtocolError("segment.tails: too many or too few")
+    spread = np.zeros(keep.shape, np.uint8)
+    spread[keep] = np.frombuffer(tails, np.uint8)
+    told = spread.reshape(-1).view(TAIL)
+    turns = np.empty((len(heads), TURN), np.int64)
+    turns[:, 0], turns[:, 1] = heads["id"], heads["events"]
+    turns[:, 2:4], turns[:, 4], turns[:, 5:] = told["move"], told["buttons"], told["place"]
+    return turns
+
+
+def _decode_part(part: Any, corners: list[int], news: tuple[list[bytes], ...]) -> SegmentPart:
+    """One part; its low corner in grid steps and its number of rows go to the `corners`, what they hold to `news`."""
+    if type(part) is not list or not 4 <= len(part) <= 11:
+        raise ProtocolError("segment: not four to eleven fields")
+    x, y, z, ago, heads, tails, rows, gone, check, edits, attributes = part + NO_FIELDS[len(part) - 4 :]
     if not (type(x) is type(y) is type(z) is int and -FAR <= x < FAR and -FAR <= y < FAR and -FAR <= z < FAR):
         raise ProtocolError(f"segment {shown(x)} {shown(y)} {shown(z)}: not allowed")
     if type(check) is not int or not 0 <= check < 1 << 32:
         raise ProtocolError(f"segment.check = {shown(check)}: not allowed")
-    if type(since) is not int or not -1 <= since < 1 << 53:
-        raise ProtocolError(f"segment.since = {shown(since)}: not allowed")
-    if not type(rows) is type(gone) is type(edits) is bytes or max(len(rows), len(gone), len(edits)) > PART_MAX:
-        raise ProtocolError("segment: rows, gone or edits are no bytes, or too many")
-    if len(rows) % ROW_BYTES or len(gone) % 4 or len(edits) % EDIT.itemsize:
-        raise ProtocolError("segment: part of a row")
+    if type(ago) is not int or not -1 <= ago < 1 << 53:
+        raise ProtocolError(f"segment.ago = {shown(ago)}: not allowed")
+    for field, size in ((heads, HEAD.itemsize), (tails, 1), (rows, ROW_BYTES), (gone, 4), (edits, EDIT.itemsize)):
+        if field != b"" and (type(field) is not bytes or len(field) > PART_MAX or len(field) % size):
+            raise ProtocolError("segment: heads, tails, rows, gone or edits are no bytes, too many, or part of one")
+    if heads and ago != 1:
+        raise ProtocolError(f"segment.heads of {ago} ticks: not allowed")
+    for field, all_ in zip((heads, tails, rows), news, strict=True):
+        all_.append(field)
     edited = np.frombuffer(edits, EDIT) if edits else NO_EDITS
     if edits and int(edited["block"].max()) >= SEGMENT**3:
         raise ProtocolError("segment.edits: a block is out of range")
@@ -175,7 +267,7 @@ def _decode_part(part: Any, corners: list[int]) -> SegmentPart:
     said = _decode_attributes(attributes) if attributes != [] else []
     entities = len(rows) // ROW_BYTES
     corners += (x * SIDE, y * SIDE, z * SIDE, entities)
-    return SegmentPart((x, y, z), since, entities, left, edited, check, said)
+    return SegmentPart((x, y, z), ago, entities, left, edited, check, said)
 
 
 def _decode_attributes(attributes: Any) -> list[tuple[int, dict[str, Any]]]:

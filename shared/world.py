@@ -388,6 +388,20 @@ class World:
                 self._arrays, -1, x * BLOCK, y * BLOCK, (x + 1) * BLOCK, (y + 1) * BLOCK, (z + 1) * BLOCK
             )
 
+    def follow(self, turns: layout.Int64s, ticks: int) -> None:
+        """Takes a world that is written and never stepped on by some ticks: what has no turn in `turns` goes on as it
+        did, with nothing in its way, but does not leave its segment. A `rebase` has to follow.
+
+        Args:
+            turns: of those that do not, [n, 8]: id, events (`layout.STOP_X` ...), wish (3), position (3; only that
+                within its segment, along axes where it stopped). Only where `ticks` is 1.
+
+        Raises:
+            KeyError: a turn of an entity that does not exist.
+        """
+        turns[:, 0] = [self._row_of[entity] for entity in turns[:, 0].tolist()]
+        self._kernel.follow(self._arrays, self._lent(turns), len(turns), self._rows, ticks, self._tick + 1)
+
     def rebase(self, tick: int) -> None:
         """Declares what has been written to be the world at the end of `tick`, without a step."""
         self._tick = tick

@@ -3,6 +3,8 @@
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
+
 from server.game import Game
 from server.limits import Limits
 from server.recorder import Saves
@@ -19,6 +21,7 @@ from shared.messages import (
     decode_from_server,
     encode,
 )
+from shared.snapshot import HEAD, NO_FIELDS, ROW
 from tests.worlds import scene
 
 HELLO = Hello(messages.VERSION, {}, "")
@@ -107,14 +110,21 @@ class Table:
         return self.game.world.tick
 
 
+def whole(part: list[Any]) -> list[Any]:
+    """A segment's part with the fields that were left out."""
+    return part + NO_FIELDS[len(part) - 4 :]
+
+
 def ids(snapshot: Snapshot) -> list[int]:
     """Who is told of, without regard to segments."""
-    rows = b"".join(part[4] for part in snapshot.segments)
-    return [int.from_bytes(rows[at : at + 4], "little") for at in range(0, len(rows), 33)]
+    found: list[int] = []
+    for part in map(whole, snapshot.segments):
+        found += np.frombuffer(part[4], HEAD)["id"].tolist() + np.frombuffer(part[6], ROW)["id"].tolist()
+    return found
 
 
 def gone(snapshot: Snapshot) -> list[int]:
-    packed = b"".join(part[5] for part in snapshot.segments)
+    packed = b"".join(whole(part)[7] for part in snapshot.segments)
     return [int.from_bytes(packed[at : at + 4], "little") for at in range(0, len(packed), 4)]
 
 

@@ -322,7 +322,7 @@ def test_a_malformed_part_changes_nothing() -> None:
     pair.act(EAST)
     good = msgpack.unpackb(encode_part(HERE, 0, pair.server.in_segment(HERE)))
     with pytest.raises(ProtocolError):
-        pair.client.apply(snapshot(pair.server.tick, [good, [*good[:4], bytes(33), *good[5:]]], drops=[BESIDE]))
+        pair.client.apply(snapshot(pair.server.tick, [good, [*good[:6], bytes(33), *good[7:]]], drops=[BESIDE]))
     assert pair.client.confirmed.state_hash() == before
 
 

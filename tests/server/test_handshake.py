@@ -33,8 +33,11 @@ def table() -> Table:
 def test_messages_and_names_have_a_longest() -> None:
     table = Table(Limits(message_bytes_max=600, name_max=3))
     assert table.connect(bytes(601)).refusal() == (messages.TOO_BIG, "a message longer than 600 bytes")
-    assert table.connect(Hello(1, {}, "Anna")).refusal() == (messages.MALFORMED, "a name longer than 3 characters")
-    link = table.connect(Hello(1, {}, "Ann"))
+    assert table.connect(Hello(messages.VERSION, {}, "Anna")).refusal() == (
+        messages.MALFORMED,
+        "a name longer than 3 characters",
+    )
+    link = table.connect(Hello(messages.VERSION, {}, "Ann"))
     table.tick()
     assert link.session.entity
     assert table.game.counters.closed == {messages.TOO_BIG: 1, messages.MALFORMED: 1}
@@ -46,7 +49,7 @@ def test_who_says_hello_is_welcomed_and_shown_the_world_in_the_next_tick(table: 
     table.tick()
     welcome, snapshot, terrain = link.sent[:3]
     assert isinstance(welcome, Welcome)
-    assert welcome == Welcome(1, 0, 1, table.game.scene.to_table(), welcome.resume)
+    assert welcome == Welcome(messages.VERSION, 0, 1, table.game.scene.to_table(), welcome.resume)
     assert len(welcome.resume) == messages.RESUME_BYTES
     assert isinstance(snapshot, Snapshot)
     assert isinstance(terrain, Terrain)
@@ -58,18 +61,18 @@ def test_who_says_hello_is_welcomed_and_shown_the_world_in_the_next_tick(table: 
 
 def test_a_client_of_another_version_is_told_which_one_is_spoken(table: Table) -> None:
     code, reason = table.connect(Hello(7, {}, "")).refusal()
-    assert (code, reason) == (messages.WRONG_VERSION, "the client is newer: protocol version 7, the server speaks 1")
+    assert (code, reason) == (messages.WRONG_VERSION, "the client is newer: protocol version 7, the server speaks 2")
 
 
 def test_a_client_of_the_same_scene_may_say_so(table: Table) -> None:
-    link = table.connect(Hello(1, table.game.scene.digests, ""))
+    link = table.connect(Hello(messages.VERSION, table.game.scene.digests, ""))
     table.tick()
     assert link.session.entity
 
 
 def test_a_client_of_another_scene_is_told_which_fields_differ(table: Table) -> None:
     other = scene(gravity=9.0, tick_rate=32, origin=(0, 0, 0), size=(1, 1, 1), spawns=((16.0, 16.0, 1.0),))
-    code, reason = table.connect(Hello(1, other.digests, "")).refusal()
+    code, reason = table.connect(Hello(messages.VERSION, other.digests, "")).refusal()
     assert (code, reason) == (
         messages.WRONG_SCENE,
         "the server plays another scene (gravity, terrain, tick_rate differ)",
@@ -78,10 +81,10 @@ def test_a_client_of_another_scene_is_told_which_fields_differ(table: Table) -> 
 
 def test_a_field_that_only_one_side_has_differs_too(table: Table) -> None:
     mine = table.game.scene.digests
-    code, reason = table.connect(Hello(1, mine | {"wind": b"1"}, "")).refusal()
+    code, reason = table.connect(Hello(messages.VERSION, mine | {"wind": b"1"}, "")).refusal()
     assert (code, reason) == (messages.WRONG_SCENE, "the server plays another scene (wind differ)")
     long = {f"{i:02}" + "x" * 200: b"" for i in range(32)}
-    assert len(table.connect(Hello(1, long, "")).refusal()[1]) <= messages.REASON_MAX
+    assert len(table.connect(Hello(messages.VERSION, long, "")).refusal()[1]) <= messages.REASON_MAX
 
 
 @pytest.mark.parametrize(

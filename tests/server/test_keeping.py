@@ -43,7 +43,7 @@ class Stored(Table):
 
 def played(table: Stored) -> tuple[FakeLink, bytes]:
     """Somebody joins, walks and edits, and the rules say this and that; the link and the token."""
-    link = table.connect(Hello(1, {}, "Ann"))
+    link = table.connect(Hello(messages.VERSION, {}, "Ann"))
     table.tick(64)
     link.say(Inputs(table.tick_number + 1, table.tick_number, bytes((127, 0, 0)) * 8), order(7, 0, 18, 16, 1, 5))
     game = table.game.stage
@@ -61,7 +61,7 @@ def goes_on(table: Stored, before: FakeLink, token: bytes, rules: Told) -> None:
     """All is as it was."""
     assert rules.told == []
     assert table.game.world.blocks.get(18, 16, 1) == 5
-    link = table.connect(Hello(1, {}, "", resume=token))
+    link = table.connect(Hello(messages.VERSION, {}, "", resume=token))
     table.tick(2)
     me = link.session.entity
     assert me == before.session.entity

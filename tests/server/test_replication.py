@@ -12,8 +12,9 @@ from server.replication import HISTORY, PACKS_PER_TICK, ChangeLog
 from server.session import Session
 from shared.blocks import Kinds, unpack
 from shared.checks import Cell
+from shared.inputs import Input
 from shared.layout import FALLING, FLAGS, ID
-from shared.messages import Hello, Resync, Snapshot, Terrain, Welcome, decode_from_server, encode
+from shared.messages import VERSION, Hello, Resync, Snapshot, Terrain, Welcome, decode_from_server, encode
 from shared.scene import Scene
 from shared.snapshot import ACTED, KEYFRAME, decode_parts
 from shared.units import BLOCK, SEGMENT
@@ -59,12 +60,12 @@ class Recorded:
         encoded = self.log.since(since)[segment]
         if not encoded:
             return [], [], []
-        (part,), states = decode_parts([msgpack.unpackb(encoded)], 255)
-        assert (part.segment, part.since) == (segment, since)
+        (part,), states, turns = decode_parts([msgpack.unpackb(encoded)], 255)
+        assert (part.segment, part.ago) == (segment, since if since == KEYFRAME else self.world.tick - since)
         for state in states.tolist():
             state[FLAGS] &= FALLING
             assert tuple(state) == self.world.state(state[ID])
-        return states[:, ID].tolist(), part.gone, part.edits.tolist()
+        return states[:, ID].tolist() + turns[:, 0].tolist(), part.gone, part.edits.tolist()
 
 
 @pytest.fixture
@@ -155,9 +156,10 @@ def test_who_was_acted_upon_is_flagged_in_every_part_that_tells_of_it(told: Reco
     told.world.place(1, (7, 5, 3))
     told.log.note_act(1)
     told.tick(2)
-    for since, flagged in ((1, [1]), (0, [1]), (2, [])):
-        _, states = decode_parts([msgpack.unpackb(told.log.since(since)[HOME])], 255)
-        assert states[states[:, FLAGS] & ACTED != 0, ID].tolist() == flagged
+    assert told.log.since(2)[HOME] == b"", "it falls, as was to be expected"
+    for since in (1, 0):
+        _, states, _ = decode_parts([msgpack.unpackb(told.log.since(since)[HOME])], 255)
+        assert states[states[:, FLAGS] & ACTED != 0, ID].tolist() == [1]
 
 
 def test_history_reaches_back_as_far_as_it_says_and_not_further(told: Recorded) -> None:
@@ -179,7 +181,8 @@ def test_the_void_below_the_floor_has_parts_like_any_segment(told: Recorded) -> 
     below = told.log.segment(1)
     assert below == (-3, 0, -1)
     assert told.part(below, KEYFRAME) == ([1], [], [])
-    assert told.part(below, 19) == ([1], [], [])
+    assert told.part(below, 19) == ([], [], []), "it falls on"
+    assert told.part(below, 0) == ([1], [], [])
     told.remove(1)
     told.tick()
     assert told.part(below, 20) == ([], [1], [])
@@ -225,15 +228,14 @@ def test_memory_is_bounded_by_history_and_by_what_exists(told: Recorded) -> None
 class Model:
     """All that a client must do with what it is told, as plainly as possible. It is the link as well."""
 
-    def __init__(self, templates: int) -> None:
-        self.templates = templates
-        self.entities: dict[int, tuple[int, ...]] = {}
+    def __init__(self, scene: Scene) -> None:
+        self.world = World(scene, compiled=False)
         self.blocks: dict[Cell, Kinds] = {}
         self.coming: dict[Cell, bytearray] = {}
         self.edits: dict[Cell, list[np.ndarray]] = {}
         self.tick = -1
         self.stuck = False
-        self.sent = 0
+        self.told = 0
 
     def outstanding(self) -> int:
         return 1 << 30 if self.stuck else 0
@@ -252,22 +254,26 @@ class Model:
 
     def snapshot(self, snapshot: Snapshot) -> None:
         assert snapshot.tick > self.tick
-        parts, states = decode_parts(snapshot.segments, self.templates)
+        parts, states, turns = decode_parts(snapshot.segments, len(self.world.scene.templates))
         states[:, FLAGS] &= FALLING
-        new = {state[ID]: tuple(state) for state in states.tolist()}
+        new = set(states[:, ID].tolist())
+        homes = {state[ID]: home_of(state) for state in self.world.states().tolist()}
+        assert snapshot.tick == self.tick + 1 or not len(turns)
+        self.told += len(turns)
+        self.world.follow(turns, snapshot.tick - self.tick)
         dropped = {tuple(segment) for segment in np.frombuffer(snapshot.drops, "<i4").reshape(-1, 3).tolist()}
         for segment in dropped:
             self.blocks.pop(segment, None)
             self.edits.pop(segment, None)
-        anew = dropped | {part.segment for part in parts if part.since == KEYFRAME}
+        anew = dropped | {part.segment for part in parts if part.ago == KEYFRAME}
         gone = {(part.segment, entity) for part in parts for entity in part.gone}
-        for entity, state in list(self.entities.items()):
-            home = home_of(state)
-            if home in anew or (home, entity) in gone:
-                del self.entities[entity]
-        self.entities.update(new)
+        for entity, home in homes.items():
+            if entity not in new and (home in anew or (home, entity) in gone):
+                self.world.remove(entity)
+        self.world.put(states)
+        self.world.rebase(snapshot.tick)
         for part in parts:
-            assert KEYFRAME <= part.since <= self.tick
+            assert part.ago == KEYFRAME or 0 < part.ago <= HISTORY
             self.edits.setdefault(part.segment, []).append(part.edits)
             if part.segment in self.blocks:
                 self.write(part.segment, part.edits)
@@ -288,7 +294,7 @@ class Model:
         self.blocks[segment][edits["block"]] = edits["kind"]
 
 
-def home_of(state: tuple[int, ...]) -> Cell:
+def home_of(state: list[int]) -> Cell:
     x, y, z = (part // (BLOCK * SEGMENT) for part in state[3:6])
     return x, y, z
 
@@ -300,15 +306,19 @@ class Told:
         self.rng = random.Random(seed)
         limits = Limits(terrain_chunk_bytes=16, terrain_bytes_per_tick=64, stalled_s=1e9, silence_s=1e9)
         self.game = Game(row_of_segments(), limits=limits, compiled=False)
-        self.model = Model(len(self.game.scene.templates))
+        self.model = Model(self.game.scene)
         self.now = 0.0
         self.session: Session = self.game.open(self.model, 0.0)
-        self.game.receive(self.session, encode(Hello(1, {}, "")), 0.0)
+        self.game.receive(self.session, encode(Hello(VERSION, {}, "")), 0.0)
         self.others: list[int] = []
         self.stuck_until = 0
 
     def tick(self) -> None:
         self.now += 1 / self.game.scene.tick_rate
+        for entity in self.others:
+            if self.rng.random() < 0.2:
+                wish = Input(self.rng.randint(-89, 89), self.rng.randint(-89, 89), self.rng.randint(0, 1))
+                self.game.stage.steered[entity] = wish
         self.game.tick(self.now, self.now)
 
     def place(self) -> tuple[float, float, float]:
@@ -351,8 +361,8 @@ class Told:
         assert model.tick == game.world.tick
         sees = session.sight.sees
         here = [entity for entity in game.world.entities["id"].tolist() if game.log.segment(entity) in sees]
-        assert model.entities == {entity: game.world.state(entity) for entity in here}
-        assert session.entity in model.entities
+        assert model.world.states().tolist() == [list(game.world.state(entity)) for entity in here]
+        assert session.entity in model.world
         under_way = {*session.terrain_due, session.terrain_now[0] if session.terrain_now else None}
         assert set(model.blocks) - session.sight.sees == set()
         for segment in session.sight.sees - under_way:
@@ -378,5 +388,6 @@ def test_a_client_has_what_the_server_has_whatever_it_skipped_and_wherever_it_lo
     told.check()
     assert told.session.sight.complete
     assert checks > 50
+    assert told.model.told > 10
     assert not told.session.terrain_due
     assert told.game.counters.snapshots_skipped > 50

@@ -24,7 +24,7 @@ def token(link: FakeLink) -> bytes:
 
 
 def back(table: Table, resume: bytes) -> FakeLink:
-    link = table.connect(Hello(1, {}, "", resume=resume))
+    link = table.connect(Hello(messages.VERSION, {}, "", resume=resume))
     table.tick()
     return link
 
@@ -35,7 +35,7 @@ def heard(table: Table, link: FakeLink) -> None:
 
 
 def test_who_comes_back_in_time_goes_on_as_before(table: Table) -> None:
-    link = table.connect(Hello(1, {}, "Ann"))
+    link = table.connect(Hello(messages.VERSION, {}, "Ann"))
     table.tick()
     me = link.session.entity
     heard(table, link)

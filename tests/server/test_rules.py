@@ -12,7 +12,7 @@ from server.stage import ATTRIBUTES_MAX
 from shared import messages
 from shared.checks import SceneError
 from shared.messages import Command, Happened, Hello, Shared, Snapshot
-from tests.tables import FakeLink, Table, order
+from tests.tables import FakeLink, Table, order, whole
 from tests.worlds import scene
 
 
@@ -61,7 +61,8 @@ def attributes(link: FakeLink) -> dict[int, Any]:
     known: dict[int, Any] = {}
     for snapshot in link.got(Snapshot):
         for part in snapshot.segments:
-            known.update(zip(part[8][::2], part[8][1::2], strict=True))
+            said = whole(part)[10]
+            known.update(zip(said[::2], said[1::2], strict=True))
     return known
 
 
@@ -76,7 +77,7 @@ def verdict(link: FakeLink, number: int) -> int:
 
 
 def test_joining_and_leaving_are_told_while_the_entity_is_there(table: Table, rules: Told) -> None:
-    link = table.connect(Hello(1, {}, "Ann"))
+    link = table.connect(Hello(messages.VERSION, {}, "Ann"))
     table.tick()
     table.lose(link)
     table.tick()
@@ -152,18 +153,18 @@ def test_who_falls_out_is_the_rules_affair_or_comes_back(table: Table, rules: To
 
 
 def test_what_is_said_of_an_entity_reaches_all_who_see_it_and_changes(table: Table) -> None:
-    early = table.connect(Hello(1, {}, "Ann"))
+    early = table.connect(Hello(messages.VERSION, {}, "Ann"))
     table.tick()
     game = table.game.stage
     npc = game.spawn("runner", (10.0, 16.0, 1.0), mood="calm")
     table.tick()
-    late = table.connect(Hello(1, {}, ""))
+    late = table.connect(Hello(messages.VERSION, {}, ""))
     table.tick()
     assert attributes(early) == attributes(late) == {1: {"name": "Ann"}, npc: {"mood": "calm"}}
     count = len(early.got(Snapshot))
     game.set(npc, "mood", "calm")  # no news
     table.tick()
-    assert not any(part[8] for snapshot in early.got(Snapshot)[count:] for part in snapshot.segments)
+    assert not any(whole(part)[10] for snapshot in early.got(Snapshot)[count:] for part in snapshot.segments)
     game.set(npc, "mood", None)
     game.set(npc, "hunger", 0.5)
     table.tick()

@@ -11,13 +11,13 @@ import msgpack
 import numpy as np
 import pytest
 
-from shared import edits, messages
+from shared import edits, layout, messages
 from shared.blocks import offset_of, pack, unpack
 from shared.messages import KINDS, Message, Snapshot, decode_from_client, decode_from_server, encode, join_snapshot
 from shared.snapshot import FIELDS, ROW, decode_parts
 
 PAGE = (Path(__file__).resolve().parents[2] / "docs" / "protocol.md").read_text("utf-8")
-SEGMENT = ("segment", "x", "y", "z", "since", "rows", "gone", "edits", "check", "attributes")
+SEGMENT = ("segment", "x", "y", "z", "ago", "heads", "tails", "rows", "gone", "check", "edits", "attributes")
 DECODE = {"client": decode_from_client, "server": decode_from_server}
 
 
@@ -104,12 +104,13 @@ def test_the_snapshot_is_what_is_said_of_it() -> None:
     assert (np.frombuffer(snapshot.margins, "<i2") / messages.MARGIN_ONE).tolist() == [2.5, -0.25, 2.0]
     assert snapshot.newest == 1021
     assert list(snapshot.fates) == [messages.USED, messages.REPEATED]
-    (part,), states = decode_parts(snapshot.segments, 1)
+    (part,), states, turns = decode_parts(snapshot.segments, 1)
+    assert turns.tolist() == [[12, layout.TOLD | layout.STOP_X, 0, 127, 0, 10 << 24, 0, 0]]
     assert (part.gone, part.edits["block"].tolist()) == ([9], [0x33E3])
     assert offset_of(3, 31, 12) == 0x33E3
     ((_, text),) = blocks("row")
     packed = b"".join(raw for raw, _ in lines(text))
-    assert packed == snapshot.segments[0][4]
+    assert packed == snapshot.segments[0][6]
     told = [note.split(" = ") for _, note in lines(text)]
     assert [len(raw) for raw, _ in lines(text)] == [ROW[name].itemsize for name in FIELDS]
     assert [(name, int(value)) for name, value in told] == list(
@@ -147,4 +148,7 @@ def test_tables_of_numbers() -> None:
     assert set(re.findall(r"[A-Z_]{3,}", listed)) == codes.keys()
     limits = {name: int(value) for name, value, _ in table("limit", "value")}
     assert limits == {name: getattr(messages, name) for name in limits}
+    events = {name: 1 << int(bit) for bit, name, _ in table("bit", "event")}
+    assert events == {name: getattr(layout, name) for name in events}
+    assert sum(events.values()) == layout.WHOLE - 1
     assert [name.strip("`") for name, _ in table("field", "meaning")] == [*SEGMENT[4:]]

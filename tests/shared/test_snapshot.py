@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from shared.blocks import BLOCKS, PACKED_MAX, pack, unpack
 from shared.checks import Cell
-from shared.layout import CELL, FALLING, FLAGS, ID, MOVE_X, TEMPLATE, VX, X
+from shared.layout import CELL, FALLING, FLAGS, ID, MOVE_X, STOP_Y, TEMPLATE, TOLD, TURN, VX, X
 from shared.messages import ENTITY_MAX, TICK_MAX, ProtocolError
 from shared.snapshot import ACTED, FIELDS, ROW, SIDE, SegmentPart, checksum, decode_parts, encode_part, encode_rows
 from tests.worlds import build
@@ -19,19 +19,21 @@ from tests.worlds import build
 FAR = (1 << 23) - 1
 SPEED_EXTREME = 1 << 30
 State = tuple[int, ...]
+HEADS = b"\x01\0\0\0" + bytes([TOLD | STOP_Y])
+"""One entity that was told another wish and stopped: 7 bytes of tails."""
 
 
 def sent(
     segment: Cell,
     states: list[State],
-    since: int = 5,
+    ago: int = 5,
     gone: list[int] | None = None,
     edits: list[tuple[int, int]] | None = None,
 ) -> tuple[SegmentPart, list[State]]:
     """What a peer makes of a part."""
     rows = np.array(states, np.int64).reshape(-1, CELL)
-    part = msgpack.unpackb(encode_part(segment, since, rows, gone or [], edits or [], check=9))
-    parts, decoded = decode_parts([part], 255)
+    part = msgpack.unpackb(encode_part(segment, ago, rows, gone or [], edits or [], check=9))
+    parts, decoded, _ = decode_parts([part], 255)
     return parts[0], [tuple(row) for row in decoded.tolist()]
 
 
@@ -47,14 +49,14 @@ def state_in(segment: Cell, inside: int, velocity: int, move: int, entity: int =
 def part_of(**fields: Any) -> list[Any]:
     """A legal part, with some fields changed."""
     row = encode_rows(np.array([state_in((0, 0, 0), 5, 6, 7)], np.int64))
-    values: dict[str, Any] = {"x": 0, "y": 0, "z": 0, "since": 3, "rows": row, "gone": b"\x01\0\0\0"}
-    values |= {"edits": b"\0\0\x01", "check": 0, "attributes": [1, {"name": "Ann"}]}
+    values: dict[str, Any] = {"x": 0, "y": 0, "z": 0, "ago": 1, "heads": HEADS, "tails": bytes(7), "rows": row}
+    values |= {"gone": b"\x01\0\0\0", "check": 0, "edits": b"\0\0\x01", "attributes": [1, {"name": "Ann"}]}
     return list((values | fields).values())
 
 
 def row_with(column: int, value: int) -> bytes:
     """A packed row in which one field has a value that no state has."""
-    packed = np.frombuffer(part_of()[4], ROW).copy()
+    packed = np.frombuffer(part_of()[6], ROW).copy()
     packed[FIELDS[column]] = value
     return packed.tobytes()
 
@@ -89,13 +91,13 @@ states = st.tuples(
     st.lists(st.tuples(st.integers(0, BLOCKS - 1), st.integers(0, 255)), max_size=5),
 )
 def test_any_legal_part_is_lossless(
-    segment: Cell, since: int, inside: list[State], gone: list[int], edits: list[tuple[int, int]]
+    segment: Cell, ago: int, inside: list[State], gone: list[int], edits: list[tuple[int, int]]
 ) -> None:
     corner = low_corner(segment)
     absolute = [(*s[:X], *(low + part for low, part in zip(corner, s[X:VX], strict=True)), *s[VX:]) for s in inside]
-    part, decoded = sent(segment, absolute, since, gone, edits)
+    part, decoded = sent(segment, absolute, ago, gone, edits)
     assert decoded == absolute
-    assert (part.segment, part.since, part.entities, part.gone, part.check) == (segment, since, len(inside), gone, 9)
+    assert (part.segment, part.ago, part.entities, part.gone, part.check) == (segment, ago, len(inside), gone, 9)
     assert part.edits.tolist() == edits
 
 
@@ -106,26 +108,26 @@ def test_parts_share_one_table_of_states_and_each_has_its_own_corner(compiled: b
         msgpack.unpackb(encode_part(s, -1, np.array(t, np.int64).reshape(-1, CELL), [], []))
         for s, t in zip(segments, tables, strict=True)
     ]
-    parts, decoded = decode_parts(encoded, 255, compiled=compiled)
+    parts, decoded, _ = decode_parts(encoded, 255, compiled=compiled)
     assert [part.entities for part in parts] == [0, 1, 2]
     assert [tuple(row) for row in decoded.tolist()] == [state for table in tables for state in table]
 
 
 def test_no_parts_are_no_states() -> None:
-    parts, decoded = decode_parts([], 1)
-    assert (parts, decoded.shape) == ([], (0, CELL))
+    parts, decoded, turns = decode_parts([], 1)
+    assert (parts, decoded.shape, turns.shape) == ([], (0, CELL), (0, TURN))
 
 
 def test_bookkeeping_of_a_process_does_not_travel() -> None:
     row = np.array([[*state_in((0, 0, 0), 1, 0, 0)[:2], 0b11, 0, 0, 0, 0, 0, 0, 0, 0, 0, 77, 78, 79, 80]], np.int64)
-    parts, decoded = decode_parts([msgpack.unpackb(encode_part((0, 0, 0), 0, row, [], []))], 255)
+    parts, decoded, _ = decode_parts([msgpack.unpackb(encode_part((0, 0, 0), 0, row, [], []))], 255)
     assert decoded.tolist() == [[1, 254, 1, 0, 0, 0, 0, 0, 0, 0, 0, 0]]
     assert parts[0].entities == 1
 
 
 def test_who_was_acted_upon_is_flagged_and_nobody_else() -> None:
     rows = np.array([state_in((0, 0, 0), 1, 0, 0, entity) for entity in (3, 5, 8)], np.int64)
-    _, decoded = decode_parts([msgpack.unpackb(encode_part((0, 0, 0), 0, rows, acted={5, 9}))], 255)
+    _, decoded, _ = decode_parts([msgpack.unpackb(encode_part((0, 0, 0), 0, rows, acted={5, 9}))], 255)
     assert [flags & ACTED for flags in decoded[:, FLAGS].tolist()] == [0, ACTED, 0]
     assert (decoded[:, FLAGS] & FALLING).tolist() == [1, 1, 1]
 
@@ -150,7 +152,9 @@ def test_a_checksum_is_of_all_a_segment_holds_and_of_nothing_else() -> None:
     "fields",
     [
         {"x": FAR + 1}, {"y": -FAR - 2}, {"z": 1 << 63}, {"x": True}, {"y": 0.0}, {"z": None}, {"x": "0"},
-        {"since": -2}, {"since": 1 << 53}, {"since": False}, {"since": None},
+        {"ago": -2}, {"ago": 1 << 53}, {"ago": False}, {"ago": None}, {"ago": 2},
+        {"heads": bytes(4)}, {"heads": b""}, {"heads": "heads"}, {"heads": HEADS + HEADS}, {"heads": [1]},
+        {"tails": bytes(6)}, {"tails": bytes(8)}, {"tails": ""}, {"tails": 7},
         {"rows": bytes(32)}, {"rows": ""}, {"rows": None}, {"rows": []}, {"rows": bytes(33 * 7000)},
         {"gone": bytes(3)}, {"gone": "gone"}, {"gone": [1]}, {"gone": bytes(4 * 60_000)},
         {"check": -1}, {"check": 1 << 32}, {"check": True}, {"check": None},
@@ -177,7 +181,7 @@ def test_a_part_beyond_its_bounds_is_refused(fields: dict[str, Any]) -> None:
 )  # fmt: skip
 def test_a_state_that_no_world_has_is_refused(column: int, value: int, compiled: bool) -> None:
     with pytest.raises(ProtocolError, match=r"segment\.rows"):
-        decode_parts([part_of(), part_of(rows=part_of()[4] + row_with(column, value))], 255, compiled=compiled)
+        decode_parts([part_of(), part_of(rows=part_of()[6] + row_with(column, value))], 255, compiled=compiled)
 
 
 def test_a_template_is_one_of_the_scene(compiled: bool) -> None:
@@ -190,7 +194,7 @@ def test_nesting_a_thousand_deep_is_refused_like_anything_else() -> None:
     deep: Any = None
     for _ in range(1000):
         deep = [deep]
-    for name in ("x", "since", "rows", "gone", "edits", "check"):
+    for name in ("x", "ago", "heads", "tails", "rows", "gone", "edits", "check"):
         with pytest.raises(ProtocolError):
             decode_parts([part_of(**{name: deep})], 255)
 
@@ -200,14 +204,14 @@ anything = st.recursive(
     lambda inner: st.lists(inner, max_size=8) | st.dictionaries(st.text(max_size=4), inner, max_size=2),
     max_leaves=9,
 )
-field = st.sampled_from(["x", "y", "z", "since", "rows", "gone", "edits", "check"])
+field = st.sampled_from(["x", "y", "z", "ago", "heads", "tails", "rows", "gone", "edits", "check"])
 
 
 @settings(derandomize=True, deadline=None)
 @given(st.lists(st.one_of(anything, st.dictionaries(field, anything, max_size=2).map(lambda f: part_of(**f)))))
 def test_any_value_is_a_part_or_a_protocol_error(segments: list[Any]) -> None:
     try:
-        parts, decoded = decode_parts(segments, 3)
+        parts, decoded, _ = decode_parts(segments, 3)
     except ProtocolError:
         return
     assert sum(part.entities for part in parts) == len(decoded)

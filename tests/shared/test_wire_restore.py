@@ -20,7 +20,7 @@ def wired(world: World) -> World:
         other.load_segment(segment, unpack(pack(world.blocks.segment(segment).reshape(-1))))
         part = encode_part(segment, -1, world.in_segment(segment), check=checksum(world, segment))
         segments.append(msgpack.unpackb(part))
-    parts, states = decode_parts(segments, len(world.scene.templates))
+    parts, states, _ = decode_parts(segments, len(world.scene.templates))
     other.put(states)
     other.rebase(world.tick)
     assert [checksum(other, part.segment) for part in parts] == [part.check for part in parts]

@@ -1,0 +1,216 @@
+"""What goes on as it did is not told: a world that is told only what happens is the one that is stepped, bit by bit."""
+
+import random
+from typing import Any
+
+import msgpack
+import numpy as np
+import pytest
+
+from shared.checks import SceneError
+from shared.inputs import NEUTRAL, Input
+from shared.layout import (
+    BUTTONS,
+    CHANGED,
+    EVENT_BITS,
+    FALL,
+    GO_X,
+    LAUNCH,
+    MOVE_X,
+    STOP_X,
+    STOP_Z,
+    TOLD,
+    WHOLE,
+    Int64s,
+    X,
+)
+from shared.scene import Scene, load_scene
+from shared.snapshot import News, decode_parts, join_part
+from shared.units import BLOCK, SEGMENT
+from shared.world import OverlapError, World
+from tests.worlds import EAST, JUMP, WEST, build, floor, steps
+
+SIDE = SEGMENT * BLOCK
+
+
+class Told:
+    """A world, and another one that has nothing but what is sent of it."""
+
+    def __init__(self, world: World) -> None:
+        self.world = world
+        self.other = World(world.scene, compiled=world.compiled)
+        self.other.put(world.states())
+        self.other.rebase(world.tick)
+        self.turns = self.news = self.bytes = 0
+
+    def tell(self) -> None:
+        """What the latest step has made of the world goes over the wire, segment by segment."""
+        rows = self.world.changed
+        self.turns += len(rows)
+        rows = rows[rows[:, CHANGED] & (1 << EVENT_BITS) - 1 != 0]
+        self.news += len(rows)
+        cells = rows[:, X : X + 3] // SIDE
+        order = np.lexsort(cells.T)
+        rows, cells = rows[order], cells[order]
+        news = News(rows, ())
+        parts = []
+        for cell in sorted(set(map(tuple, cells.tolist()))):
+            inside = np.flatnonzero((cells == cell).all(axis=1))
+            parts.append(join_part(cell, 1, news.share(int(inside[0]), int(inside[-1]) + 1)))
+        self.bytes += sum(map(len, parts))
+        templates = len(self.world.scene.templates)
+        _, states, turns = decode_parts(list(map(msgpack.unpackb, parts)), templates, compiled=self.world.compiled)
+        self.other.follow(turns, self.world.tick - self.other.tick)
+        self.other.put(states)
+        self.other.rebase(self.world.tick)
+
+    def check(self) -> None:
+        assert self.other.states().tolist() == self.world.states().tolist()
+
+
+def crowd(made: Scene, n: int, rng: random.Random, compiled: bool) -> World:
+    world = World(made, compiled=compiled)
+    world.load_terrain()
+    x, y, z = made.spawns[0]
+    while len(world) < n:
+        try:
+            world.spawn(rng.choice(made.templates).name, (x + rng.uniform(-14, 14), y + rng.uniform(-14, 14), z + 1))
+        except OverlapError:
+            continue
+    return world
+
+
+@pytest.mark.parametrize("name", ["hills", "arena", "topdown"])
+@pytest.mark.parametrize("rate", [20, 32])
+@pytest.mark.parametrize("integrator", ["mean", "semi"])
+def test_a_crowd_that_is_told_of_is_the_crowd(name: str, rate: int, integrator: str, compiled: bool) -> None:
+    """Walls, steps, each other, blocks that come and go, throws and teleports; every tick, every bit."""
+    rng = random.Random(f"{name} {rate}")
+    table: dict[str, Any] = load_scene(name).to_table() | {"tick_rate": rate, "integrator": integrator}
+    told = Told(crowd(Scene.from_table(table), 30, rng, compiled))
+    world = told.world
+    for _ in range(300 if compiled else 60):
+        wishes = {
+            entity: Input(rng.randint(-89, 89), rng.randint(-89, 89), rng.randint(0, 1))
+            for entity in range(1, 31)
+            if rng.random() < 0.05
+        }
+        entity, (x, y, z) = rng.randint(1, 30), world.position(rng.randint(1, 30))
+        try:
+            for fallen in world.fell:
+                world.place(fallen, world.scene.spawns[0], push=True)
+            match rng.randrange(12):
+                case 0:
+                    world.set_velocity(entity, (rng.uniform(-9, 9), 0, rng.uniform(-9, 9)))
+                case 1:
+                    world.place(entity, (x + rng.uniform(-3, 3), y, z + 2))
+                case 2 | 3:
+                    world.set_block(int(x // 1), int(y // 1), int(z // 1) - 1, 0)
+                case 4 | 5:
+                    world.set_block(int(x // 1) + 1, int(y // 1), int(z // 1), 1)
+        except SceneError:
+            pass
+        world.step(wishes)
+        told.tell()
+        told.check()
+    assert 50 < told.news < told.turns * 0.6
+
+
+@pytest.mark.parametrize("pause", [2, 7, 64])
+def test_several_ticks_in_which_nothing_happens_are_as_good_as_one(pause: int, compiled: bool) -> None:
+    told = Told(build(gravity=1.0, compiled=compiled))
+    for i in range(3):
+        told.world.spawn("stone", (3 * i, 0, 25))
+        told.world.set_velocity(i + 1, (i / 8, -1 / 8, i))
+    told.world.step()
+    told.tell()
+    steps(told.world, pause)
+    told.tell()
+    assert told.news == 3, "only that they are there"
+    told.check()
+
+
+def events(world: World, entity: int) -> int:
+    """What happened to an entity in the latest step."""
+    row: Int64s = world.rows([entity])[0]
+    return int(row[CHANGED]) & (1 << EVENT_BITS) - 1 if row[CHANGED] >> EVENT_BITS == world.tick else 0
+
+
+def test_each_thing_that_happens_is_told_once(compiled: bool) -> None:
+    """A walk against a wall, a jump over it, and off the far edge."""
+    world = build([floor(0, 8), [3, -9, 0, 4, 9, 1, 1]], compiled=compiled)
+    me = world.spawn("box", (0, 0, 0))
+    world.step()
+    assert events(world, me) & WHOLE
+    told, found = Told(world), []
+    for tick in range(400):
+        wish = {0: EAST, 80: EAST._replace(buttons=1), 84: EAST}.get(tick)
+        world.step(None if wish is None else {me: wish})
+        found.append(events(world, me))
+        told.tell()
+        told.check()
+    assert [what for what in found if what][:7] == [
+        TOLD,  # walks
+        STOP_X,  # at the wall
+        TOLD | LAUNCH | STOP_X,  # jumps, and is at the wall still
+        TOLD | STOP_X,  # lets go of the key
+        GO_X,  # is above the wall
+        STOP_Z,  # lands
+        FALL | WHOLE,  # off the edge, and into the segment below
+    ]
+
+
+def test_holding_a_course_costs_nothing(compiled: bool) -> None:
+    world = build([floor(0, 30)], compiled=compiled)
+    me = world.spawn("box", (-20, 5, 0))
+    steps(world, 10, {me: EAST})
+    told = Told(world)
+    for _ in range(200):
+        world.step({me: EAST})
+        told.tell()
+    assert (told.turns, told.news, told.bytes) == (200, 0, 0)
+    world.step({me: JUMP})
+    told.tell()
+    assert told.bytes == 17, "5 for the part, 7 for the head, 5 for the tail"
+    told.check()
+
+
+# -- what no server says -------------------------------------------------------------------------------------
+
+
+def turn(entity: int, what: int, *rest: int) -> list[int]:
+    return [entity, what, *rest, *[0] * (6 - len(rest))]
+
+
+def test_a_turn_of_nobody_is_an_error() -> None:
+    world = build()
+    with pytest.raises(KeyError):
+        world.follow(np.array([turn(7, FALL)], np.int64), 1)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_whatever_is_told_an_entity_stays_in_its_segment_and_the_kernel_in_its_tables(
+    seed: int, compiled: bool
+) -> None:
+    rng = random.Random(seed)
+    world = build(compiled=compiled)
+    for i in range(8):
+        world.spawn(rng.choice(["box", "stone", "ghost"]), (i - 4, 0, 0))
+    world.rebase(0)
+    homes = world.states()[:, X : X + 3] // SIDE
+    for _ in range(200):
+        turns = [
+            turn(
+                entity, rng.randrange(256), rng.randint(-128, 127), rng.randint(-128, 127), rng.randrange(256),
+                *(rng.randint(-(1 << 31), (1 << 31) - 1) for _ in range(3)),
+            )
+            for entity in range(1, 9)
+        ]  # fmt: skip
+        world.follow(np.array(turns, np.int64), 1)
+        world.rebase(world.tick + 1)
+        states = world.states()
+        assert (states[:, X : X + 3] // SIDE == homes).all()
+        assert (abs(states[:, MOVE_X:BUTTONS]) <= 127).all()
+    other = World(world.scene, compiled=compiled)
+    other.restore(world)
+    steps(other, 3, {1: WEST, 2: NEUTRAL})
