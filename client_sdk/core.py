@@ -223,6 +223,10 @@ class Core:
             if not self._draws:
                 self._seen = shown
         self._predict(math.floor(self.timeline.tick(now)), now)
+        if self.prediction is not None:
+            self.stats.snapshot_age_s = (
+                max(self.clock.tick(now) - self.prediction.confirmed.tick, 0.0) / self.clock.rate
+            )
         # Steered only now: a tick that was due, and for which the program woke up, is not put off by a moment.
         if self.state == "playing" and self.timeline.steer(self._lead, self.clock, now):
             self._restart(now)
@@ -478,7 +482,6 @@ class Core:
             self.stats.rtt_s = self.clock.rtt_s
             self.stats.lead_ticks = timeline.phase - self.clock.phase
             self.stats.lead_s = self.stats.lead_ticks / self.clock.rate
-            self.stats.snapshot_age_s = max(self.clock.tick(now) - prediction.confirmed.tick, 0.0) / self.clock.rate
             row = bytes(part & 0xFF for part in self.wish)
             if self.state == "playing":
                 self._send(Inputs(first, prediction.confirmed.tick, row * (to + 1 - first)))

@@ -5,6 +5,7 @@ Theory of operation. Whole messages are held back, in order, between the core an
 no thread, nothing sleeps, and with a clock of one's own all of it happens again exactly. That the connection is lost
 is heard behind what was sent before; what was still to go out is gone with it. While a slow line is busy, nothing more
 should be read (`appetite`): what waits for it then waits at the server, which sends less, as it does on a real one.
+Over a socket the kernels hide a few KB of that: with "thin", snapshots are 0.9 s old at p50, not 0.3 as in the lab.
 """
 
 import math
@@ -55,10 +56,10 @@ class LinkedCore(Core):
     @property
     def appetite(self) -> int:
         """See `Core.appetite`."""
-        line = self._line
-        if line is None or line.weather.rate(line.agenda.now) == math.inf:
+        link, line = self._link, self._line
+        if link is None or (link.rate == math.inf and link.dip is None):
             return super().appetite
-        return 0 if line.down.busy else SLOW_READ_BYTES
+        return 0 if line is not None and line.down.busy else SLOW_READ_BYTES
 
     def open(self, now: float) -> None:
         """See `Core.open`."""

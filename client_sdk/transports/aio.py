@@ -17,7 +17,7 @@ from types import TracebackType
 from typing import Any, cast
 
 from client_sdk.base import BaseClient
-from client_sdk.core import EVENTS_MAX, Core
+from client_sdk.core import EVENTS_MAX, READ_BYTES, Core
 from client_sdk.events import Event
 from client_sdk.linked import LinkedCore
 from client_sdk.links import Path
@@ -166,6 +166,8 @@ class AsyncClient(BaseClient):
     def _made(self, transport: asyncio.Transport) -> None:
         self._transport = transport
         transport.set_write_buffer_limits(UNSENT_MAX)
+        if self.core.appetite < READ_BYTES:  # what does not fit on a slow line stays with the server
+            transport.get_extra_info("socket").setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 0)
         self._pump(time.monotonic())
 
     def _received(self, data: bytes) -> None:
@@ -185,7 +187,6 @@ class AsyncClient(BaseClient):
             transport.resume_reading()
         else:
             transport.pause_reading()
-            transport.get_extra_info("socket").setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 0)
 
     async def _dial(self, timeout: float) -> None:
         """Connects, and waits until the server has answered."""
