@@ -133,7 +133,7 @@ def in_view(game: Game) -> float:
 
 def serve(served: Game) -> None:
     """As `python -m server` does, on a port that the system picks."""
-    settings = Settings(port=0, log_level="warning")
+    settings = Settings(port=0, page=False, log_level="warning")
     log.set_up(settings.log_level, settings.log_format, sys.stderr)
     with asyncio.Runner(loop_factory=app._loop_factory()) as runner:
         runner.run(app.Server(settings, served).serve())

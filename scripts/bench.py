@@ -11,9 +11,12 @@ served of them gets of what the best served gets.
 
 `bytes` tells what one client is sent at 20 Hz while 100 entities (or N) move in its view, and that its copy of them is
 exact in every tick.
+
+`memory` tells the bytes per connection, entity and loaded segment, and what is in use after each cycle of churn.
 """
 
 import argparse
+import itertools
 import json
 import os
 import statistics
@@ -26,6 +29,7 @@ from rich.progress import Progress
 from rich.table import Table
 
 import _bench_bytes as wire
+import _bench_memory as memory
 import _bench_physics as physics
 import _bench_server as server
 import _step_c
@@ -250,6 +254,19 @@ def run_bytes(args: argparse.Namespace, console: Console) -> int:
     return int(any(run["differing"] for run in runs))
 
 
+def run_memory(args: argparse.Namespace, console: Console) -> int:
+    """What things take, and whether anything stays of what is gone."""
+    report = memory.run(args.cycles)
+    for name in ("segment", "entity", "connection"):
+        console.print(f"{report[f'bytes_per_{name}']:10,.0f} bytes per {name}")
+    after = report["bytes_after_each_cycle"]
+    console.print(f"{after[0]:10,} bytes after a cycle of churn, and in the {len(after) - 1} after it more by")
+    console.print("           " + " ".join(f"{b - a:,}" for a, b in itertools.pairwise(after)))
+    if args.json:
+        args.json.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
+    return 0
+
+
 def capacity_table(runs: list[dict[str, Any]], bounds: list[dict[str, Any]]) -> Table:
     made = Table("figure", title="server: 30 Hz, one process; each search apart")
     for number in range(len(runs)):
@@ -305,6 +322,10 @@ def main(argv: list[str] | None = None) -> int:
     command.add_argument("--json", type=Path, metavar="OUT", help="write all figures to this file")
     command.add_argument("--quick", action="store_true", help="ten seconds of one seed each")
     command.set_defaults(run=run_bytes)
+    command = commands.add_parser("memory", help="bytes per connection, entity and segment, and under churn")
+    command.add_argument("--cycles", type=int, default=10, metavar="N", help="of churn, 2 s each (10)")
+    command.add_argument("--json", type=Path, metavar="OUT", help="write all figures to this file")
+    command.set_defaults(run=run_memory)
     args = parser.parse_args(argv)
     return int(args.run(args, Console()))
 

@@ -1,0 +1,30 @@
+"""The benchmarks of bytes and of memory, in short, and what they promise."""
+
+import itertools
+import sys
+import tracemalloc
+from pathlib import Path
+
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parents[2] / "scripts"))
+import _bench_bytes as wire
+import _bench_memory as memory
+
+
+@pytest.mark.parametrize(("motion", "most"), [("wander", 7_500), ("run-and-jump", 9_500), ("restless", 21_000)])
+def test_a_hundred_that_move_are_few_bytes_and_every_tick_of_them_is_exact(motion: str, most: int) -> None:
+    found = wire.run(motion, 140 if motion == "wander" else 100, 60, 1)
+    assert found["differing"] == 0
+    assert found["moving"] > 90
+    assert 0 < found["bytes_per_s"] < most
+
+
+def test_nothing_stays_of_clients_entities_and_segments_that_are_gone() -> None:
+    tracemalloc.start()
+    try:
+        after = memory.churn(5)
+    finally:
+        tracemalloc.stop()
+    # 20 clients, 100 entities and a segment take 300,000 bytes; what still grows at first are tables.
+    assert all(b - a < 20_000 for a, b in itertools.pairwise(after[1:])), after
