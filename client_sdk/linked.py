@@ -5,7 +5,7 @@ Theory of operation. Whole messages are held back, in order, between the core an
 no thread, nothing sleeps, and with a clock of one's own all of it happens again exactly. That the connection is lost
 is heard behind what was sent before; what was still to go out is gone with it. While a slow line is busy, nothing more
 should be read (`appetite`): what waits for it then waits at the server, which sends less, as it does on a real one.
-Over a socket the kernels hide a few KB of that: with "thin", snapshots are 0.9 s old at p50, not 0.3 as in the lab.
+Over a socket the kernels hide some of that: with "thin", snapshots are 0.4 to 1.4 s old at p50, more than in the lab.
 """
 
 import math
