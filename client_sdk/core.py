@@ -39,6 +39,7 @@ from client_sdk.stats import Stats
 from shared import edits, messages
 from shared.inputs import NEUTRAL, Input, clamp
 from shared.messages import (
+    IDLE,
     MARGIN_ONE,
     MARGIN_REFUSED,
     NEUTRALISED,
@@ -370,6 +371,9 @@ class Core:
                 self._lead.observe(tick, margin / MARGIN_ONE, phase, now)
         neutralised = snapshot.fates.count(NEUTRALISED)
         missing = snapshot.fates.count(REPEATED) + neutralised
+        if IDLE in snapshot.fates:  # the very first ones came late: until then nothing stood in for them
+            ticks = enumerate(snapshot.fates, snapshot.first)
+            missing += sum(fate == IDLE and self._phases.get(tick) is not None for tick, fate in ticks)
         self.stats.inputs_substituted += missing
         self.stats.inputs_neutralised += neutralised
         return missing > 0

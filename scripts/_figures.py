@@ -198,6 +198,10 @@ def _corrections(f: Figures) -> Judgement:
         f"{max(f['correction_blocks']['p50'], 0.01):.2f} blocks, by cause: "
         + ", ".join(f"{cause} {n}" for cause, n in causes.most_common())
     )
+    if unexplained:
+        text += f"; {unexplained} without a cause, which must never be: please report it"
+    elif by_late > LATE_SHARE_MAX * f["inputs_sent"]:
+        text += "; too many after late inputs"
     return Judgement(not unexplained and by_late <= LATE_SHARE_MAX * f["inputs_sent"], text)
 
 

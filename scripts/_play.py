@@ -38,6 +38,9 @@ def arguments(argv: list[str] | None = None) -> argparse.Namespace:
 
 def main(argv: list[str] | None = None) -> int:
     options = arguments(argv)
+    if options.script_demo and (options.game != GAME or options.url):
+        print("error: --script-demo plays tag on a server of its own, and nothing else", file=sys.stderr)
+        return 2
     script = Script(options.script_demo) if options.script_demo else None
     if script:
         os.environ.setdefault("SDL_VIDEODRIVER", "dummy")

@@ -13,7 +13,7 @@ from client_sdk.transports.aio import AsyncClient
 from loadtest import own_server
 from tests.chromium import chromium, installed
 
-NAMES = "Ada Alan Barbara Claude Donald Edsger Frances Grace Hedy Ivan Joan Ken Leslie Margaret Niklaus Radia".split()
+NAMES = "Ada Alan Barbara Chen Donald Edsger Frances Grace Hedy Ivan Joan Ken Leslie Margaret Niklaus Radia".split()
 PLAYED = ("wander", "follow", "wander", "run-and-jump", "dig-and-place")
 
 

@@ -80,6 +80,7 @@ def run(settings: Settings) -> int:
     if settings.tick_rate is not None:
         scene = dataclasses.replace(scene, tick_rate=settings.tick_rate)
     scene = rules.prepare(scene)
+    logger.info("getting ready; the first start compiles the physics, which takes some 20 s")
     warm_up(scene)
     with asyncio.Runner(loop_factory=_loop_factory()) as runner, contextlib.ExitStack() as stack:
         store = world = None

@@ -8,10 +8,15 @@ logger = logging.getLogger(__name__)
 
 
 class Faults:
-    """Counts exceptions by the place where they were raised; of each place the 1st, 10th, 100th, ... are logged."""
+    """Counts exceptions by the place where they were raised; of each place the 1st, 10th, 100th, ... are logged.
 
-    def __init__(self) -> None:
+    Args:
+        whose: begins the line in the log.
+    """
+
+    def __init__(self, whose: str = "internal error") -> None:
         self.total = 0
+        self._whose = whose
         self._places: Counter[tuple[str, str, int]] = Counter()
 
     def report(self, where: str) -> None:
@@ -25,4 +30,4 @@ class Faults:
         self._places[where, *place] += 1
         times = self._places[where, *place]
         if str(times).strip("0") == "1":
-            logger.exception("internal error in %s (no. %d at this place)", where, times)
+            logger.exception("%s in %s (no. %d at this place)", self._whose, where, times)

@@ -88,4 +88,8 @@ def load_rules(name: str) -> Rules:
         raise RulesError(f"game = {name!r}: cannot be loaded ({type(error).__name__}: {error})") from error
     if not isinstance(rules, Rules):
         raise RulesError(f"game = {name!r}: is no subclass of server.rules.Rules")
+    hooks = [hook for hook in dir(Rules) if hook.startswith(("on_", "can_"))]
+    for hook in dir(rules):
+        if hook.startswith(("on_", "can_")) and hook not in hooks:
+            raise RulesError(f"game = {name!r}: {hook} is no hook, and nothing calls it (there are {', '.join(hooks)})")
     return rules

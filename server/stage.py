@@ -4,7 +4,6 @@ Everything here acts at once on the one world, ahead of the step of the coming t
 everybody else; so it is sent, recorded and replayed like all that happens.
 """
 
-import logging
 from collections.abc import Iterable, Mapping
 from random import Random
 from types import MappingProxyType
@@ -12,6 +11,7 @@ from typing import Any
 
 from server.contacts import Contacts
 from server.counters import Counters
+from server.faults import Faults
 from server.keeping import LEFT, SAID, SHARED, Kept
 from server.recorder import RecordedWorld
 from server.replication import ChangeLog
@@ -30,12 +30,8 @@ ATTRIBUTES_MAX = 32
 """So many attributes an entity may have, and so many values the game may share,"""
 VALUE_BYTES_MAX = 256
 """each of at most so many bytes as MessagePack."""
-FAILURES_LOGGED_MAX = 100
-"""Failures of rules beyond this many are counted only."""
 
 _FAILED = object()
-
-logger = logging.getLogger(__name__)
 
 
 class Stage:
@@ -70,6 +66,7 @@ class Stage:
         self._contacts = Contacts(world)
         self._told_contacts = _overrides(rules, "on_contact")
         self._started = kept is not None
+        self._faults = Faults("the rules have failed")
         rules.game = self
 
     # -- the world -----------------------------------------------------------------------------------------
@@ -340,8 +337,7 @@ class Stage:
             return hook(*arguments)
         except Exception:
             self._counters.rules_failed += 1
-            if self._counters.rules_failed <= FAILURES_LOGGED_MAX:
-                logger.exception("the rules have failed in %s", hook.__qualname__)
+            self._faults.report(hook.__qualname__)
             return failed
 
 

@@ -97,9 +97,8 @@ class Player:
         self.match.game.lost(self.session, self.match.now)
 
     def _at_server(self, message: bytes, wire: Wire) -> None:
-        if wire is not self.up:
+        if wire is not self.up or self.session is None:
             return
-        assert self.session is not None
         self.match.game.receive(self.session, message, self.match.now)
 
     def _at_client(self, message: bytes, wire: Wire) -> None:
