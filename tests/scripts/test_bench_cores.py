@@ -9,6 +9,7 @@ import pytest
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "scripts"))
 import _bench_bytes as wire
+import _bench_entities as entities
 import _bench_memory as memory
 
 
@@ -28,3 +29,9 @@ def test_nothing_stays_of_clients_entities_and_segments_that_are_gone() -> None:
         tracemalloc.stop()
     # 20 clients, 100 entities and a segment take 300,000 bytes; what still grows at first are tables.
     assert all(b - a < 20_000 for a, b in itertools.pairwise(after[1:])), after
+
+
+def test_a_large_world_in_small_has_all_its_entities_and_clients() -> None:
+    found = entities.run(300, 4, 1)
+    assert (found["entities"], found["clients"]) == (304, 4)
+    assert found["awake"] >= 34
