@@ -93,6 +93,7 @@ def test_a_long_sleep_ends_the_connection_with_a_reason() -> None:
     match = Match(load_scene("flat"), 5)
     player = match.join(wander, Path(0.05))
     joined(match, player)
+    match.run(1)  # it is heard of
     player.suspend(20)
     match.run(21)
     left = [event for event in player.events if isinstance(event, Left)]
