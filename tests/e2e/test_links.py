@@ -46,6 +46,16 @@ class Hold:
         return self._wish
 
 
+class Fidget:
+    """Wishes something else in every tick: that has to be sent, each time."""
+
+    def __init__(self, seed: int) -> None:
+        self._rng = random.Random(seed)
+
+    def __call__(self, world: World, me: int) -> Input:
+        return Input(self._rng.randint(-127, 127), self._rng.randint(-127, 127), 0)
+
+
 @dataclass(frozen=True)
 class Link:
     path: Path
@@ -53,14 +63,14 @@ class Link:
     policy: Callable[[int], Policy]
 
 
-DIP_S, DIP_RATE = (4.0, 9.0), 36e3
+DIP_S, DIP_RATE = (4.0, 9.0), 28e3
 LINKS = {
     "typical": Link(PRESETS["typical"], 9.0, lambda turn: Wander(random.Random(turn))),
     # Too narrow for a snapshot in every tick.
     "dip": Link(
         replace(path(50, 2), rate=2e6, dip=(DIP_S[1], DIP_S[1] - DIP_S[0], DIP_RATE)),
         11.0,
-        lambda turn: Wander(random.Random(turn)),
+        Fidget,
     ),
     # From 3.8 to 4.0 s, from 5.8, and from 7.8: with what follows, just shorter than missing inputs are repeated.
     "outage": Link(replace(path(50, 2), outage=(2.0, 0.2)), 9.0, Hold),
