@@ -63,7 +63,7 @@ from shared.scene import Scene
 from shared.snapshot import VERDICT
 
 TICKS_PER_UPDATE_MAX = 16
-"""A program that was away for longer does not catch up tick by tick: it begins anew."""
+"""A program that was away for longer does not catch up tick by tick: it begins anew. No message has more inputs."""
 UNCONFIRMED_MAX = 96
 """So many ticks beyond the newest snapshot, prediction waits."""
 INPUT_DELAY_MAX = 3
@@ -414,8 +414,9 @@ class Core:
         self._events.append(back)
         self.comeback.back()
         since = max(self._told, prediction.confirmed.tick, self._newest - messages.INPUT_ROWS_MAX)
-        if same and self._newest > since:
-            self._send(Inputs(since + 1, prediction.confirmed.tick, prediction.rows_since(since, self._newest)))
+        for first in range(since, self._newest if same else since, TICKS_PER_UPDATE_MAX):
+            rows = prediction.rows_since(first, min(first + TICKS_PER_UPDATE_MAX, self._newest))
+            self._send(Inputs(first + 1, prediction.confirmed.tick, rows))
 
     def _cut_off(self, left: Left, now: float) -> None:
         """The connection is gone, and there may be another one."""

@@ -14,7 +14,6 @@ from client_sdk.events import Answered, Disconnected, Diverged, Event, Happened,
 from client_sdk.links import Path
 from client_sdk.picture import Figure, View
 from shared.checks import Cell, Vec
-from shared.edits import REACH_BLOCKS
 from shared.scene import Scene
 
 SIZE = 1280, 800
@@ -148,7 +147,7 @@ class Window:
         if found is None:
             return None
         centre = [part + 0.5 for part in found[0]]
-        return found if math.dist(centre, view.me.position) <= REACH_BLOCKS else None
+        return found if math.dist(centre, view.me.position) <= prediction.predicted.scene.reach else None
 
     # -- what is drawn ---------------------------------------------------------------------------------------
 

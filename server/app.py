@@ -79,6 +79,8 @@ def run(settings: Settings) -> int:
     scene = load_scene(settings.scene if "scene" in settings.origins else rules.scene or settings.scene)
     if settings.tick_rate is not None:
         scene = dataclasses.replace(scene, tick_rate=settings.tick_rate)
+    if settings.reach is not None:
+        scene = dataclasses.replace(scene, reach=settings.reach)
     scene = rules.prepare(scene)
     logger.info("getting ready; the first start compiles the physics, which takes some 20 s")
     warm_up(scene)

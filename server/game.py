@@ -31,6 +31,7 @@ from server.stage import Stage
 from shared import messages
 from shared.inputs import Input
 from shared.messages import (
+    INPUT_ROW_BYTES,
     Bye,
     Command,
     Hello,
@@ -138,6 +139,9 @@ class Game:
             self._kick(session, messages.MALFORMED, str(error))
             return
         if isinstance(message, Inputs) and session.entity:
+            if len(message.rows) > self.limits.input_rows_max * INPUT_ROW_BYTES:
+                self._kick(session, messages.MALFORMED, f"more than {self.limits.input_rows_max} inputs in a message")
+                return
             session.inputs.file(message, self.world.tick, self._ticks_left(now))
             self.delivery.acked(session, message.acked, now)
         elif isinstance(message, Ping):

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 from server.kinds import Kind, setting
-from shared.messages import CLIENT_MESSAGE_MAX, NAME_MAX
+from shared.messages import CLIENT_MESSAGE_MAX, INPUT_ROWS_MAX, NAME_MAX
 
 HOUR_S = 3600.0
 
@@ -39,6 +39,9 @@ class Limits:
     )
     messages_per_tick: float = setting(
         8.0, Kind(float, "messages of a client per tick, with a burst of 32 ticks' worth", "N", 1, 1000)
+    )
+    input_rows_max: int = setting(
+        INPUT_ROWS_MAX, Kind(int, "inputs in one message; this SDK sends up to sixteen", "N", 16, INPUT_ROWS_MAX)
     )
     edits_per_s: float = setting(
         10.0, Kind(float, "edits of a player per second, with a burst of two seconds' worth", "N", 0.5, 10_000)

@@ -46,6 +46,10 @@ class Settings:
     host: str = setting("127.0.0.1", Kind(str, "address to listen on; 0.0.0.0 or :: for every interface", "ADDRESS"))
     port: int = setting(8765, Kind(int, "TCP port; 0 lets the system pick one", "PORT", 0, 65535))
     scene: str = setting("hills", Kind(str, "one of --list-scenes, or a scene file; games may have their own", "SCENE"))
+    reach: float | None = setting(
+        None,
+        Kind(float, "blocks that a player's hands reach, instead of the scene's own", "BLOCKS", 0, 1024),
+    )
     tick_rate: int | None = setting(
         None, Kind(int, "ticks per second (default: the scene's own)", "HZ", 1, TICK_RATE_MAX)
     )
@@ -100,7 +104,7 @@ class Settings:
 
 
 GROUPS = {
-    "what is played": ("scene", "game", "seed", "tick_rate"),
+    "what is played": ("scene", "game", "seed", "tick_rate", "reach"),
     "where it listens": ("host", "port", "tls_cert", "tls_key", "allowed_origins"),
     "who may play": ("auth", "auth_key_file"),
     "what is kept": ("data", "durability", "checkpoint_s", "record"),

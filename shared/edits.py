@@ -10,8 +10,6 @@ from shared.messages import DONE, INVALID, OUT_OF_REACH, OVERLAPS
 from shared.units import BLOCK
 from shared.world import OverlapError, World
 
-REACH_BLOCKS = 6
-"""The centre of a block may be so far from the position of who edits it."""
 NAME = "edit"
 """The name of the command."""
 
@@ -48,7 +46,7 @@ def apply(world: World, entity: int, edit: Edit) -> int:
         return INVALID
     centre = [part * BLOCK + BLOCK // 2 for part in edit[:3]]
     way = [a - b for a, b in zip(centre, world.state(entity)[X : X + 3], strict=True)]
-    if sum(part * part for part in way) > (REACH_BLOCKS * BLOCK) ** 2:
+    if sum(part * part for part in way) > (world.scene.reach * BLOCK) ** 2:
         return OUT_OF_REACH
     try:
         world.set_block(*edit)

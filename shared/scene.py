@@ -21,6 +21,7 @@ TEMPLATES_MAX = 255
 SEGMENTS_MAX = 1 << 16
 BOX_MAX = 32.0
 """No box is longer, in blocks."""
+REACH_MAX = 1024.0
 INTEGRATORS = ("mean", "semi")
 SHOWN = ("interpolated", "predicted")
 
@@ -94,6 +95,7 @@ class Scene:
         terrain: the generator's name under "generator", and its parameters.
         spawns: where players appear, in turn.
         player: the name of the template of players.
+        reach: how far from its position a player may place and remove blocks, in blocks to their centres; 0: nowhere.
     """
 
     name: str
@@ -108,6 +110,7 @@ class Scene:
     terrain: Mapping[str, Any] = field(default_factory=lambda: {"generator": "flat"})
     spawns: tuple[Vec, ...] = ((64.0, 64.0, 8.0),)
     player: str = "player"
+    reach: float = 6.0
 
     def __post_init__(self) -> None:
         text(self.name, "name")
@@ -124,6 +127,8 @@ class Scene:
         if self.integrator not in INTEGRATORS:
             raise SceneError(f"integrator = {self.integrator!r}: must be one of {', '.join(INTEGRATORS)}")
         boolean(self.entity_collision, "entity_collision")
+        if not 0 <= finite(self.reach, "reach") <= REACH_MAX:
+            raise SceneError(f"reach = {self.reach!r}: must be 0 to {REACH_MAX:g}")
         object.__setattr__(self, "size", cell(self.size, "size", 1, SEGMENTS_MAX))
         limit = RANGE_BLOCKS // SEGMENT
         object.__setattr__(self, "origin", cell(self.origin, "origin", -limit, limit - 1))

@@ -291,7 +291,7 @@ def done(link: FakeLink) -> int:
 
 def test_edits_out_of_reach_are_refused_whatever_tick_they_name(cheat: Cheat) -> None:
     cheat.tick(128)
-    reach = edits.REACH_BLOCKS
+    reach = int(cheat.table.game.scene.reach)
     cells = [(reach, 0, 1), (-reach - 1, 0, 1), (0, reach, 1), (0, 0, reach + 1), (1 << 27, 0, 1), (5, 5, 5)]
     ticks = (-1, 0, cheat.table.tick_number, cheat.table.tick_number + AHEAD_MAX)
     orders = [order(i, tick, *cell, 5) for i, (tick, cell) in enumerate(itertools.product(ticks, cells), 1)]

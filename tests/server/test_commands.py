@@ -158,3 +158,23 @@ def test_what_a_client_ordered_before_it_was_closed_is_not_carried_out(table: Ta
     link.say(order(1, table.tick_number + 1, 18, 16, 1, 5), b"\xff")
     table.tick(2)
     assert table.game.world.blocks.get(18, 16, 1) == 0
+
+
+@pytest.mark.parametrize(
+    ("reach", "verdict"), [(1.0, messages.OUT_OF_REACH), (6.0, messages.DONE), (0.0, messages.OUT_OF_REACH)]
+)
+def test_the_scene_says_how_far_a_player_reaches(reach: float, verdict: int) -> None:
+    table = Table(reach=reach)
+    link = builder(table)
+    link.say(order(1, 0, 18, 16, 1, 5))
+    table.tick()
+    assert verdicts(link) == {1: verdict}
+
+
+def test_more_inputs_in_a_message_than_the_limit_end_it() -> None:
+    table = Table(Limits(input_rows_max=16))
+    link = table.join()
+    link.say(Inputs(table.tick_number + 1, -1, bytes(3 * 16)))
+    assert link.closings == []
+    link.say(Inputs(table.tick_number + 17, -1, bytes(3 * 17)))
+    assert link.refusal() == (messages.MALFORMED, "more than 16 inputs in a message")

@@ -24,6 +24,7 @@ NO_NUMBERS = (math.nan, math.inf, -math.inf, 10**400, "3", None, True)
         ("terminal_speed", (*NO_NUMBERS, -1, 0, 1e300, 1024.5, 5e-324)),
         ("integrator", ("explicit", "", None, 1)),
         ("entity_collision", (1, "yes", None)),
+        ("reach", (-0.1, 1025.0, float("nan"), "6", None, True)),
         ("size", ((0, 1, 1), (1, 1), (1.0, 1, 1), "abc", (1, 1, 1 << 17), (1 << 9, 1 << 9, 1))),
         ("origin", ((1 << 24, 0, 0), (0, -(1 << 24), 0), (0.5, 0, 0), None)),
         ("terrain", ({}, {"generator": 3}, "flat", None)),
