@@ -27,6 +27,7 @@ from rich.console import Console
 from rich.table import Table
 
 from server.game import Game
+from server.limits import Limits
 from server.store import Store
 from shared import edits, messages
 from shared.inputs import Input
@@ -55,6 +56,9 @@ class Client:
         raise RuntimeError(f"closed: {code} {reason}")
 
 
+EAGER = Limits(edits_per_s=1000.0)
+
+
 @contextmanager
 def opened(directory: str | None, scene: Scene, **how: Any) -> Iterator[Store]:
     with tempfile.TemporaryDirectory(dir=directory) as data:
@@ -80,10 +84,10 @@ def verdicts(directory: str | None, ticks: int) -> dict[str, Any]:
     scene = load_scene("flat")
     for name, power in HOW.items():
         if power is None:
-            report[name] = {"verdict_ms": quantiles(edit_on(Game(scene), ticks)), "commit_ms": None}
+            report[name] = {"verdict_ms": quantiles(edit_on(Game(scene, limits=EAGER), ticks)), "commit_ms": None}
             continue
         with opened(directory, scene, power=power) as store:
-            game = Game(scene, world=store.world, saves=store)
+            game = Game(scene, limits=EAGER, world=store.world, saves=store)
             store.start(game.keep)
             report[name] = {"verdict_ms": quantiles(edit_on(game, ticks)), "commit_ms": store.commit_s.summary()}
     return report
@@ -91,7 +95,6 @@ def verdicts(directory: str | None, ticks: int) -> dict[str, Any]:
 
 def edit_on(game: Game, ticks: int) -> list[float]:
     """One edit per tick, in real time; ms from its step to its verdict."""
-    game.limits = replace(game.limits, edits_per_s=1000.0)
     link, tick_s = Client(), 1 / game.scene.tick_rate
     start = time.monotonic()
     session = game.open(link, start)

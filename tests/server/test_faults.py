@@ -181,4 +181,6 @@ def test_of_the_same_mistake_the_first_the_tenth_and_so_on_are_logged(caplog: py
         faults.report("a search")
     assert faults.total == 1001
     logged = [record for record in caplog.records if record.levelno == logging.ERROR and record.exc_info]
-    assert [record.args for record in logged] == [("a sum", 10**n) for n in range(4)] + [("a search", 1)]
+    assert [record.args for record in logged] == [
+        ("internal error", *told) for told in [*(("a sum", 10**n) for n in range(4)), ("a search", 1)]
+    ]
