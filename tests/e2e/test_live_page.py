@@ -2,6 +2,9 @@
 
 import asyncio
 import random
+import subprocess
+import sys
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -9,7 +12,7 @@ import pytest
 from client_sdk.bots import Bot, RunAndJump
 from client_sdk.transports.aio import AsyncClient
 from tests.chromium import chromium, installed
-from tests.client_sdk.servers import real_server
+from tests.client_sdk.servers import ROOT, real_server
 
 BROWSER = installed()
 pytestmark = [pytest.mark.e2e, pytest.mark.skipif(BROWSER is None, reason="there is no Chromium on this machine")]
@@ -66,3 +69,14 @@ async def test_a_bot_is_seen_running() -> None:
     assert names == {(name, "Bob")}, "a name is text, whatever it says"
     assert len({spot[1] for spot in found["spots"]}) == 5, "Ann is in another place each time"
     assert len({spot[3] for spot in found["spots"]}) == 1, "Bob stands"
+
+
+def test_the_picture_of_the_readme_is_made_by_its_script(tmp_path: Path) -> None:
+    picture = tmp_path / "live.png"
+    command = [sys.executable, "scripts/live_picture.py", "--seconds", "3", "--out", str(picture)]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=180)
+    assert done.returncode == 0, done.stderr
+    data = picture.read_bytes()
+    assert data.startswith(b"\x89PNG")
+    assert (int.from_bytes(data[16:20], "big"), int.from_bytes(data[20:24], "big")) == (1400, 860)
+    assert len(data) > 50_000, "there is something on it"
