@@ -82,7 +82,6 @@ def run(settings: Settings) -> int:
     if settings.reach is not None:
         scene = dataclasses.replace(scene, reach=settings.reach)
     scene = rules.prepare(scene)
-    logger.info("getting ready", note="the first start compiles the physics, which takes some 20 s")
     warm_up(scene)
     with asyncio.Runner(loop_factory=_loop_factory()) as runner, contextlib.ExitStack() as stack:
         store = world = None
