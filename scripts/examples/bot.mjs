@@ -10,15 +10,17 @@ import WebSocket from "ws";
 
 const [url = "ws://127.0.0.1:8765", seconds = "10"] = process.argv.slice(2);
 const HELLO = 1, INPUTS = 2, PING = 3, BYE = 4, WELCOME = 17, SNAPSHOT = 18, TERRAIN = 19, PONG = 20;
-const BLOCK = 2 ** 24, ROW_BYTES = 33, REFUSED = -32768;
+const BLOCK = 2 ** 24, SIDE = 32 * BLOCK, SPEED = 2 ** 16, ROW_BYTES = 33, REFUSED = -32768, NONE = new Uint8Array(0);
+const STOPS = [1, 2, 4], GO = [8, 16], FALL = 32, LAUNCH = 64, TOLD = 128; // what may happen in an entity's turn
 const SQUARE = [[127, 0], [0, 127], [-127, 0], [0, -127]]; // east, north, west, south
 
 const now = () => performance.now() / 1000;
 const bytes = bin => new DataView(bin.buffer, bin.byteOffset, bin.byteLength);
-const entities = new Map(); // id -> {segment, at: position in blocks}
+const rounded = value => Math.sign(value) * Math.round(Math.abs(value));
+const entities = new Map(); // id -> {segment, corner, template, at: steps from the corner, v, move, falling}
 const names = new Map();
 const ground = new Map(); // segment "x,y,z" -> 32768 kinds of blocks
-let me = 0, rate = 0, acked = -1, sent = -1, pieces = [];
+let me = 0, rate = 0, scene, acked = -1, sent = -1, pieces = [];
 let pongs = [], phase = 0, lead = 0, margins = [];
 const seen = { snapshots: 0, terrain: 0, used: 0, missing: 0, path: 0 };
 
@@ -27,7 +29,7 @@ const send = (...message) => socket.send(encode(message));
 const ping = () => send(PING, now(), 0);
 
 socket.on("open", () => {
-  send(HELLO, 1, {}, "node", "", new Uint8Array(0));
+  send(HELLO, 2, {}, "node", "", new Uint8Array(0));
   for (let i = 0; i < 5; i++) setTimeout(ping, 100 * i);
   setInterval(ping, 1000);
   setInterval(() => console.log(`tick ${acked}: at ${place()?.map(part => part.toFixed(2))}, ${entities.size} in sight`), 1000);
@@ -35,7 +37,7 @@ socket.on("open", () => {
 });
 socket.on("message", data => {
   const [kind, ...fields] = decode(data);
-  if (kind === WELCOME) [, , me, { tick_rate: rate }] = fields;
+  if (kind === WELCOME) { [, , me, scene] = fields; rate = scene.tick_rate; }
   else if (kind === PONG) pong(...fields);
   else if (kind === SNAPSHOT) snapshot(...fields);
   else if (kind === TERRAIN) terrain(...fields);
@@ -71,10 +73,40 @@ function steer() { // the least margin of the last two seconds should be half a 
   lead += Math.max(-0.02, Math.min(0.5 - least, 0.1));
 }
 
+function turn(entity, events = 0, tail = undefined) { // the physics, with what the world does to it told
+  const { v, move, template } = entity, walk = scene.templates[template].walk_speed;
+  let at = 0;
+  if (events & TOLD) for (; at < 2; at++) move[at] = tail.getInt8(at);
+  if (events & TOLD) at = 3; // the buttons
+  for (const k of [0, 1]) if (walk && events & (TOLD | GO[k])) v[k] = rounded(walk * SPEED * move[k] / 127);
+  if (events & LAUNCH) v[2] = rounded(scene.templates[template].jump_speed * SPEED);
+  if (events & (LAUNCH | FALL)) entity.falling = true;
+  let from = v[2];
+  if (entity.falling && scene.gravity)
+    v[2] = Math.max(v[2] - rounded(scene.gravity * SPEED / rate), -rounded(scene.terminal_speed * SPEED));
+  if (scene.gravity && scene.integrator !== "mean") from = v[2];
+  const sums = [2 * v[0], 2 * v[1], from + v[2]];
+  const to = sums.map((sum, k) => entity.at[k] + Math.sign(sum) * Math.floor((Math.abs(sum) * 256 + rate) / (2 * rate)));
+  for (const k of [0, 1, 2]) if (events & STOPS[k]) {
+    to[k] = tail.getInt32(at, true);
+    at += 4;
+    if (k === 2 && sums[2] < 0) entity.falling = false;
+    v[k] = 0;
+  }
+  if (to.every(part => part >= 0 && part < SIDE)) entity.at = to; // who leaves the segment is told of by a row
+  return at;
+}
+
 function snapshot(tick, newest, early, first, fates, verdicts, drops, ...segments) {
-  const before = place(), told = new Set();
-  const parts = segments.map(([x, y, z, since, rows, gone, edits, check, attributes]) =>
-    ({ x, y, z, key: `${x},${y},${z}`, whole: since === -1, rows: bytes(rows), gone: bytes(gone), edits: bytes(edits), attributes }));
+  const before = place(), told = new Set(), turned = new Set();
+  const parts = segments.map(([x, y, z, ago, heads = NONE, tails = NONE, rows = NONE, gone = NONE, , edits = NONE, attributes = []]) =>
+    ({ x, y, z, key: `${x},${y},${z}`, whole: ago === -1, heads: bytes(heads), tails, rows: bytes(rows), gone: bytes(gone), edits: bytes(edits), attributes }));
+  for (const { heads, tails } of parts) for (let at = 0, tail = 0; at < heads.byteLength; at += 5) {
+    const id = heads.getUint32(at, true);
+    tail += turn(entities.get(id), heads.getUint8(at + 4), bytes(tails.subarray(tail)));
+    turned.add(id);
+  }
+  for (const [id, entity] of entities) for (let n = turned.has(id) ? 0 : tick - acked; n > 0; n--) turn(entity);
   for (const { rows } of parts) for (let at = 0; at < rows.byteLength; at += ROW_BYTES) told.add(rows.getUint32(at, true));
   const remove = (id, entity) => { if (!told.has(id)) { entities.delete(id); names.delete(id); } };
   const empty = new Set(parts.filter(part => part.whole).map(part => part.key));
@@ -93,9 +125,11 @@ function snapshot(tick, newest, early, first, fates, verdicts, drops, ...segment
       for (const kinds of [ground.get(key), ...pieces.filter(piece => piece.key === key).map(piece => piece.edits)])
         if (kinds) kinds[edits.getUint16(at, true)] = edits.getUint8(at + 2);
     for (let at = 0; at < rows.byteLength; at += ROW_BYTES) {
-      const corner = [32 * x, 32 * y, 32 * z];
-      const position = corner.map((low, axis) => low + rows.getInt32(at + 6 + 4 * axis, true) / BLOCK);
-      entities.set(rows.getUint32(at, true), { segment: key, at: position });
+      const [px, py, pz, ...v] = [6, 10, 14, 18, 22, 26].map(offset => rows.getInt32(at + offset, true));
+      entities.set(rows.getUint32(at, true), {
+        segment: key, corner: [32 * x, 32 * y, 32 * z], template: rows.getUint8(at + 4), at: [px, py, pz], v,
+        move: [rows.getInt8(at + 30), rows.getInt8(at + 31)], falling: (rows.getUint8(at + 5) & 1) === 1,
+      });
     }
     for (let i = 0; i < attributes.length; i += 2) names.set(attributes[i], attributes[i + 1].name ?? "somebody");
   }
@@ -105,7 +139,7 @@ function snapshot(tick, newest, early, first, fates, verdicts, drops, ...segment
   for (let at = 0; at < early.length; at += 2) margins.push(bytes(early).getInt16(at, true) / 256);
   margins = margins.filter(margin => margin !== REFUSED / 256).slice(-2 * rate);
   if (margins.length) steer();
-  const after = entities.get(me)?.at;
+  const after = place();
   if (before && after) seen.path += Math.hypot(after[0] - before[0], after[1] - before[1]);
 }
 
@@ -120,7 +154,8 @@ function terrain(x, y, z, offset, total, chunk) {
 }
 
 function place() {
-  return entities.get(me)?.at;
+  const mine = entities.get(me);
+  return mine?.at.map((part, axis) => mine.corner[axis] + part / BLOCK);
 }
 
 function below() { // the kind of the block under our feet
