@@ -20,13 +20,43 @@ MARGIN = 14
 
 def network_lines(client: Client, lag_s: float) -> list[tuple[str, str]]:
     """The figures of the connection, by name."""
-    return [("added by [ ]", f"{lag_s * 1000:.0f} ms"), *client.stats.figures()]
+    return [("added latency", f"{lag_s * 1000:.0f} ms"), *client.stats.figures()]
+
+
+class Slider:
+    """A value from 0 to `top`, set with the mouse."""
+
+    def __init__(self, top: float) -> None:
+        self._top = top
+        self._held = False
+        self.track = pygame.Rect(0, 0, 0, 0)
+
+    def draw(self, target: pygame.Surface, area: pygame.Rect, value: float) -> None:
+        """A track on a plate, and a knob where the value is."""
+        target.blit(_plate(*area.size), area)
+        self.track = pygame.Rect(area.x + 16, area.centery - 3, area.width - 32, 6)
+        pygame.draw.rect(target, FAINT, self.track, border_radius=3)
+        knob = (self.track.x + round(self.track.width * value / self._top), self.track.centery)
+        pygame.draw.circle(target, WHITE, knob, 9)
+
+    def handle(self, event: pygame.event.Event) -> float | None:
+        """The value that the mouse sets with this event; None: it is not about the slider."""
+        x, y = pygame.mouse.get_pos()
+        if event.type == pygame.MOUSEBUTTONDOWN and event.button == 1:
+            self._held = self.track.inflate(24, 24).collidepoint(x, y)
+        elif event.type == pygame.MOUSEBUTTONUP:
+            self._held = False
+        if not self._held or event.type not in (pygame.MOUSEBUTTONDOWN, pygame.MOUSEMOTION):
+            return None
+        share = (x - self.track.x) / max(self.track.width, 1)
+        return self._top * min(max(share, 0.0), 1.0)
 
 
 class Hud:
     """Panels in the window's corners."""
 
-    def __init__(self) -> None:
+    def __init__(self, lag_max_s: float) -> None:
+        self.slider = Slider(lag_max_s)
         self._toasts: list[tuple[float, str]] = []
 
     def say(self, text: str, now: float) -> None:
@@ -42,6 +72,7 @@ class Hud:
         left_s: float | None,
         actors: Sequence[Actor],
         network: Sequence[tuple[str, str]],
+        lag_s: float,
         choice: Colour,
     ) -> None:
         """All of it; `left_s` is the time that is left of a round, if there is one."""
@@ -51,6 +82,7 @@ class Hud:
         target.blit(top, ((width - top.get_width()) // 2, MARGIN))
         table = _table("The network", tuple(network), ())
         target.blit(table, (MARGIN, MARGIN))
+        self.slider.draw(target, pygame.Rect(MARGIN, MARGIN + table.get_height() + 6, table.get_width(), 34), lag_s)
         scores = _scores(actors)
         if scores:
             marks = tuple(tone for _, _, tone in scores)

@@ -59,7 +59,7 @@ class Window:
         """Why it is over."""
         self._pilot = pilot
         self._screen = pygame.display.set_mode(SIZE, pygame.RESIZABLE)
-        self._ground, self._hud = Ground(), Hud()
+        self._ground, self._hud = Ground(), Hud(LAG_MAX_S)
         self._camera: Point | None = None
         self._looks: dict[int, int] = {}
         self._tones: dict[int, int] = {}
@@ -121,7 +121,10 @@ class Window:
                 pass
 
     def _handle(self, event: pygame.event.Event, view: View) -> None:
-        if event.type == pygame.QUIT or (event.type == pygame.KEYDOWN and event.key == pygame.K_ESCAPE):
+        lag_s = self._hud.slider.handle(event)
+        if lag_s is not None:
+            self.lag(lag_s)
+        elif event.type == pygame.QUIT or (event.type == pygame.KEYDOWN and event.key == pygame.K_ESCAPE):
             self.over = "closed by the player"
         elif event.type == pygame.KEYDOWN:
             if event.key == pygame.K_g:
@@ -185,6 +188,7 @@ class Window:
             left_s=left_s,
             actors=self.actors,
             network=network_lines(self.client, self.lag_s),
+            lag_s=self.lag_s,
             choice=colour_of(self.kind),
         )
         pygame.display.flip()

@@ -185,6 +185,27 @@ def test_the_mouse_places_and_digs(monkeypatch: pytest.MonkeyPatch) -> None:
     assert world.blocks.get(ground[1], ground[2], ground[0] + 1) == 0
 
 
+def test_a_slider_sets_the_latency(monkeypatch: pytest.MonkeyPatch) -> None:
+    session = Session()
+    track = session.window._hud.slider.track
+    kind, way = (
+        pygame.MOUSEBUTTONDOWN,
+        [(track.x + track.width // 4, 0.25), (track.centerx, 0.5), (2000, 1.0), (-5, 0.0)],
+    )
+    for x, lag_s in way:
+        monkeypatch.setattr(pygame.mouse, "get_pos", lambda x=x: (x, track.centery))
+        pygame.event.post(pygame.event.Event(kind, button=1))
+        session.run(0.1)
+        assert session.window.lag_s == pytest.approx(lag_s, abs=0.01)
+        kind = pygame.MOUSEMOTION
+    for each in (pygame.MOUSEBUTTONUP, pygame.MOUSEMOTION):  # let go: the mouse is free again
+        monkeypatch.setattr(pygame.mouse, "get_pos", lambda: track.center)
+        pygame.event.post(pygame.event.Event(each, button=1))
+    session.run(0.1)
+    assert session.window.lag_s == 0.0
+    assert session.core.link is None
+
+
 def test_the_latency_of_the_keys_is_as_much_as_they_say() -> None:
     match = Match(load_scene("flat"), 5)
     core = LinkedCore("Ann")
