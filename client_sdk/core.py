@@ -69,7 +69,7 @@ UNCONFIRMED_MAX = 96
 INPUT_DELAY_MAX = 3
 CLOCK_S = 1.0
 """A server whose time is this far from what it was believed to be is not the same one any more, or was away."""
-COME_AGAIN = (messages.TOO_SLOW, messages.GOING_AWAY)
+COME_AGAIN = (messages.TOO_SLOW, messages.GOING_AWAY, messages.NO_HELLO)
 """The connection was at fault, not the player."""
 EVENTS_MAX = 1000
 READ_BYTES = 64 * 1024

@@ -344,7 +344,7 @@ class Game:
             if session.closed:
                 continue
             if not session.entity:
-                if now - session.opened > self.limits.hello_s:
+                if session.hello is None and now - session.opened > self.limits.hello_s:
                     self._kick(session, messages.NO_HELLO, f"no hello within {self.limits.hello_s:g} s")
             elif len(session.outbox) > self.limits.outbox_max:
                 self._kick(session, messages.TOO_SLOW, f"{len(session.outbox)} messages behind")

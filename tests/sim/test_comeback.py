@@ -9,6 +9,8 @@ from client_sdk.core import Core
 from client_sdk.events import Answered, Corrected, Disconnected, Joined, Left, Resumed
 from client_sdk.links import PRESETS, Path
 from server.limits import Limits
+from shared import messages
+from shared.messages import Bye, encode
 from shared.scene import load_scene
 from tests.match import Match, Player, wander
 
@@ -106,6 +108,22 @@ def test_who_has_no_patience_or_was_told_to_go_does_not_come_back() -> None:
         assert player.core.state == "closed"
         assert len(told(player, Left)) == 1
         assert not told(player, Disconnected)
+
+
+def test_who_was_too_slow_to_say_hello_again_tries_once_more() -> None:
+    match = Match(load_scene("flat"), 6)
+    player = match.join(wander, Path(0.05), Core(patience_s=10))
+    joined(match, player)
+    entity = player.core.entity
+    player.disconnect()
+    match.run_until(lambda: player.session is not None, 5)
+    assert player.core.state == "away"
+    player.core.receive(encode(Bye(messages.NO_HELLO, "no hello within 5 s", -1.0)), player.local)
+    assert player.core.state == "away"
+    player.disconnect()
+    match.run_until(lambda: player.core.state == "playing", 10)
+    assert player.core.entity == entity
+    assert not told(player, Left)
 
 
 def test_waits_grow_spread_and_end() -> None:
