@@ -59,7 +59,7 @@ def test_it_joins_walks_and_reads_snapshots(installed: Path) -> None:
         assert found["name"] == "node", "the attributes of its entity"
         assert found["at"][2] == GROUND
         assert found["below"] == GRASS, "the terrain was unpacked, and is where the rows say that it is"
-        assert found["terrain"] == 9
+        assert found["terrain"] >= 9  # more, where its way leads over a border
         assert found["snapshots"] > 16
         assert found["used"] > 16
         assert WALK_SPEED / 2 < found["path"] < WALK_SPEED * (PLAYED_S + 1)
