@@ -206,7 +206,7 @@ class Core:
 
     def update(self, now: float) -> None:
         """Sends pings that are due, and predicts every tick whose time has come."""
-        if self._open and (self._filled.clock if self._filled else self.clock).due(now):
+        if self._open and self._told_clock.due(now):
             self._send(Ping(now, self.stats.corrections))
             self._pings.append(now)
         if self.state == "joining":
@@ -234,7 +234,7 @@ class Core:
 
     def next_update(self, now: float) -> float:
         """The local time at which `update` has something to do."""
-        due = (self._filled.clock if self._filled else self.clock).next_ping if self._open else self.comeback.retry_at
+        due = self._told_clock.next_ping if self._open else self.comeback.retry_at
         prediction = self.prediction
         if self.timeline and prediction and self._newest < prediction.confirmed.tick + UNCONFIRMED_MAX:
             due = min(due, self.timeline.when(self._newest + 1))
@@ -264,6 +264,11 @@ class Core:
 
     # -- inside --------------------------------------------------------------------------------------------
 
+    @property
+    def _told_clock(self) -> ServerClock:
+        """That of the server whose messages come now; after a return not yet the one that is played by."""
+        return self._filled.clock if self._filled else self.clock
+
     def _take(self, message: messages.Message, now: float) -> None:
         match message:
             case Snapshot():
@@ -271,7 +276,7 @@ class Core:
             case Pong():
                 if message.sent in self._pings:  # anything else is no answer to a ping of ours
                     self._pings.remove(message.sent)
-                    (self._filled.clock if self._filled else self.clock).answered(message.sent, message.tick, now)
+                    self._told_clock.answered(message.sent, message.tick, now)
             case Terrain():
                 self._terrain(message)
             case Welcome():

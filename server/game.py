@@ -105,7 +105,6 @@ class Game:
         self.orders = Orders(self.world, self.stage, self.limits, self.faults, saves)
         self._spawns = Spawns(self.world)
         self._numbers = count(1)
-        self._leaving: list[Player] = []
         self._respawn: list[int] = []
         self._deadline: float | None = None
         self._rules = scene.to_table()
@@ -229,16 +228,14 @@ class Game:
         for player in self.players.values():
             if player.session is None and player.away_until == math.inf:  # the server has been away
                 player.away_until = now + self.limits.resume_s
-        self._leaving += [player for player in self.players.values() if now >= player.away_until]
-        self._let_go(self._leaving)
-        self._leaving.clear()
+        self._let_go([player for player in self.players.values() if now >= player.away_until])
 
     def _let_go(self, leaving: list[Player]) -> None:
         for player in leaving:
-            if self.players.pop(player.entity, None) is not None:
-                self.counters.left += 1
-                self.counters.add(player.inputs)
-                self.stage.left(player)
+            del self.players[player.entity]
+            self.counters.left += 1
+            self.counters.add(player.inputs)
+            self.stage.left(player)
 
     def _join(self) -> None:
         joining = [session for session in self.sessions if session.hello is not None and not session.closed]
@@ -408,7 +405,7 @@ class Game:
         """The player of this connection is not kept for a return."""
         if session.player is not None and session.player.session is session:
             session.player.session = None
-            self._leaving.append(session.player)
+            session.player.away_until = -math.inf
 
     def _end(self, session: Session, code: int, reason: str, wait: float = -1.0) -> None:
         reason = reason[: messages.REASON_MAX]
