@@ -1,8 +1,5 @@
 """The game in the README, as somebody wrote it who had read nothing else."""
 
-import re
-from pathlib import Path
-
 from client_sdk.bots import Policy
 from scripts.examples.freeze import Freeze
 from shared.inputs import NEUTRAL, Input, make_input
@@ -11,7 +8,6 @@ from shared.world import World
 from tests.match import Match, Player, bot
 from tests.match import Path as Line
 
-ROOT = Path(__file__).resolve().parents[2]
 TYPICAL = Line(0.05, 0.01)
 
 
@@ -36,18 +32,6 @@ def heading(x: int, y: int) -> Policy:
 def clean(player: Player) -> None:
     assert player.core.stats.divergences == 0
     assert set(player.core.stats.corrections_by_cause) <= {"server act", "other entity", "late input"}
-
-
-def test_it_stands_in_the_readme_and_is_short() -> None:
-    text = (ROOT / "scripts" / "examples" / "freeze.py").read_text("utf-8")
-    assert len(text.splitlines()) < 30
-    assert f"```python\n{text}```" in (ROOT / "README.md").read_text("utf-8")
-
-
-def test_the_test_in_the_readme_passes() -> None:
-    blocks = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text("utf-8"), re.DOTALL)
-    (test,) = [block for block in blocks if "Match(" in block]
-    exec(compile(test, "README.md", "exec"), {})
 
 
 def test_who_is_touched_freezes_and_is_thawed_by_a_friend() -> None:

@@ -1,16 +1,14 @@
-"""Runs a program of the README until its player has walked: `python -m tests.readme.run_snippet NAME`.
+"""Runs a program of the pages until its player has walked: `python -m tests.readme.run_snippet HEADING`.
 
-Programs for an engine play in a game within this process, at 30 frames per second by their own clock, however long a
-frame takes; the others on the server whose address is the second argument. The keys are held by nobody, so the wish is
-looked at and another one takes its place.
+Loops, in an engine or bare, play in a game within this process, at 30 frames per second by their own clock, however
+long a frame takes; the others on the server whose address is the second argument. An engine's keys are held by nobody,
+so the wish is looked at and another one takes its place.
 """
 
 import asyncio
 import itertools
-import re
 import sys
 import time
-from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -18,8 +16,9 @@ from client_sdk import AsyncClient, Client, Loopback, View, client
 from server.game import Game
 from shared.scene import load_scene
 from tests.readme import engines
+from tests.readme.pages import programs
 
-README = Path(__file__).resolve().parents[2] / "README.md"
+LOOP = "In your game's loop"
 URL = "ws://127.0.0.1:8765"
 FAR_BLOCKS = 3.0
 FRAMES_MAX = 3000
@@ -29,14 +28,8 @@ class EnoughError(Exception):
     """The player has got somewhere."""
 
 
-def snippets() -> dict[str, str]:
-    """The programs by the names that they are folded under."""
-    found = re.findall(r"<summary>(.*?)</summary>\n\n```python\n(.*?)```", README.read_text("utf-8"), re.DOTALL)
-    return dict(found)
-
-
-def in_an_engine() -> None:
-    """Makes `Client` one of a game within this process."""
+def in_this_process(wish: tuple[float, float, bool]) -> None:
+    """Makes `Client` one of a game within this process; the program is to wish that."""
     frames = itertools.count()
     now = [0.0]
     start: list[float] = []
@@ -52,7 +45,7 @@ def in_an_engine() -> None:
         return poll(self)
 
     def wished(self: Client, x: float, y: float, *, jump: bool) -> None:
-        assert (x, y, jump) == (0, 0, False)
+        assert (x, y, jump) == wish
         set_input(self, 1, 0)
 
     def looked(self: Client) -> View:
@@ -98,14 +91,14 @@ def on_a_server(url: str) -> None:
 
 
 def main(name: str, url: str = "") -> None:
-    program = compile(snippets()[name], f"README.md: {name}", "exec")
+    program = compile(programs()[name], name, "exec")
     space = {"__name__": "snippet"}
     if url:
         on_a_server(url)
         exec(program, space)
         return
-    real = engines.prepare(name)
-    in_an_engine()
+    real = name == LOOP or engines.prepare(name)
+    in_this_process((1, 0, False) if name == LOOP else (0, 0, False))
     try:
         exec(program, space)
     except EnoughError:

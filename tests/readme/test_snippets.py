@@ -1,19 +1,23 @@
-"""The programs in the README, run as they stand there.
+"""The programs in the README and docs/, all run as they stand there.
 
 pygame-ce is installed for the tests and runs without a display. The other engines are used where they are installed
 (they are heavy: 12 to 200 MB); elsewhere the least that has the shape of their loop stands in for them.
 """
 
-import re
 import subprocess
 import sys
+from typing import Any
 
 import pytest
 
 from tests.client_sdk.servers import ROOT, real_server
-from tests.readme.run_snippet import README, snippets
+from tests.readme.pages import programs
+from tests.readme.run_snippet import LOOP
 
 ENGINES = ["pygame-ce", "pyglet", "arcade", "Panda3D", "ursina"]
+ON_A_SERVER = ["asyncio", "A bot"]
+ALONE = ["Without a socket", "Testing it", "Agents that learn"]
+A_FILE = "Your own game"
 
 
 def run(*arguments: str) -> str:
@@ -24,7 +28,7 @@ def run(*arguments: str) -> str:
 
 
 def test_there_are_no_others() -> None:
-    assert [*snippets()] == [*ENGINES, "asyncio", "A bot"]
+    assert sorted(programs()) == sorted([*ENGINES, LOOP, *ON_A_SERVER, *ALONE, A_FILE])
 
 
 @pytest.mark.parametrize("engine", ENGINES)
@@ -32,6 +36,12 @@ def test_an_engines_loop(engine: str) -> None:
     said = run(engine).splitlines()[-1]
     assert said in ("walked, in the engine", "walked, in a stand-in; it has drawn True")
     assert engine != "pygame-ce" or said.endswith("the engine")
+
+
+def test_a_bare_loop() -> None:
+    said = run(LOOP).splitlines()
+    assert said[0].startswith("in flat as ")
+    assert said[-1] == "walked, in the engine"
 
 
 @pytest.mark.e2e
@@ -43,11 +53,30 @@ def test_asyncio_and_bots() -> None:
         assert "walked" in said
 
 
+def alone(name: str) -> dict[str, Any]:
+    """What is there after a program that needs nothing else."""
+    assert name in ALONE
+    space: dict[str, Any] = {}
+    exec(compile(programs()[name], name, "exec"), space)
+    return space
+
+
 def test_single_player() -> None:
-    blocks = re.findall(r"```python\n(.*?)```", README.read_text("utf-8"), re.DOTALL)
-    (program,) = [block for block in blocks if "Loopback(" in block]
-    space: dict[str, object] = {}
-    exec(compile(program, "README.md", "exec"), space)
-    client = space["client"]
-    assert client.playing  # type: ignore[attr-defined]
-    assert client.stats.inputs_late == client.stats.divergences == 0  # type: ignore[attr-defined]
+    client = alone("Without a socket")["client"]
+    assert client.playing
+    assert client.stats.inputs_late == client.stats.divergences == 0
+
+
+def test_a_match() -> None:
+    assert alone("Testing it")["match"].now == 30
+
+
+def test_agents() -> None:
+    assert alone("Agents that learn")["truncations"] == {f"player_{i}": True for i in range(4)}
+
+
+def test_a_game() -> None:
+    """Who plays it is in tests/examples/test_freeze.py."""
+    text = (ROOT / "scripts" / "examples" / "freeze.py").read_text("utf-8")
+    assert len(text.splitlines()) < 30
+    assert programs()[A_FILE] == text

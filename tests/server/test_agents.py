@@ -2,7 +2,6 @@
 
 import asyncio
 import random
-import re
 import subprocess
 import sys
 import warnings
@@ -215,14 +214,6 @@ async def test_the_same_policies_play_here_and_over_the_wire() -> None:
 
     with real_server("--scene", "flat") as url:
         await asyncio.gather(*(plays(url, policy) for policy in policies))
-
-
-def test_the_example_of_the_readme() -> None:
-    text = (ROOT / "README.md").read_text("utf-8")
-    (example,) = re.findall(r"^## Agents.*?^```python\n(.*?)^```$", text, re.MULTILINE | re.DOTALL)
-    found: dict[str, Any] = {}
-    exec(example, found)
-    assert found["truncations"] == {f"player_{i}": True for i in range(4)}
 
 
 def test_without_pettingzoo_it_says_what_to_install() -> None:

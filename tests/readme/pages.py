@@ -1,0 +1,29 @@
+"""What people read: the README and docs/, and the programs in them by the heading that they stand under."""
+
+import re
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[2]
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+_HEADING_OR_FENCE = re.compile(r"^#+ ([^\n]+)$|^```(\w*)[^\n]*\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+
+
+def programs() -> dict[str, str]:
+    """All Python in the pages, in order; each heading has one at most."""
+    found: dict[str, str] = {}
+    for page in PAGES:
+        heading = ""
+        for title, kind, text in _HEADING_OR_FENCE.findall(page.read_text("utf-8")):
+            heading = title or heading
+            if kind == "python":
+                assert heading not in found, f"{page.name}: a second program under {heading!r}"
+                found[heading] = text
+    return found
+
+
+def headings(page: Path) -> set[str]:
+    """The anchors of a page, as GitHub makes them."""
+    titles = [title for title, _, _ in _HEADING_OR_FENCE.findall(page.read_text("utf-8")) if title]
+    anchors = [re.sub(r"[^\w\- ]", "", title.lower()).replace(" ", "-") for title in titles]
+    assert len(anchors) == len(set(anchors)), f"{page.name}: the same heading twice"
+    return set(anchors)
