@@ -225,10 +225,11 @@ class Game:
                 session.opened = session.heard = session.sent_at = now
 
     def _leave(self, now: float) -> None:
-        for player in self.players.values():
-            if player.session is None and player.away_until == math.inf:  # the server has been away
+        away = [player for player in self.players.values() if player.session is None]
+        for player in away:
+            if player.away_until == math.inf:  # the server has been away
                 player.away_until = now + self.limits.resume_s
-        self._let_go([player for player in self.players.values() if now >= player.away_until])
+        self._let_go([player for player in away if now >= player.away_until])
 
     def _let_go(self, leaving: list[Player]) -> None:
         for player in leaving:

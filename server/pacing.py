@@ -94,9 +94,10 @@ class Pacing:
             return 0
         window = self._carries if self._narrow else max(2 * snapshot_bytes, self._carries)
         held = outstanding > window
-        self._held += (held - self._held) / HELD_TICKS
         if held:
             self._full_at = now
+        if held or self._held:
+            self._held += (held - self._held) / HELD_TICKS
         return window
 
     def room(self, window: int, outstanding: int) -> int:

@@ -282,19 +282,21 @@ SERVER_KINDS = frozenset({4, 17, 18, 19, 20, 21, 22})
 _KIND_OF = {kind: number for number, (kind, _) in KINDS.items()}
 _SNAPSHOT = _KIND_OF[Snapshot]
 _INPUTS_HEAD = bytes((0x94, _KIND_OF[Inputs]))
+_pack: Callable[[Any], bytes] = msgpack.Packer().pack
+"""Half the time of `msgpack.packb`, which makes a packer and its buffer anew for each message."""
 
 
 def encode(message: Message) -> bytes:
     """One message as bytes."""
     kind = _KIND_OF[type(message)]
     fields = (*message[:-1], *message.segments) if isinstance(message, Snapshot) else message
-    return msgpack.packb((kind, *fields))  # type: ignore[no-any-return]
+    return _pack((kind, *fields))
 
 
 def join_snapshot(header: tuple[int, int, bytes, int, bytes, bytes, bytes], segments: list[bytes]) -> bytes:
     """A snapshot from its first seven fields and segments that are encoded already (shared by many clients)."""
     n = 1 + len(header) + len(segments)
-    fields = msgpack.packb((_SNAPSHOT, *header))[1:]  # without its own head, which is one byte
+    fields = _pack((_SNAPSHOT, *header))[1:]  # without its own head, which is one byte
     return b"".join((b"\xdc", n.to_bytes(2, "big"), fields, *segments))
 
 
