@@ -1,165 +1,118 @@
-// A client in plain Node.js, from docs/protocol.md alone: joins, walks in squares, and tells where it is.
+// A client in plain Node.js, from docs/protocol.md alone: joins, walks in squares, and tells where everybody is.
 //
 //     npm ci && node bot.mjs ws://127.0.0.1:8765 [seconds]
 //
-// It does not predict: it lives ahead of the server, sends an input per tick, and believes the snapshots.
+// It lives ahead of the server, sends an input per tick, and believes the snapshots. It neither predicts nor looks at
+// the terrain: what that does to anybody, the snapshots tell.
 
-import { inflateSync } from "node:zlib";
 import { decode, encode } from "@msgpack/msgpack";
 import WebSocket from "ws";
 
-const [url = "ws://127.0.0.1:8765", seconds = "10"] = process.argv.slice(2);
-const HELLO = 1, INPUTS = 2, PING = 3, BYE = 4, WELCOME = 17, SNAPSHOT = 18, TERRAIN = 19, PONG = 20;
-const BLOCK = 2 ** 24, SIDE = 32 * BLOCK, SPEED = 2 ** 16, ROW_BYTES = 33, REFUSED = -32768, NONE = new Uint8Array(0);
-const STOPS = [1, 2, 4], GO = [8, 16], FALL = 32, LAUNCH = 64, TOLD = 128; // what may happen in an entity's turn
+const [url = "ws://127.0.0.1:8765", seconds = 10] = process.argv.slice(2);
+const HELLO = 1, INPUTS = 2, PING = 3, BYE = 4, WELCOME = 17, SNAPSHOT = 18, PONG = 20, GOING_AWAY = 1001;
+const STOP = [1, 2, 4], GO = [8, 16], FALL = 32, LAUNCH = 64, TOLD = 128; // what may happen in an entity's turn
+const BLOCK = 2 ** 24, SIDE = 32 * BLOCK, SPEED = 2 ** 16, KEYFRAME = -1, USED = 0, REFUSED = -32768;
 const SQUARE = [[127, 0], [0, 127], [-127, 0], [0, -127]]; // east, north, west, south
 
-const now = () => performance.now() / 1000;
-const bytes = bin => new DataView(bin.buffer, bin.byteOffset, bin.byteLength);
-const rounded = value => Math.sign(value) * Math.round(Math.abs(value));
-const entities = new Map(); // id -> {segment, corner, template, at: steps from the corner, v, move, falling}
-const names = new Map();
-const ground = new Map(); // segment "x,y,z" -> 32768 kinds of blocks
-let me = 0, rate = 0, scene, acked = -1, sent = -1, pieces = [];
-let pongs = [], phase = 0, lead = 0, margins = [];
-const seen = { snapshots: 0, terrain: 0, used: 0, missing: 0, path: 0 };
+const entities = new Map(); // id -> { tick, template, falls, at: [x, y, z], v: [x, y, z], move: [x, y] }, as on the wire
+const said = new Map(); // id -> attributes
+let me, scene, acked = -1, sent = -1, used = 0, pongs = [], margins = [], phase, lead;
 
 const socket = new WebSocket(url, { perMessageDeflate: false });
 const send = (...message) => socket.send(encode(message));
-const ping = () => send(PING, now(), 0);
+const now = () => performance.now() / 1000;
+const rounded = value => Math.sign(value) * Math.round(Math.abs(value)); // halves away from zero
+const home = at => at.map(part => Math.floor(part / SIDE)).join(); // a place's segment, as text
+const ints = (bin, ...offsets) => offsets.map(offset => bin.readInt32LE(offset));
+const reader = (bin, at = 0) => ({ i8: () => bin.readInt8(at++), i32: () => bin.readInt32LE((at += 4) - 4) });
+function* records(size, bin = []) { for (let at = 0; at < bin.length; at += size) yield bin.subarray(at, at + size); }
 
-socket.on("open", () => {
-  send(HELLO, 2, {}, "node", "", new Uint8Array(0));
-  for (let i = 0; i < 5; i++) setTimeout(ping, 100 * i);
-  setInterval(ping, 1000);
-  setInterval(() => console.log(`tick ${acked}: at ${place()?.map(part => part.toFixed(2))}, ${entities.size} in sight`), 1000);
-  setTimeout(() => send(BYE, 1001, "", -1), 1000 * Number(seconds));
-});
+socket.on("open", () => send(HELLO, 2, {}, "node", "", new Uint8Array(0)));
 socket.on("message", data => {
-  const [kind, ...fields] = decode(data);
-  if (kind === WELCOME) { [, , me, scene] = fields; rate = scene.tick_rate; }
+  const [kind, ...fields] = decode(data); // each bin in it is a Buffer, as `data` is
+  if (kind === WELCOME) welcome(...fields);
   else if (kind === PONG) pong(...fields);
   else if (kind === SNAPSHOT) snapshot(...fields);
-  else if (kind === TERRAIN) terrain(...fields);
   else if (kind === BYE) console.error(`told to go: ${fields[0]} ${fields[1]}`);
 });
-socket.on("close", code => {
-  console.log(JSON.stringify({ me, at: place(), below: below(), name: names.get(me), ...seen }));
-  process.exit(code === 1001 ? 0 : 1);
-});
+socket.on("close", code => { tell(); process.exit(code === GOING_AWAY ? 0 : 1); });
 socket.on("error", error => { console.error(error.message); process.exit(1); });
 
-function pong(at, tick) { // the server's time: phase + rate * now, by the pings that stood in no queue
-  pongs = [...pongs, { trip: now() - at, phase: tick - rate * (at + now()) / 2 }].slice(-15);
-  const best = [...pongs].sort((a, b) => a.trip - b.trip).slice(0, Math.ceil(pongs.length / 3));
-  phase = best.map(each => each.phase).sort((a, b) => a - b)[best.length >> 1];
-  if (pongs.length !== 5) return;
-  lead = best[0].trip / 2 * rate + 2;
-  setInterval(act, 1000 / rate / 4);
+function welcome(version, tick, entity, rules) {
+  [me, scene] = [entity, rules];
+  for (let i = 0; i < 5; i++) setTimeout(() => send(PING, now(), 0), 100 * i);
+  setInterval(() => { send(PING, now(), 0); tell(); }, 1000);
+  setTimeout(() => send(BYE, GOING_AWAY, "", -1), 1000 * seconds);
 }
 
-function act() { // a row for each tick that our own clock, which is ahead, has reached
-  const tick = Math.floor(rate * now() + phase + lead);
-  if (sent < 0 || tick - sent > 16) sent = tick - 1;
+function tell() {
+  const places = Object.fromEntries([...entities].map(([id, { at }]) => [id, at.map(part => part / BLOCK)]));
+  console.log(JSON.stringify({ tick: acked, me, name: said.get(me)?.name, used, places }));
+}
+
+function pong(at, tick) { // the server's time is tick_rate * now + phase; the quickest answers know best
+  const { tick_rate } = scene, trip = now() - at;
+  pongs = [...pongs, { trip, phase: tick - tick_rate * (at + trip / 2) }].slice(-15);
+  const best = [...pongs].sort((a, b) => a.trip - b.trip).slice(0, Math.ceil(pongs.length / 3));
+  phase = best.map(each => each.phase).sort((a, b) => a - b)[best.length >> 1];
+  if (lead !== undefined || pongs.length < 5) return;
+  lead = best[0].trip / 2 * tick_rate + 2;
+  setInterval(walk, 250 / tick_rate);
+}
+
+function walk() { // a row for each tick that our own clock has reached; a hop at each corner
+  const tick = Math.floor(scene.tick_rate * now() + phase + lead), side = 2 * scene.tick_rate;
+  if (tick - sent > 16) sent = tick - 1; // the first time, or after a pause
   if (tick <= sent) return;
-  const [x, y] = SQUARE[Math.floor(tick / rate / 2) % 4], row = [x & 255, y & 255, 0];
-  const rows = Uint8Array.from({ length: 3 * (tick - sent) }, (_, i) => row[i % 3]);
-  send(INPUTS, sent + 1, acked, rows);
+  const row = [...SQUARE[Math.floor(tick / side) % 4], tick % side === 0];
+  send(INPUTS, sent + 1, acked, Uint8Array.from(Array(tick - sent).fill(row).flat()));
   sent = tick;
 }
 
-function steer() { // the least margin of the last two seconds should be half a tick
-  const least = Math.min(...margins);
-  lead += Math.max(-0.02, Math.min(0.5 - least, 0.1));
+function turn(entity, events, tail) { // the entity after a tick in which this happened to it
+  const { tick, template, at } = entity, { walk_speed, jump_speed } = scene.templates[template];
+  const { gravity, terminal_speed, tick_rate, integrator } = scene;
+  const move = events & TOLD ? [tail.i8(), tail.i8(), tail.i8()] : entity.move; // the third are buttons
+  const v = entity.v.map((old, k) =>
+    k < 2 && walk_speed && events & (TOLD | GO[k]) ? rounded(walk_speed * SPEED * move[k] / 127) : old);
+  if (events & LAUNCH) v[2] = rounded(jump_speed * SPEED);
+  let falls = entity.falls || events & (LAUNCH | FALL), before = v[2];
+  if (falls) v[2] = Math.max(v[2] - rounded(gravity * SPEED / tick_rate), -rounded(terminal_speed * SPEED));
+  if (integrator === "semi") before = v[2];
+  const way = [2 * v[0], 2 * v[1], before + v[2]].map(sum => rounded(sum * 128 / tick_rate));
+  const to = at.map((from, k) => events & STOP[k] ? Math.floor(from / SIDE) * SIDE + tail.i32() : from + way[k]);
+  if (events & STOP[2] && before + v[2] < 0) falls = 0;
+  if (home(to) !== home(at)) return { ...entity, tick: tick + 1, move }; // a row will tell
+  return { tick: tick + 1, template, falls, at: to, v: v.map((speed, k) => events & STOP[k] ? 0 : speed), move };
 }
 
-function turn(entity, events = 0, tail = undefined) { // the physics, with what the world does to it told
-  const { v, move, template } = entity, walk = scene.templates[template].walk_speed;
-  let at = 0;
-  if (events & TOLD) for (; at < 2; at++) move[at] = tail.getInt8(at);
-  if (events & TOLD) at = 3; // the buttons
-  for (const k of [0, 1]) if (walk && events & (TOLD | GO[k])) v[k] = rounded(walk * SPEED * move[k] / 127);
-  if (events & LAUNCH) v[2] = rounded(scene.templates[template].jump_speed * SPEED);
-  if (events & (LAUNCH | FALL)) entity.falling = true;
-  let from = v[2];
-  if (entity.falling && scene.gravity)
-    v[2] = Math.max(v[2] - rounded(scene.gravity * SPEED / rate), -rounded(scene.terminal_speed * SPEED));
-  if (scene.gravity && scene.integrator !== "mean") from = v[2];
-  const sums = [2 * v[0], 2 * v[1], from + v[2]];
-  const to = sums.map((sum, k) => entity.at[k] + Math.sign(sum) * Math.floor((Math.abs(sum) * 256 + rate) / (2 * rate)));
-  for (const k of [0, 1, 2]) if (events & STOPS[k]) {
-    to[k] = tail.getInt32(at, true);
-    at += 4;
-    if (k === 2 && sums[2] < 0) entity.falling = false;
-    v[k] = 0;
-  }
-  if (to.every(part => part >= 0 && part < SIDE)) entity.at = to; // who leaves the segment is told of by a row
-  return at;
-}
-
-function snapshot(tick, newest, early, first, fates, verdicts, drops, ...segments) {
-  const before = place(), told = new Set(), turned = new Set();
-  const parts = segments.map(([x, y, z, ago, heads = NONE, tails = NONE, rows = NONE, gone = NONE, , edits = NONE, attributes = []]) =>
-    ({ x, y, z, key: `${x},${y},${z}`, whole: ago === -1, heads: bytes(heads), tails, rows: bytes(rows), gone: bytes(gone), edits: bytes(edits), attributes }));
-  for (const { heads, tails } of parts) for (let at = 0, tail = 0; at < heads.byteLength; at += 5) {
-    const id = heads.getUint32(at, true);
-    tail += turn(entities.get(id), heads.getUint8(at + 4), bytes(tails.subarray(tail)));
-    turned.add(id);
-  }
-  for (const [id, entity] of entities) for (let n = turned.has(id) ? 0 : tick - acked; n > 0; n--) turn(entity);
-  for (const { rows } of parts) for (let at = 0; at < rows.byteLength; at += ROW_BYTES) told.add(rows.getUint32(at, true));
-  const remove = (id, entity) => { if (!told.has(id)) { entities.delete(id); names.delete(id); } };
-  const empty = new Set(parts.filter(part => part.whole).map(part => part.key));
-  for (let at = 0; at < drops.length; at += 12) {
-    const key = [0, 4, 8].map(offset => bytes(drops).getInt32(at + offset, true)).join();
-    empty.add(key);
-    ground.delete(key);
-  }
-  for (const [id, { segment }] of entities) if (empty.has(segment)) remove(id);
-  for (const { key, gone } of parts) for (let at = 0; at < gone.byteLength; at += 4) {
-    const id = gone.getUint32(at, true);
-    if (entities.get(id)?.segment === key) remove(id);
-  }
-  for (const { x, y, z, key, rows, edits, attributes } of parts) {
-    for (let at = 0; at < edits.byteLength; at += 3)
-      for (const kinds of [ground.get(key), ...pieces.filter(piece => piece.key === key).map(piece => piece.edits)])
-        if (kinds) kinds[edits.getUint16(at, true)] = edits.getUint8(at + 2);
-    for (let at = 0; at < rows.byteLength; at += ROW_BYTES) {
-      const [px, py, pz, ...v] = [6, 10, 14, 18, 22, 26].map(offset => rows.getInt32(at + offset, true));
-      entities.set(rows.getUint32(at, true), {
-        segment: key, corner: [32 * x, 32 * y, 32 * z], template: rows.getUint8(at + 4), at: [px, py, pz], v,
-        move: [rows.getInt8(at + 30), rows.getInt8(at + 31)], falling: (rows.getUint8(at + 5) & 1) === 1,
-      });
+function snapshot(tick, newest, early, first, fates, verdicts, drops, ...parts) {
+  const told = new Map(), left = new Set(); // told: by rows; left: "segment", or "segment:entity"
+  for (const drop of records(12, drops)) left.add(ints(drop, 0, 4, 8).join());
+  for (const [x, y, z, ago, heads, tails, rows, gone] of parts) {
+    const segment = [x, y, z], tail = reader(tails);
+    for (const head of records(5, heads)) {
+      const id = head.readUInt32LE();
+      entities.set(id, turn(entities.get(id), head[4], tail));
     }
-    for (let i = 0; i < attributes.length; i += 2) names.set(attributes[i], attributes[i + 1].name ?? "somebody");
+    if (ago === KEYFRAME) left.add(segment.join());
+    for (const id of records(4, gone)) left.add(`${segment}:${id.readUInt32LE()}`);
+    for (const row of records(33, rows)) told.set(row.readUInt32LE(), {
+      tick, template: row[4], falls: row[5] & 1, at: ints(row, 6, 10, 14).map((part, k) => segment[k] * SIDE + part),
+      v: ints(row, 18, 22, 26), move: [row.readInt8(30), row.readInt8(31)],
+    });
   }
+  for (let [id, entity] of entities) { // all others go on as they did
+    while (entity.tick < tick) entity = turn(entity, 0);
+    entities.set(id, entity);
+    if (left.has(home(entity.at)) || left.has(`${home(entity.at)}:${id}`)) entities.delete(id);
+  }
+  for (const [id, entity] of told) entities.set(id, entity);
+  for (const [, , , , , , , , , , attributes = []] of parts)
+    for (let i = 0; i < attributes.length; i += 2) said.set(attributes[i], attributes[i + 1]);
   acked = tick;
-  seen.snapshots += 1;
-  for (const fate of fates) { seen.used += fate === 0; seen.missing += fate === 1 || fate === 2; }
-  for (let at = 0; at < early.length; at += 2) margins.push(bytes(early).getInt16(at, true) / 256);
-  margins = margins.filter(margin => margin !== REFUSED / 256).slice(-2 * rate);
-  if (margins.length) steer();
-  const after = place();
-  if (before && after) seen.path += Math.hypot(after[0] - before[0], after[1] - before[1]);
-}
-
-function terrain(x, y, z, offset, total, chunk) {
-  const key = `${x},${y},${z}`;
-  if (offset === 0) pieces = [{ key, chunks: [], edits: {} }]; // edits that come until the last piece belong on top
-  pieces[0].chunks.push(chunk);
-  if (offset + chunk.length < total) return;
-  ground.set(key, Object.assign(inflateSync(Buffer.concat(pieces[0].chunks)), pieces[0].edits));
-  pieces = [];
-  seen.terrain += 1;
-}
-
-function place() {
-  const mine = entities.get(me);
-  return mine?.at.map((part, axis) => mine.corner[axis] + part / BLOCK);
-}
-
-function below() { // the kind of the block under our feet
-  if (!place()) return undefined;
-  const [x, y, z] = place().map(Math.floor), height = z - 1;
-  return ground.get([x >> 5, y >> 5, height >> 5].join())?.[(height & 31) << 10 | (y & 31) << 5 | (x & 31)];
+  used += fates.filter(fate => fate === USED).length;
+  margins.push(...[...records(2, early)].map(margin => margin.readInt16LE()).filter(margin => margin !== REFUSED));
+  margins = margins.slice(-2 * scene.tick_rate);
+  if (margins.length) lead += Math.max(-0.02, Math.min(0.5 - Math.min(...margins) / 256, 0.1)); // half a tick to spare
 }

@@ -1,20 +1,27 @@
-"""The client in Node.js, written from docs/protocol.md: it plays on a real server, which has nothing to complain of."""
+"""The client in Node.js, written from docs/protocol.md: it plays on a real server, which has nothing to complain of.
+
+What it has been told of everybody's way is compared with a recording of that server.
+"""
 
 import json
+import math
 import re
 import shutil
+import signal
 import subprocess
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
 
-from shared.terrain import GRASS
+from scripts.examples.tag import Tag
+from server.journal import replay
+from shared.layout import ID
 from tests.e2e.processes import running, stats, until
 
 EXAMPLES = Path(__file__).resolve().parents[2] / "scripts" / "examples"
 FILES = ("bot.mjs", "package.json", "package-lock.json")
 PLAYED_S = 4
-WALK_SPEED, GROUND = 3.0, 8.0
 UNREACHABLE = "ENOTFOUND|EAI_AGAIN|ECONNREFUSED|ECONNRESET|ETIMEDOUT|ENETUNREACH"
 
 
@@ -42,8 +49,9 @@ def installed(tmp_path: Path) -> Path:
 
 
 @pytest.mark.e2e
-def test_it_joins_walks_and_reads_snapshots(installed: Path) -> None:
-    with running("--port", "0", "--scene", "flat") as server:
+def test_it_joins_walks_and_knows_exactly_where_everybody_is(installed: Path) -> None:
+    record = installed / "record"
+    with running("--port", "0", "--game", "scripts.examples.tag:Tag", "--record", str(record)) as server:
         address = server.address()
         url = "ws://{}:{}".format(*address)
         done = subprocess.run(
@@ -55,16 +63,24 @@ def test_it_joins_walks_and_reads_snapshots(installed: Path) -> None:
             check=False,
         )
         assert (done.returncode, done.stderr) == (0, "")
-        found = json.loads(done.stdout.splitlines()[-1])
-        assert found["name"] == "node", "the attributes of its entity"
-        assert found["at"][2] == GROUND
-        assert found["below"] == GRASS, "the terrain was unpacked, and is where the rows say that it is"
-        assert found["terrain"] >= 9  # more, where its way leads over a border
-        assert found["snapshots"] > 16
-        assert found["used"] > 16
-        assert WALK_SPEED / 2 < found["path"] < WALK_SPEED * (PLAYED_S + 1)
         until(lambda: stats(address)["left"] == 1)
         figures = stats(address)
-        assert figures["inputs_used"] >= found["used"]
-        assert (figures["malformed"], figures["kicked"], figures["inputs_refused"], figures["closed"]) == (0, 0, 0, {})
-        assert figures["internal_errors"] == 0
+        assert server.end(signal.SIGTERM) == 0
+    told = {said["tick"]: said for said in map(json.loads, done.stdout.splitlines())}
+    *_, last = told.values()
+    assert len(told) >= PLAYED_S - 1
+    assert last["name"] == "node", "the attributes of its entity"
+    assert len(last["places"]) == Tag.players_min
+    compared = 0
+    for moment in replay(record):
+        world = moment.world
+        if world.tick in told and not moment.ended:  # the meadow is so small that everybody is in sight
+            truth = {str(entity): list(world.position(entity)) for entity in world.states()[:, ID].tolist()}
+            assert told[world.tick]["places"] == truth, world.tick
+            compared += 1
+    assert compared == len(told)
+    places = [said["places"][str(said["me"])] for said in told.values()]
+    assert sum(math.dist(a, b) for a, b in pairwise(places)) > 2
+    assert figures["inputs_used"] >= last["used"] > 16
+    assert (figures["malformed"], figures["kicked"], figures["inputs_refused"], figures["closed"]) == (0, 0, 0, {})
+    assert figures["internal_errors"] == 0
