@@ -1,8 +1,13 @@
 """One process full of bots, told what to do over its pipes; `loadtest.py` starts it.
 
 argument  {"url", "first", "clients", "seed", "policy", "joins_per_s"}, as JSON
-stdin     "measure": the window begins; "stop": it ends, say goodbye; the end of the pipe: give up
-stdout    a JSON object per line: {"playing", "ended"} while joining and playing; at last {"clients", "cpu_s", "lags_s"}
+stdin     "settle": all have joined, tidy up; "measure": the window begins; "stop": it ends, say goodbye; the end of the
+          pipe: give up
+stdout    a JSON object per line: {"playing", "ended"} while joining, and from "measure" on also {"at", "cpu_s",
+          "lag_counts", ...}, the counters of all its bots since their start; after "stop" {"clients", "cpu_s",
+          "lag_counts"}, of the window
+
+Counts of lags are a `Histogram`'s: those of several processes can be added up.
 """
 
 import asyncio
@@ -20,6 +25,7 @@ from client_sdk.events import Left
 from client_sdk.stats import Stats
 from client_sdk.transports.aio import AsyncClient
 from client_sdk.transports.connection import ConnectError
+from server.histogram import Histogram
 
 REPORT_S = 0.2
 LAG_S = 0.02
@@ -106,26 +112,28 @@ async def swarm(order: dict[str, Any]) -> int:
     make = POLICIES[order["policy"]]
     lives: list[asyncio.Task[None]] = []
     joining = asyncio.create_task(join(order, players, make, lives))
-    lags_s: list[float] = []
-    measuring = asyncio.create_task(lag(lags_s))
-    cpu_s = 0.0
+    lags = Histogram()
+    measuring = asyncio.create_task(lag(lags))
+    cpu_s: float | None = None
     while True:
-        say({"playing": sum(p.playing for p in players), "ended": [p.left for p in players if p.left]})
+        told = {"playing": sum(p.playing for p in players), "ended": [p.left for p in players if p.left]}
+        say(told if cpu_s is None else told | so_far(players, lags))
         try:
             command = await asyncio.wait_for(commands.get(), REPORT_S)
         except TimeoutError:
             continue
-        if command == "measure":
+        if command == "settle":
             gc.collect()
             gc.freeze()
-            lags_s.clear()
+        elif command == "measure":
+            lags.reset()
             cpu_s = time.process_time()
             for player in players:
                 player.mark()
         elif command == "stop":
-            cpu_s = time.process_time() - cpu_s
-            say({"clients": [player.figures() for player in players], "cpu_s": cpu_s, "lags_s": lags_s})
-        if command != "measure":
+            cpu_s = time.process_time() - (cpu_s or 0.0)
+            say({"clients": [player.figures() for player in players], "cpu_s": cpu_s, "lag_counts": lags.counts()})
+        if command not in ("settle", "measure"):
             break
     joining.cancel()
     measuring.cancel()
@@ -134,6 +142,17 @@ async def swarm(order: dict[str, Any]) -> int:
         life.cancel()
     await asyncio.gather(*lives, return_exceptions=True)
     return 0
+
+
+def so_far(players: list[Player], lags: Histogram) -> dict[str, Any]:
+    """What a look at the bots shows while they play."""
+    totals = [counters(player.client.stats) for player in players if player.client is not None]
+    return {
+        "at": time.monotonic(),
+        "cpu_s": time.process_time(),
+        "lag_counts": lags.counts(),
+        **{name: sum(total[name] for total in totals) for name in COUNTERS},
+    }
 
 
 async def join(order: dict[str, Any], players: list[Player], make: Any, lives: list[asyncio.Task[None]]) -> None:
@@ -145,12 +164,12 @@ async def join(order: dict[str, Any], players: list[Player], make: Any, lives: l
         await asyncio.sleep(max(0.0, begun + (i + 1) / order["joins_per_s"] - time.monotonic()))
 
 
-async def lag(found_s: list[float]) -> None:
+async def lag(found: Histogram) -> None:
     """How late this process is with everything it does, looked at every 20 ms."""
     while True:
         due = time.monotonic() + LAG_S
         await asyncio.sleep(LAG_S)
-        found_s.append(round(time.monotonic() - due, 5))
+        found.record(time.monotonic() - due)
 
 
 def listen() -> asyncio.Queue[str]:

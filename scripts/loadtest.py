@@ -1,45 +1,40 @@
 """Bots on real sockets against a real server process, and what they saw.
 
-Starts a server of its own unless --url is given. The figures are of the window in which all clients are playing.
-Exits with 1 if a bot died, a message was malformed, or the server did not end well; with 2 if nothing could start.
+Starts a server of its own unless --url is given. The bots are spread over --processes, each with an event loop of its
+own. While they play, it shows what has happened since the last look: clients, ticks, how late they began (p50 / p99 /
+max), bytes, late inputs, corrections, and how late the bots are themselves, in the worst of their processes (p99). The
+figures in the end are of the whole window in which all clients are playing; quantiles are of all processes' samples
+put together. Exits with 1 if a bot or a process died, a message was malformed, or the server did not end well; with 2
+if nothing could start.
 """
 
 import argparse
 import asyncio
 import contextlib
-import http.client
 import json
 import os
 import signal
 import sys
 import time
-from collections.abc import AsyncIterator
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
-from urllib.parse import urlsplit
 
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
-from _figures import Figures, failures, figures, rows, verdict
+from _figures import bottleneck, failures, figures, rows, verdict
+from _glance import Look, Stage
+from _glance import rows as glance
+from _processes import ROOT, CannotStartError, DiedError, Figures, Process, Worker, child, own_server, stats
 from client_sdk.bots import POLICIES
 
-ROOT = Path(__file__).resolve().parent.parent
 JOINS_PER_S = 100.0
 JOIN_S_MAX = 30.0
 """What the joins may take beyond their pace."""
-START_S_MAX = 120.0
-"""A server's first start compiles the physics."""
-END_S = 10.0
-"""A process that has not ended by then, though asked to, is killed."""
-LINE_BYTES_MAX = 1 << 24
-
-Process = asyncio.subprocess.Process
-
-
-class CannotStartError(Exception):
-    """The test cannot begin; the text says why."""
+SETTLE_S = 0.5
+"""After the last join: the bots' garbage has been collected, and what was late for its sake is over."""
+LINES_MAX = 20
+"""Lines of figures, at most, where the output is no terminal."""
 
 
 def arguments(argv: list[str] | None = None) -> argparse.Namespace:
@@ -66,9 +61,17 @@ async def test(args: argparse.Namespace, console: Console) -> int:
         url = args.url
         if url is None:
             server, url = await stack.enter_async_context(own_server(args))
-        workers = [await stack.enter_async_context(child(*order, patience_s=2.0)) for order in orders(args, url)]
-        measured = await measure(args, url, [Worker(worker) for worker in workers], console)
-    measured |= {"policy": args.policy, "scene": args.scene, "seed": args.seed, "processes": args.processes}
+        workers = [
+            Worker(await stack.enter_async_context(child(*order, patience_s=2.0))) for order in orders(args, url)
+        ]
+        for worker in workers:
+            stack.callback(worker.leave)  # all of them, before any is waited for
+        watched = {
+            "a process of bots": [worker.process for worker in workers],
+            "the server": [server] if server else [],
+        }
+        measured = await measure(args, url, workers, lambda: check(watched), console)
+    measured |= {"policy": args.policy, "scene": args.scene, "seed": args.seed, "processes": len(workers)}
     failed = failures(measured)
     if server is not None:
         measured["server_exit_code"] = server.returncode
@@ -81,33 +84,61 @@ async def test(args: argparse.Namespace, console: Console) -> int:
     return int(bool(failed))
 
 
-async def measure(args: argparse.Namespace, url: str, workers: "list[Worker]", console: Console) -> Figures:
-    """Waits for everybody to play, then measures."""
+def check(watched: dict[str, list[Process]]) -> None:
+    """Nobody has ended.
+
+    Raises:
+        DiedError: somebody has.
+    """
+    for name, processes in watched.items():
+        for process in processes:
+            if process.returncode is not None:
+                raise DiedError(f"{name} ended in the middle, with {process.returncode}")
+
+
+async def measure(
+    args: argparse.Namespace, url: str, workers: list[Worker], check: Callable[[], None], console: Console
+) -> Figures:
+    """Waits for everybody to play, then measures.
+
+    Args:
+        check: raises if one of the processes is gone.
+    """
     with Stage(console) as stage:
         stage.begin(f"{args.clients} clients join", args.clients)
         deadline = time.monotonic() + args.clients / JOINS_PER_S + JOIN_S_MAX
-        while sum(worker.playing + len(worker.ended) for worker in workers) < args.clients:
-            if time.monotonic() > deadline or any(worker.dead for worker in workers):
+        while sum(worker.told["playing"] + len(worker.told["ended"]) for worker in workers) < args.clients:
+            if time.monotonic() > deadline:
                 break
             await asyncio.sleep(0.05)
-            stage.at(sum(worker.playing for worker in workers))
-        playing = sum(worker.playing for worker in workers)
+            check()
+            stage.at(sum(worker.told["playing"] for worker in workers))
+        playing = sum(worker.told["playing"] for worker in workers)
         if not playing:
-            reasons = {left["reason"] for worker in workers for left in worker.ended}
+            reasons = {left["reason"] for worker in workers for left in worker.told["ended"]}
             raise CannotStartError("; ".join(sorted(reasons)) or "no client could join in time")
-        stage.at(playing)
 
         stage.begin(f"{playing} play", args.seconds)
+        for worker in workers:
+            await worker.tell("settle")
+        await asyncio.sleep(SETTLE_S)
         for worker in workers:
             await worker.tell("measure")
         before, began = await stats(url), time.monotonic()
         rss_mb: list[float] = []
-        sample = began + 1
+        looked = shown = Look(before, [worker.told for worker in workers])
+        sample, line = began + 1, began
         while (now := time.monotonic()) < began + args.seconds:
+            check()
             stage.at(now - began)
             if now >= sample:
                 sample += 1
-                rss_mb += [told["rss_mb"] for told in [await stats(url)] if "rss_mb" in told]
+                looked = Look(await stats(url), [worker.told for worker in workers])
+                rss_mb += [looked.server["rss_mb"]] if "rss_mb" in looked.server else []
+                if console.is_terminal or now >= line + args.seconds / LINES_MAX:
+                    line = now
+                    stage.show(now - began, glance(shown, looked))
+                    shown = looked
             await asyncio.sleep(max(0.0, min(began + args.seconds - now, sample - now, 0.25)))
         for worker in workers:
             await worker.tell("stop")
@@ -115,97 +146,6 @@ async def measure(args: argparse.Namespace, url: str, workers: "list[Worker]", c
         after = await stats(url)
         results = [await worker.result() for worker in workers]
     return figures(results, seconds, before, after, rss_mb)
-
-
-class Worker:
-    """The other end of a `_swarm.py`."""
-
-    def __init__(self, process: Process) -> None:
-        self._process = process
-        self.playing = 0
-        self.ended: list[dict[str, Any]] = []
-        self.dead = False
-        self._result: dict[str, Any] | None = None
-        self._reading = asyncio.create_task(self._read())
-
-    async def tell(self, command: str) -> None:
-        assert self._process.stdin is not None
-        with contextlib.suppress(ConnectionError):  # it is dead: its result will say so
-            self._process.stdin.write(f"{command}\n".encode())
-            await self._process.stdin.drain()
-
-    async def result(self) -> dict[str, Any]:
-        """What its bots counted.
-
-        Raises:
-            CannotStartError: the process died.
-        """
-        with contextlib.suppress(TimeoutError):
-            await asyncio.wait_for(self._reading, JOIN_S_MAX)
-        if self._result is None:
-            raise CannotStartError("a process of bots died")
-        return self._result
-
-    async def _read(self) -> None:
-        assert self._process.stdout is not None
-        while line := await self._process.stdout.readline():
-            told = json.loads(line)
-            if "clients" in told:
-                self._result = told
-            else:
-                self.playing, self.ended = told["playing"], told["ended"]
-        self.dead = self._result is None
-
-
-@contextlib.asynccontextmanager
-async def child(*command: str, patience_s: float = 0.0) -> AsyncIterator[Process]:
-    """A process that has ended when this has, whatever happens. Ctrl-C goes to this process alone.
-
-    At the end its input is closed, which ends bots; after `patience_s` it gets SIGTERM, which ends a server.
-    """
-    process = await asyncio.create_subprocess_exec(
-        *(sys.executable, *command),
-        cwd=ROOT,
-        stdin=asyncio.subprocess.PIPE,
-        stdout=asyncio.subprocess.PIPE,
-        limit=LINE_BYTES_MAX,
-        start_new_session=True,
-    )
-    assert process.stdin is not None
-    try:
-        yield process
-    finally:
-        try:
-            process.stdin.close()
-            if not await ended(process, patience_s):
-                process.terminate()
-                await ended(process, END_S)
-        finally:
-            if process.returncode is None:
-                process.kill()
-                await process.wait()
-
-
-async def ended(process: Process, seconds: float) -> bool:
-    """Waits for a process to end, at most so long; whether it has."""
-    with contextlib.suppress(TimeoutError):
-        await asyncio.wait_for(process.wait(), seconds)
-    return process.returncode is not None
-
-
-@contextlib.asynccontextmanager
-async def own_server(args: argparse.Namespace) -> AsyncIterator[tuple[Process, str]]:
-    """A server on a port that the system picks, once it listens."""
-    rate = ("--tick-rate", str(args.tick_rate)) if args.tick_rate else ()
-    command = ("-m", "server", "--host", "127.0.0.1", "--port", "0", "--scene", args.scene, "--log-level", "warning")
-    async with child(*command, *rate) as server:
-        assert server.stdout is not None
-        line = ""
-        with contextlib.suppress(TimeoutError):
-            line = (await asyncio.wait_for(server.stdout.readline(), START_S_MAX)).decode()
-        if not line.startswith("listening on "):
-            raise CannotStartError("the server did not start")
-        yield server, line.removeprefix("listening on ").strip()
 
 
 def orders(args: argparse.Namespace, url: str) -> list[tuple[str, str]]:
@@ -219,51 +159,6 @@ def orders(args: argparse.Namespace, url: str) -> list[tuple[str, str]]:
         found.append((str(ROOT / "scripts" / "_swarm.py"), json.dumps(order)))
         first += clients
     return found
-
-
-async def stats(url: str) -> Figures:
-    """The server's `/stats`; empty if it does not tell."""
-
-    def get() -> Figures:
-        address = urlsplit(url)
-        kind = http.client.HTTPSConnection if address.scheme == "wss" else http.client.HTTPConnection
-        connection = kind(address.hostname or "", address.port, timeout=5)
-        try:
-            connection.request("GET", "/stats")
-            response = connection.getresponse()
-            return dict(json.loads(response.read())) if response.status == 200 else {}
-        except (OSError, ValueError, http.client.HTTPException):
-            return {}
-        finally:
-            connection.close()
-
-    return await asyncio.to_thread(get)
-
-
-class Stage:
-    """What goes on right now: a bar on a terminal, otherwise one line for each stage."""
-
-    def __init__(self, console: Console) -> None:
-        columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
-        self._progress = Progress(*columns, console=console, transient=True, disable=not console.is_terminal)
-        self._console = console
-
-    def __enter__(self) -> "Stage":
-        self._progress.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._progress.stop()
-
-    def begin(self, text: str, total: float) -> None:
-        if not self._console.is_terminal:
-            self._console.print(f"{text} ...")
-        for task in self._progress.task_ids:
-            self._progress.remove_task(task)
-        self._task = self._progress.add_task(text, total=total)
-
-    def at(self, done: float) -> None:
-        self._progress.update(self._task, completed=done)
 
 
 def show(measured: Figures, args: argparse.Namespace, console: Console) -> None:
@@ -280,6 +175,8 @@ def show(measured: Figures, args: argparse.Namespace, console: Console) -> None:
             console.print(f"{mark}  {judgement.text}", highlight=False, soft_wrap=True)
         bad = sum(not judgement.good for judgement in judgements)
         console.print("all is well" if not bad else f"{bad} of {len(judgements)} not as it should be", style="bold")
+    elif held_up := bottleneck(measured):
+        console.print(held_up, style="yellow", highlight=False, soft_wrap=True)
     for failure in measured["failures"]:
         console.print(f"failed: {failure}", style="red", highlight=False, soft_wrap=True)
 
@@ -308,6 +205,9 @@ async def until_signal(args: argparse.Namespace, console: Console) -> int:
     except CannotStartError as error:
         console.print(f"error: {error}", style="red", highlight=False, soft_wrap=True)
         return 2
+    except DiedError as error:
+        console.print(f"failed: {error}", style="red", highlight=False, soft_wrap=True)
+        return 1
 
 
 def main(argv: list[str] | None = None) -> int:

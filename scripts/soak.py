@@ -29,8 +29,8 @@ from typing import Any
 from rich.console import Console
 from rich.progress import Progress
 
+from _processes import CannotStartError, stats
 from _soakers import Cells, Honest
-from loadtest import CannotStartError, stats
 from server.store import Store
 from shared.scene import load_scene
 from shared.world import World

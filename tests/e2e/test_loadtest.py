@@ -1,9 +1,11 @@
 """The load test as it is called: real processes, real sockets."""
 
 import json
+import os
 import signal
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -11,6 +13,7 @@ import pytest
 from tests.client_sdk.servers import real_server
 
 pytestmark = pytest.mark.e2e
+needs_linux = pytest.mark.skipif(sys.platform != "linux", reason="looks for processes in /proc")
 
 ROOT = Path(__file__).resolve().parents[2]
 KEYS = """clients seconds tick_rate server_ticks tick_lateness_ms snapshots_per_client_per_s inputs_sent
@@ -38,6 +41,9 @@ def test_all_clients_play_and_the_figures_are_there(tmp_path: Path) -> None:
     assert set(figures["tick_lateness_ms"]) == set(figures["correction_blocks"]) == {"p50", "p99", "max"}
     assert len(figures["server_rss_mb"]) >= 2
     assert figures["server_exit_code"] == 0
+    assert [bots["clients"] for bots in figures["bots"]] == [5, 5]
+    assert all(set(bots["lag_ms"]) == {"p50", "p99", "max"} for bots in figures["bots"])
+    assert "     1 s  clients 10, ticks " in done.stdout
     assert "10 of 10 clients got at least 95 % of their snapshots" in done.stdout
 
 
@@ -80,22 +86,47 @@ def test_a_broken_scene_is_one_clear_line() -> None:
     assert "Traceback" not in done.stdout + done.stderr
 
 
-@pytest.mark.skipif(sys.platform != "linux", reason="looks for processes in /proc")
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_leaves_nothing_behind(number: signal.Signals) -> None:
-    command = [sys.executable, "-u", "scripts/loadtest.py", "--clients", "3", "--seconds", "60"]
+@pytest.fixture
+def playing() -> Iterator[tuple["subprocess.Popen[str]", dict[int, str]]]:
+    """A load test in the midst of it: its process, and those that it has started, with their commands."""
+    command = [sys.executable, "-u", "scripts/loadtest.py", "--clients", "4", "--processes", "2", "--seconds", "60"]
     with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True) as process:
         try:
             assert process.stdout is not None
             for line in process.stdout:
-                if "3 play" in line:
+                if "4 play" in line:
                     break
-            children = Path(f"/proc/{process.pid}/task/{process.pid}/children")
-            started = children.read_text().split()
-            assert len(started) == 2
-            process.send_signal(number)
-            assert process.wait(20) == 130
+            pids = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()
+            started = {int(pid): Path(f"/proc/{pid}/cmdline").read_text() for pid in pids}
+            assert sorted("_swarm.py" in command for command in started.values()) == [False, True, True]
+            yield process, started
         finally:
             if process.poll() is None:
                 process.kill()
-    assert not [pid for pid in started if Path(f"/proc/{pid}").exists()]
+    left = [pid for pid in started if Path(f"/proc/{pid}").exists()]
+    for pid in left:
+        os.kill(pid, signal.SIGKILL)
+    assert not left
+
+
+@needs_linux
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_leaves_nothing_behind(
+    playing: tuple["subprocess.Popen[str]", dict[int, str]], number: signal.Signals
+) -> None:
+    process, _ = playing
+    process.send_signal(number)
+    assert process.wait(20) == 130
+
+
+@needs_linux
+@pytest.mark.parametrize(("killed", "name"), [("_swarm.py\0", "a process of bots"), ("-m\0server\0", "the server")])
+def test_the_death_of_a_process_ends_it_at_once_with_nothing_left_behind(
+    playing: tuple["subprocess.Popen[str]", dict[int, str]], killed: str, name: str
+) -> None:
+    process, started = playing
+    os.kill(next(pid for pid, command in started.items() if killed in command), signal.SIGKILL)
+    out, _ = process.communicate(timeout=20)  # of the 60 s that it was to last
+    assert process.returncode == 1
+    assert f"failed: {name} ended in the middle, with -9" in out
+    assert "Traceback" not in out
