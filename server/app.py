@@ -229,7 +229,7 @@ def saved(scene: Scene, settings: Settings) -> Iterator[Store]:
     """
     assert settings.data is not None
     power = settings.durability == "power"
-    store = Store(settings.data, scene, power=power, checkpoint_s=settings.checkpoint_s)
+    store = Store(settings.data, scene, game=settings.game or "", power=power, checkpoint_s=settings.checkpoint_s)
     tick, state_hash = store.restored
     logger.info("restored", directory=settings.data, tick=tick, state_hash=state_hash)
     try:

@@ -1,12 +1,13 @@
 """The file of a saved world, in SQLite: its schema, how one schema becomes the next, and what is refused.
 
-    world      one row: the newest checkpoint, without its blocks
+    world      one row: the newest checkpoint, without its blocks, and which game it is of (NULL: not known)
     segment    every loaded segment as of that checkpoint; kinds is NULL where they are as the generator makes them
     log        what each tick since then was told: the record that a recording has for it (`server.journal`)
 
 `chain` is the CRC-32 of a record, begun with the one before (the first one: with the checkpoint's), so no record can
 be lost, doubled or changed in between. `seal` is a BLAKE2b of the checkpoint's columns but for the states: those and
-the segments are what `hash`, the world's own, is about. While a server runs, anyone may read the file with SQLite.
+the segments are what `hash`, the world's own, is about; and but for the game, which may get another name. While a
+server runs, anyone may read the file with SQLite.
 """
 
 import contextlib
@@ -36,6 +37,7 @@ MIGRATIONS: list[tuple[str, ...]] = [
         "CREATE TABLE log (tick INTEGER PRIMARY KEY, record BLOB NOT NULL, chain INTEGER NOT NULL)",
         f"PRAGMA application_id = {APPLICATION_ID}",
     ),
+    ("ALTER TABLE world ADD COLUMN game TEXT",),
 ]
 """Entry n takes schema version n to n + 1; version 0 is an empty file."""
 
@@ -69,6 +71,7 @@ class Saved(NamedTuple):
 
     checkpoint: Checkpoint
     scene: bytes
+    game: str | None
     chain: int
     log: list[Record]
 
@@ -110,14 +113,15 @@ def read(path: Path) -> Saved | None:
         StoreError: it is damaged.
     """
     with _reading(path) as connection:
-        row = connection.execute("SELECT tick, next_id, states, hash, kept, chain, scene, seal FROM world").fetchone()
+        columns = "tick, next_id, states, hash, kept, chain, scene, seal, game"
+        row = connection.execute(f"SELECT {columns} FROM world").fetchone()
         segments = connection.execute("SELECT x, y, z, kinds, digest FROM segment ORDER BY z, y, x").fetchall()
         log = [Record(*each) for each in connection.execute("SELECT tick, record, chain FROM log ORDER BY tick")]
         if row is None:
             if segments or log:
                 raise damaged(path, "it has no checkpoint")
             return None
-        tick, next_id, states, checked, kept, chain, scene, seal = row
+        tick, next_id, states, checked, kept, chain, scene, seal, game = row
         checkpoint = Checkpoint(tick, next_id, states, checked, kept, segments, [])
         if seal != _seal(checkpoint, scene, chain):
             raise damaged(path, "the checkpoint does not match its seal")
@@ -126,7 +130,7 @@ def read(path: Path) -> Saved | None:
             found = chained(record.record, found)
             if found != record.chain:
                 raise damaged(path, f"tick {record.tick} of the log does not match its check")
-        return Saved(checkpoint, scene, chain, log)
+        return Saved(checkpoint, scene, game, chain, log)
 
 
 class Database:
@@ -162,13 +166,13 @@ class Database:
         with self._transaction():
             self._connection.executemany("INSERT INTO log VALUES (?, ?, ?)", records)
 
-    def save(self, checkpoint: Checkpoint, scene: bytes, chain: int) -> None:
+    def save(self, checkpoint: Checkpoint, scene: bytes, chain: int, game: str) -> None:
         """Replaces the checkpoint, and drops the log up to it, all or nothing."""
         seal = _seal(checkpoint, scene, chain)
         with self._transaction():
             self._connection.execute(
-                "INSERT OR REPLACE INTO world VALUES (1, ?, ?, ?, ?, ?, ?, ?, ?)",
-                (*checkpoint[:5], chain, scene, seal),
+                "INSERT OR REPLACE INTO world VALUES (1, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
+                (*checkpoint[:5], chain, scene, seal, game),
             )
             self._connection.executemany(
                 "INSERT OR REPLACE INTO segment VALUES (?, ?, ?, ?, ?)",

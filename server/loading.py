@@ -36,7 +36,7 @@ class Loaded(NamedTuple):
     log_bytes: int
 
 
-def load(path: Path, scene: Scene, *, compiled: bool | None = None) -> Loaded:
+def load(path: Path, scene: Scene, game: str = "", *, compiled: bool | None = None) -> Loaded:
     """The world that was saved, checkpoint and log, each tick compared; or a new one, which is saved at once.
 
     Raises:
@@ -49,7 +49,12 @@ def load(path: Path, scene: Scene, *, compiled: bool | None = None) -> Loaded:
         logger.info("%s: brought from schema version %d to %d", path, version, len(database.MIGRATIONS))
     saved = database.read(path) if version else None
     if saved is None:
-        return _new(path, scene, compiled)
+        return _new(path, scene, game, compiled)
+    if saved.game is not None and saved.game != game:
+        raise StoreError(
+            f"{path}: was saved by {_served(saved.game)}, and this is {_served(game)}. Serve the same, or give another "
+            "directory"
+        )
     try:
         theirs = Scene.from_table(msgpack.unpackb(saved.scene, strict_map_key=False)).digests
         differ = sorted(name for name in theirs | scene.digests if theirs.get(name) != scene.digests.get(name))
@@ -70,11 +75,15 @@ def load(path: Path, scene: Scene, *, compiled: bool | None = None) -> Loaded:
         raise database.damaged(path, error) from error
 
 
-def _new(path: Path, scene: Scene, compiled: bool | None) -> Loaded:
+def _served(game: str) -> str:
+    return f"a server of the game {game}" if game else "a server without a game"
+
+
+def _new(path: Path, scene: Scene, game: str, compiled: bool | None) -> Loaded:
     world, first = checkpoint.generated(scene, compiled=compiled)
     file = Database(path)
     try:
-        file.save(first, msgpack.packb(scene.to_table()), 0)
+        file.save(first, msgpack.packb(scene.to_table()), 0, game)
     finally:
         file.close()
     return Loaded(world, None, [], world.tick, 0, 0)

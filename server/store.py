@@ -73,6 +73,7 @@ class Store(Pen):
     Args:
         directory: made if it is not there.
         scene: the rules; they must be those that the world was saved with.
+        game: so must the game be, MODULE:CLASS; empty: none.
         power: whether a verdict waits until it survives a power cut (an fsync), or just the end of the process.
         checkpoint_s: a checkpoint so often, in seconds of the world's time.
         compiled: as for `World`.
@@ -91,13 +92,14 @@ class Store(Pen):
         directory: str | Path,
         scene: Scene,
         *,
+        game: str = "",
         power: bool = True,
         checkpoint_s: float = 60.0,
         compiled: bool | None = None,
     ) -> None:
         super().__init__(first=False, hashed_max=HASHED_MAX)
         self._path = Path(directory) / "world.db"
-        self._rules = msgpack.packb(scene.to_table())
+        self._rules, self._game = msgpack.packb(scene.to_table()), game
         self._power = power
         self._checkpoint_ticks = max(1, round(checkpoint_s * scene.tick_rate))
         self.trouble = ""
@@ -117,7 +119,7 @@ class Store(Pen):
         self._urgent = self._closing = self._copy_due = self._gap = False
         self._claim = claimed(self._path.parent)
         try:
-            loaded = load(self._path, scene, compiled=compiled)
+            loaded = load(self._path, scene, game, compiled=compiled)
             self._file: Database | None = Database(self._path, power=power)
             self._saved = self._file.digests()
         except sqlite3.Error as error:
@@ -282,7 +284,7 @@ class Store(Pen):
 
     def _save(self, file: Database, copy: Copy, checkpoint: Checkpoint, chain: int) -> None:
         """Puts a checkpoint on disk; the gap before it, if there was one, is closed."""
-        file.save(checkpoint, self._rules, chain)
+        file.save(checkpoint, self._rules, chain, self._game)
         self._saved = copy.digests
         self._written = max(self._written, copy.tick)
         self._log_bytes = 0

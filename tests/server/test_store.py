@@ -207,8 +207,9 @@ def test_what_cannot_be_used_is_refused_and_left_as_it_is(opened: Callable[..., 
         altered(tmp_path / name, *statements)
         return tmp_path / name
 
-    said = refused(bad("newer", "PRAGMA user_version = 2"))
-    assert "world.db: in schema version 2, and this program knows those up to 1" in said
+    newest = len(database.MIGRATIONS)
+    said = refused(bad("newer", f"PRAGMA user_version = {newest + 1}"))
+    assert f"world.db: in schema version {newest + 1}, and this program knows those up to {newest}" in said
     assert "newer one" in said
     assert "not a saved world" in refused(bad("foreign", "PRAGMA application_id = 1"))
     for name, statement in {
@@ -256,6 +257,34 @@ def test_a_replay_that_comes_out_otherwise_says_what_to_do(
     assert "replayed otherwise than it was played (tick 31: the entities" in refused(copy)
 
 
+def test_a_world_belongs_to_its_game(tmp_path: Path) -> None:
+    def opens(game: str, directory: Path = tmp_path) -> bool:
+        return Store(directory, SCENE, game=game, compiled=False).close()
+
+    assert opens("tag:Tag")
+    assert opens("tag:Tag")
+    with pytest.raises(StoreError, match=r"was saved by a server of the game tag:Tag, and this is .* of the game a:B"):
+        opens("a:B")
+    with pytest.raises(StoreError, match=r"was saved by a server of the game tag:Tag, and this is .* without a game"):
+        opens("")
+    assert opens("", tmp_path / "plain")
+    with pytest.raises(StoreError, match=r"was saved by a server without a game, and this is .* of the game a:B"):
+        opens("a:B", tmp_path / "plain")
+    altered(tmp_path, "UPDATE world SET game = 'tags:Tag'")  # as docs/server.md says where it has another name now
+    assert opens("tags:Tag")
+
+
+def test_a_world_of_the_first_schema_takes_the_game_that_comes(tmp_path: Path) -> None:
+    assert Store(tmp_path, SCENE, compiled=False).close()
+    altered(tmp_path, "ALTER TABLE world DROP COLUMN game", "PRAGMA user_version = 1")
+    store = Store(tmp_path, SCENE, game="a:B", compiled=False)
+    store.start(keep)
+    store.world.step()
+    assert store.close()
+    with pytest.raises(StoreError, match="was saved by a server of the game a:B"):
+        Store(tmp_path, SCENE, compiled=False)
+
+
 def test_an_older_schema_is_migrated(
     opened: Callable[..., Store], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -268,7 +297,7 @@ def test_an_older_schema_is_migrated(
     assert (again.world.tick, again.world.state_hash()) == last
     again.close()
     with closing(sqlite3.connect(tmp_path / "data" / "world.db")) as connection:
-        assert connection.execute("PRAGMA user_version").fetchone() == (2,)
+        assert connection.execute("PRAGMA user_version").fetchone() == (len(database.MIGRATIONS),)
         assert [row[1] for row in connection.execute("PRAGMA table_info(log)")][-1] == "extra"
 
 

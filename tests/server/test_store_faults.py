@@ -139,9 +139,9 @@ class Disk:
                 disk.touched()
                 super().append(records)
 
-            def save(self, checkpoint: Any, scene: bytes, chain: int) -> None:
+            def save(self, checkpoint: Any, scene: bytes, chain: int, game: str) -> None:
                 disk.touched()
-                super().save(checkpoint, scene, chain)
+                super().save(checkpoint, scene, chain, game)
 
         monkeypatch.setattr(stores, "Database", OnDisk)
         monkeypatch.setattr(stores, "RETRY_S", 0.01)
