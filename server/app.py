@@ -3,6 +3,7 @@
 import asyncio
 import contextlib
 import dataclasses
+import errno
 import gc
 import os
 import signal
@@ -23,7 +24,7 @@ from server.door import Door
 from server.game import Game
 from server.gateway import Gateway
 from server.histogram import Histogram
-from server.kinds import SettingsError
+from server.kinds import SettingsError, nearest
 from server.live import Live
 from server.metrics import metrics_page
 from server.pages import Pages, json_page, ready_page
@@ -52,8 +53,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         signal.signal(number, _leave)  # until the event loop takes over
     arguments = sys.argv[1:] if arguments is None else arguments
     try:
-        if arguments and arguments[0] in COMMANDS:
-            return COMMANDS[arguments[0]](arguments[1:])
+        if arguments and not arguments[0].startswith("-"):
+            return command(arguments[0])(arguments[1:])
         settings = parse(arguments)
         if isinstance(settings, str):
             print(settings, end="")
@@ -62,6 +63,20 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except (SettingsError, SceneError, StoreError, RulesError) as error:
         print("error:", *str(error).split(), file=sys.stderr)
         return 2
+
+
+def command(name: str) -> Callable[[Sequence[str]], int]:
+    """One of the other commands.
+
+    Raises:
+        SettingsError: there is none of that name.
+    """
+    if name not in COMMANDS:
+        there = " and ".join(COMMANDS)
+        raise SettingsError(
+            f"{name!r}: no such command{nearest(name, COMMANDS)}; there are {there}, or just flags (--help)"
+        )
+    return COMMANDS[name]
 
 
 def run(settings: Settings) -> int:
@@ -203,8 +218,10 @@ class Server:
         try:
             return await self.gateway.listen(host, port, tls)
         except (OSError, UnicodeError) as error:  # UnicodeError: a host that is no host name at all
-            reason = getattr(error, "strerror", None) or str(error)
-            raise SettingsError(f"host = {host!r}, port = {port}: cannot listen ({reason})") from error
+            reason = f"cannot listen ({getattr(error, 'strerror', None) or error})"
+            if getattr(error, "errno", None) == errno.EADDRINUSE:
+                reason = "in use by another program, so end that one or choose another --port (0: any that is free)"
+            raise SettingsError(f"host = {host!r}, port = {port}: {reason}") from error
 
     def _end(self, reason: str, code: int) -> None:
         if self._stop is not None and not self._stop.done():

@@ -1,6 +1,5 @@
 """`python -m server check`: whether a server is ready, as an exit code, for containers and service managers."""
 
-import argparse
 import http.client
 import os
 import ssl
@@ -8,7 +7,7 @@ import urllib.error
 import urllib.request
 from collections.abc import Mapping, Sequence
 
-from server.kinds import SettingsError
+from server.kinds import Parser, SettingsError
 
 TIME_OUT_S = 3.0
 
@@ -21,14 +20,12 @@ def main(arguments: Sequence[str], environment: Mapping[str, str] = os.environ) 
     """
     port = environment.get("SOVEREIGN_PORT", "8765")
     scheme = "https" if "SOVEREIGN_TLS_CERT" in environment else "http"
-    parser = argparse.ArgumentParser(
+    parser = Parser(
         prog="python -m server check", description="Exit code 0 if the server is ready for players.", allow_abbrev=False
     )
     default = f"{scheme}://127.0.0.1:{port}/readyz"
-    parser.add_argument("--url", default=default, help=f"what to ask (default: {default})")
-    url = parser.parse_args(arguments).url
-    if not url.startswith(("http://", "https://")):
-        raise SettingsError(f"url = {url!r}: must begin with http:// or https://")
+    parser.add_argument("--url", default=default, help=f"what to ask, or just ws://HOST:PORT (default: {default})")
+    url = page(parser.flags(arguments)["url"])
     # It asks whether the server works, often by another name than the one in its certificate: nothing is kept secret.
     trusting = ssl.create_default_context()
     trusting.check_hostname, trusting.verify_mode = False, ssl.CERT_NONE
@@ -43,3 +40,13 @@ def main(arguments: Sequence[str], environment: Mapping[str, str] = os.environ) 
     except (OSError, ValueError, http.client.HTTPException) as error:
         print(f"no answer from {url} ({getattr(error, 'reason', None) or error})")
     return 1
+
+
+def page(url: str) -> str:
+    """The address of a page: of `/readyz` where none is named, also for an address that players use."""
+    scheme, colon, rest = url.partition("://")
+    scheme = {"ws": "http", "wss": "https"}.get(scheme, scheme)
+    host, _, path = rest.partition("/")
+    if scheme not in ("http", "https") or not host:
+        raise SettingsError(f"url = {url!r}: must be like ws://HOST:PORT, wss://, http:// or https://")
+    return f"{scheme}{colon}{host}/{path or 'readyz'}"

@@ -1,8 +1,11 @@
 """What a setting may be, and how its value is checked; every mistake names the setting, the value and its origin."""
 
+import argparse
+import difflib
 import math
+from collections.abc import Iterable, Sequence
 from dataclasses import field, fields
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, NoReturn
 
 
 class SettingsError(ValueError):
@@ -19,6 +22,37 @@ class Kind(NamedTuple):
     low: float = 0
     high: float = 0
     choices: tuple[str, ...] = ()
+
+
+class Parser(argparse.ArgumentParser):
+    """One line for a mistake, not the usage and then a line."""
+
+    def flags(self, arguments: Sequence[str]) -> dict[str, Any]:
+        """What the flags say, by name.
+
+        Raises:
+            SettingsError: they cannot be used.
+            SystemExit: after `--help`.
+        """
+        found, rest = self.parse_known_args(arguments)
+        if rest:
+            meant = nearest(rest[0].partition("=")[0], self._option_string_actions, "--")
+            self.error(f"unrecognized arguments: {' '.join(rest)}{meant}")
+        return vars(found)
+
+    def error(self, message: str) -> NoReturn:
+        """Instead of the end of the program."""
+        raise SettingsError(f"{message}; --help lists all flags")
+
+
+def nearest(name: str, known: Iterable[str], prefix: str = "") -> str:
+    """A word on which of these may have been meant, to go behind a mistake; empty if none is similar.
+
+    Args:
+        prefix: what all begin with, and what does not make them similar.
+    """
+    found = difflib.get_close_matches(name.removeprefix(prefix), [each.removeprefix(prefix) for each in known], 1)
+    return f" (did you mean {prefix}{found[0]}?)" if found else ""
 
 
 def setting(default: Any, kind: Kind) -> Any:

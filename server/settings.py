@@ -8,10 +8,10 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import takewhile
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
 from server.door import is_loopback
-from server.kinds import Kind, SettingsError, checked, kinds_of, setting, to_toml
+from server.kinds import Kind, Parser, SettingsError, checked, kinds_of, nearest, setting, to_toml
 from server.limits import Limits
 from server.log import FORMATS
 from server.tokens import KEY_VARIABLE
@@ -20,6 +20,7 @@ from shared.scene import SCENES, TICK_RATE_MAX, load_scene
 from shared.units import SEGMENT
 
 ENV_PREFIX = "SOVEREIGN_"
+CONFIG_VARIABLE = ENV_PREFIX + "CONFIG"
 ADDRESSES = ("none", "loopback", "private", "all")
 LOG_LEVELS = ("debug", "info", "warning", "error")
 
@@ -114,6 +115,8 @@ GROUPS = {
 SECTIONS: dict[str, dict[str, Kind]] = {"": kinds_of(Settings), "limits": kinds_of(Limits)}
 """The settings by the table of a TOML file that they stand in. Names are unique, wherever they stand."""
 KINDS: dict[str, Kind] = {name: kind for names in SECTIONS.values() for name, kind in names.items()}
+VARIABLES = [*(ENV_PREFIX + name.upper() for name in KINDS), CONFIG_VARIABLE, KEY_VARIABLE]
+"""What is read from the environment; others that begin like these are mistakes."""
 DEFAULTS: dict[str, Any] = {f.name: f.default for owner in (Settings, Limits) for f in dataclasses.fields(owner)}
 
 
@@ -137,6 +140,11 @@ def load(flags: Mapping[str, str], environment: Mapping[str, str], config: str |
     if config is not None:
         for name, value in _entries(config):
             take(name, value, f"file {config}")
+    for variable in environment:
+        if variable.startswith(ENV_PREFIX) and variable not in VARIABLES:
+            raise SettingsError(
+                f"{variable}: there is no such setting{nearest(variable.upper(), VARIABLES, ENV_PREFIX)}"
+            )
     for name in KINDS:
         variable = ENV_PREFIX + name.upper()
         if variable in environment:
@@ -174,8 +182,8 @@ def _entries(config: str) -> Iterator[tuple[str, object]]:
         known, place = SECTIONS[section], f"[{section}] in " if section else ""
         for name, value in table.items():
             if name not in known:
-                there = ", ".join(known)
-                raise SettingsError(f"{name} (from {place}file {config}): no such setting (there are {there})")
+                hint = nearest(name, known) or f" (there are {', '.join(known)})"
+                raise SettingsError(f"{name} (from {place}file {config}): no such setting{hint}")
             yield name, value
 
 
@@ -188,13 +196,6 @@ def _read(path: str) -> dict[str, Any]:
         raise SettingsError(f"config = {path!r}: not valid TOML ({error})") from error
 
 
-class _Parser(argparse.ArgumentParser):
-    """One line for a mistake, not the usage and then a line."""
-
-    def error(self, message: str) -> NoReturn:
-        raise SettingsError(f"{message}; --help lists all flags")
-
-
 def parse(arguments: Sequence[str], environment: Mapping[str, str] = os.environ) -> Settings | str:
     """The settings, or the text that the operator asked for instead (`--list-scenes`, `--print-config`).
 
@@ -202,7 +203,7 @@ def parse(arguments: Sequence[str], environment: Mapping[str, str] = os.environ)
         SettingsError: see `load`; also for flags that do not exist.
         SystemExit: after `--help`.
     """
-    parser = _Parser(
+    parser = Parser(
         prog="python -m server",
         usage="%(prog)s [options]",
         description=DESCRIPTION,
@@ -223,14 +224,14 @@ def parse(arguments: Sequence[str], environment: Mapping[str, str] = os.environ)
                 help=kind.help + ("" if default in (None, ()) else f" (default: {str(default).lower()})"),
                 default=argparse.SUPPRESS,
             )
-    parser.add_argument("--config", metavar="FILE", help=f"TOML file with settings (or {ENV_PREFIX}CONFIG)")
+    parser.add_argument("--config", metavar="FILE", help=f"TOML file with settings (or {CONFIG_VARIABLE})")
     parser.add_argument("--list-scenes", action="store_true", help="print the built-in scenes and exit")
     parser.add_argument("--print-config", action="store_true", help="print the settings in force and exit")
-    flags = vars(parser.parse_args(arguments))
+    flags = parser.flags(arguments)
     config, listing, printing = (flags.pop(name) for name in ("config", "list_scenes", "print_config"))
     if listing:
         return list_scenes()
-    settings = load(flags, environment, config or environment.get(ENV_PREFIX + "CONFIG"))
+    settings = load(flags, environment, config or environment.get(CONFIG_VARIABLE))
     return settings.to_toml() if printing else settings
 
 

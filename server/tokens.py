@@ -1,6 +1,5 @@
 """Signed tokens (JWT, HS256) with a subject and an expiry: who may come in, until when; and issuing them."""
 
-import argparse
 import json
 import math
 import os
@@ -12,7 +11,7 @@ from typing import Any
 import jwt
 
 from server.auth import SUBJECT_MAX, AuthError
-from server.kinds import SettingsError
+from server.kinds import Parser, SettingsError
 
 ALGORITHM = "HS256"
 KEY_BYTES_MIN = 32
@@ -120,7 +119,7 @@ def main(arguments: Sequence[str], environment: Mapping[str, str] = os.environ) 
     Raises:
         SettingsError: the key or an argument cannot be used.
     """
-    parser = argparse.ArgumentParser(
+    parser = Parser(
         prog="python -m server token", description="Issues a token that lets a player in.", allow_abbrev=False
     )
     parser.add_argument("--subject", required=True, help=f"who the player is, up to {SUBJECT_MAX} characters")
@@ -128,10 +127,11 @@ def main(arguments: Sequence[str], environment: Mapping[str, str] = os.environ) 
     parser.add_argument(
         "--auth-key-file", default=environment.get("SOVEREIGN_AUTH_KEY_FILE"), help=f"the key; or {KEY_VARIABLE}"
     )
-    given = parser.parse_args(arguments)
-    if not 0 < len(given.subject.strip()) <= SUBJECT_MAX >= len(given.subject):
-        raise SettingsError(f"subject = {given.subject!r}: must be a text of 1 to {SUBJECT_MAX} characters")
-    if not 0 < given.hours <= HOURS_MAX:
-        raise SettingsError(f"hours = {given.hours:g}: must be more than 0 and at most {HOURS_MAX}")
-    print(issue(read_key(given.auth_key_file, environment), given.subject, given.hours * 3600, time.time()))
+    flags = parser.flags(arguments)
+    subject, hours = flags["subject"], flags["hours"]
+    if not 0 < len(subject.strip()) <= SUBJECT_MAX >= len(subject):
+        raise SettingsError(f"subject = {subject!r}: must be a text of 1 to {SUBJECT_MAX} characters")
+    if not 0 < hours <= HOURS_MAX:
+        raise SettingsError(f"hours = {hours:g}: must be more than 0 and at most {HOURS_MAX}")
+    print(issue(read_key(flags["auth_key_file"], environment), subject, hours * 3600, time.time()))
     return 0

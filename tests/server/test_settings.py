@@ -85,8 +85,9 @@ def test_the_environment_can_name_the_file_and_the_flag_wins(tmp_path: Path) -> 
             {},
             "log_level = 'loud' (from --log-level): must be one of debug, info, warning, error",
         ),
-        (["--prot", "1"], {}, "unrecognized arguments: --prot 1; --help lists all flags"),
-        (["--tick", "1"], {}, "unrecognized arguments: --tick 1; --help lists all flags"),
+        (["--prot", "1"], {}, "unrecognized arguments: --prot 1 (did you mean --port?); --help lists all flags"),
+        (["--tick", "1"], {}, "unrecognized arguments: --tick 1"),
+        (["--zzz=1"], {}, "unrecognized arguments: --zzz=1; --help lists all flags"),
         (["--port"], {}, "argument --port: expected one argument; --help lists all flags"),
     ],
 )
@@ -98,9 +99,26 @@ def test_a_mistake_names_the_setting_its_origin_and_the_value(
     assert str(error.value).startswith(message)
 
 
+def test_a_variable_that_is_no_setting_is_named_with_the_one_that_may_have_been_meant() -> None:
+    known = {"SOVEREIGN_AUTH_KEY": "k" * 32, "SOVEREIGN": "1", "SOVEREIGNTY": "1", "OTHER_SOVEREIGN_X": "1"}
+    assert settings([], known).origins == {}
+    for variable, meant in {
+        "SOVEREIGN_PROT": " (did you mean SOVEREIGN_PORT?)",
+        "SOVEREIGN_TICKRATE": " (did you mean SOVEREIGN_TICK_RATE?)",
+        "SOVEREIGN_CONFG": " (did you mean SOVEREIGN_CONFIG?)",
+        "SOVEREIGN_port": " (did you mean SOVEREIGN_PORT?)",
+        "SOVEREIGN_": "",
+        "SOVEREIGN_URK": "",
+    }.items():
+        with pytest.raises(SettingsError) as error:
+            parse([], {variable: "1"})
+        assert str(error.value) == f"{variable}: there is no such setting{meant}"
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [
+        ("prot = 1", "prot (from file {path}): no such setting (did you mean port?)"),
         ('port = "8765"', "port = '8765' (from file {path}): must be a whole number from 0 to 65535"),
         ("port = true", "port = True (from file {path}): must be a whole number from 0 to 65535"),
         (
@@ -115,7 +133,7 @@ def test_a_mistake_names_the_setting_its_origin_and_the_value(
         ('allowed_origins = "a"', "allowed_origins = 'a' (from file {path}): must be a list of texts"),
         ("host = 1", "host = 1 (from file {path}): must be a text without spaces around it"),
         ("log_level = []", "log_level = [] (from file {path}): must be one of debug, info, warning, error"),
-        ("origins = {}", "origins (from file {path}): no such setting (there are host, port, "),
+        ("origins = {}", "origins (from file {path}): no such setting (did you mean allowed_origins?)"),
         ("port = ", "config = '{path}': not valid TOML ("),
         ("port = 1\nport = 2", "config = '{path}': not valid TOML ("),
     ],
