@@ -11,11 +11,13 @@ import json
 import math
 import queue
 import random
+import signal
 import subprocess
 import sys
 import tempfile
 import threading
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -102,6 +104,7 @@ class Rig:
         )
         told = {
             "clients": clients,
+            "seconds": after["uptime_s"] - before["uptime_s"],
             "held": held,
             "tick_lateness_ms": lateness,
             "ticks_share": ticks / RATE / (after["uptime_s"] - before["uptime_s"]),
@@ -115,13 +118,26 @@ class Rig:
         if "samples" in after:
             told["samples"] = {name: n - before["samples"][name] for name, n in after["samples"].items()}
         told["entities_in_view"] = after.get("entities_in_view")
-        for name in ("inputs_late", "inputs_used"):
+        for name in ("inputs_late", "inputs_used", "collections", "collections_cpu_s"):
             if name in after:
                 told[name] = after[name] - before[name]
+        for name in after:
+            if name.endswith("_counts"):
+                told[name] = sorted((Counter(dict(after[name])) - Counter(dict(before[name]))).items())
         return told | {f"generator_{name}" if name in ("cpu_share", "late_ms") else name: figures[name] for name in (
             "snapshot_age_ms", "inputs_per_client_per_s", "bytes_down_per_client_per_s", "bytes_up_per_client_per_s",
             "cpu_share", "late_ms",
         )}  # fmt: skip
+
+    def collect(self) -> float:
+        """Has the server collect all its garbage; the CPU time of that, in seconds. Not every kind of server can."""
+        self._server.send_signal(signal.SIGUSR1)
+        deadline = time.monotonic() + PATIENCE_S
+        while (taken := self.stats()["full_collection_s"]) is None:
+            if time.monotonic() > deadline:
+                raise RuntimeError("the server has not collected its garbage")
+            time.sleep(0.05)
+        return float(taken)
 
     def stats(self) -> Figures:
         connection = http.client.HTTPConnection("127.0.0.1", self.port, timeout=PATIENCE_S)

@@ -2,6 +2,10 @@
 
 _busy_server.py game SCENE         the product
 _busy_server.py profile SCENE      the product, its stack sampled by CPU time; /stats shows the seconds of each part
+_busy_server.py product SCENE      the product; /stats shows the CPU time of its ticks and of garbage collections
+_busy_server.py default SCENE      the same, but what is there after the start is not frozen
+_busy_server.py off SCENE          the same without a collector
+_busy_server.py asyncio SCENE      the same on asyncio's own event loop
 _busy_server.py echo SCENE BYTES   the product's gateway and ticker without a game: the bound. What comes is taken in
                                    unread; every tick each client is sent a message of so many bytes
 """
@@ -9,10 +13,11 @@ _busy_server.py echo SCENE BYTES   the product's gateway and ticker without a ga
 import asyncio
 import collections
 import functools
+import gc
 import signal
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from types import FrameType, FunctionType
 from typing import Any, cast
 
@@ -23,11 +28,13 @@ from server.delivery import Delivery
 from server.faults import Faults
 from server.game import Game
 from server.gateway import Connection
+from server.histogram import Histogram
 from server.replication import ChangeLog
 from server.rewind import Rewind
 from server.session import Link, Session
 from server.settings import Settings
 from server.warmup import warm_up
+from shared.inputs import Input
 from shared.layout import X
 from shared.messages import Hello, Ping, Pong, Welcome, decode_from_client, encode, join_snapshot
 from shared.scene import load_scene
@@ -123,6 +130,61 @@ class Profile:
         self._latest = now
 
 
+class Stopwatch:
+    """CPU time of a game's ticks, of what in them comes before the step, and of each garbage collection."""
+
+    def __init__(self, game: Game) -> None:
+        self.ticks, self.before_step, self.collections = Histogram(), Histogram(), Histogram()
+        self._plain_tick, self._plain_step = game.tick, game.world.step
+        self._tick_began = self._collection_began = 0.0
+        self.full_collection_s: float | None = None
+        """Of the one that SIGUSR1 has asked for."""
+        cast("Any", game).tick, cast("Any", game.world).step = self._tick, self._step
+        gc.callbacks.append(self._collect)
+        signal.signal(signal.SIGUSR1, lambda number, frame: self._collect_all())
+
+    def stats(self) -> dict[str, Any]:
+        return {
+            "tick_cpu_counts": self.ticks.counts(),
+            "before_step_cpu_counts": self.before_step.counts(),
+            "collection_cpu_counts": self.collections.counts(),
+            "collections_cpu_s": self.collections.sum_s,
+            "collections": self.collections.count,
+            "full_collection_s": self.full_collection_s,
+            "collecting": gc.isenabled(),
+            "frozen": gc.get_freeze_count(),
+            "loop": type(asyncio.get_running_loop()).__module__.partition(".")[0],
+        }
+
+    def _collect_all(self) -> None:
+        began = time.thread_time()
+        gc.collect()
+        self.full_collection_s = time.thread_time() - began
+
+    def _tick(self, deadline: float, now: float) -> None:
+        self._tick_began = time.thread_time()
+        self._plain_tick(deadline, now)
+        self.ticks.record(time.thread_time() - self._tick_began)
+
+    def _step(self, inputs: Mapping[int, Input] | None = None) -> None:
+        self.before_step.record(time.thread_time() - self._tick_began)
+        self._plain_step(inputs)
+
+    def _collect(self, phase: str, info: dict[str, int]) -> None:
+        if phase == "start":
+            self._collection_began = time.thread_time()
+        else:
+            self.collections.record(time.thread_time() - self._collection_began)
+
+
+VARIANTS: dict[str, tuple[str, Callable[[], Any]]] = {
+    "default": ("freeze", lambda: None),
+    "off": ("freeze", gc.disable),
+    "asyncio": ("_loop_factory", lambda: asyncio.new_event_loop),
+}
+"""What the product does otherwise, and what does it instead."""
+
+
 def in_view(game: Game) -> float:
     """Entities in the segments that a client sees, on average."""
     cells = game.world.states()[:, X : X + 3] >> (BLOCK_SHIFT + SEGMENT_SHIFT)
@@ -149,6 +211,10 @@ def main(argv: list[str]) -> int:
     made = Game(rules)
     plain_stats = made.stats
     more: list[Callable[[], dict[str, Any]]] = [lambda: {"entities_in_view": in_view(made)}]
+    if kind in ("product", *VARIANTS):
+        more.append(Stopwatch(made).stats)
+        if kind != "product":
+            setattr(app, *VARIANTS[kind])
     if kind == "profile":
         profile = Profile()
         more.append(lambda: {"samples": dict(profile.samples)})

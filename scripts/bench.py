@@ -9,6 +9,9 @@ work, ticks are late for their sake. The CPU time per client and tick is told as
 `server --crowd` puts 300 players (or N) into one segment instead, each seeing all: the fairness is what the worst
 served of them gets of what the best served gets.
 
+`jitter` tells how late the ticks of a server with 200 clients begin and how long they take, with garbage collection and
+event loop as the product has them and otherwise, in turns.
+
 `bytes` tells what one client is sent at 20 Hz while 100 entities (or N) move in its view, and that its copy of them is
 exact in every tick.
 
@@ -21,7 +24,6 @@ clients join.
 import argparse
 import itertools
 import json
-import os
 import statistics
 import sys
 from pathlib import Path
@@ -32,10 +34,11 @@ from rich.progress import Progress
 from rich.table import Table
 
 import _bench_bytes as wire
+import _bench_capacity as capacity
 import _bench_entities as entities
+import _bench_jitter as jitter
 import _bench_memory as memory
 import _bench_physics as physics
-import _bench_server as server
 import _step_c
 from _crowds import Samples
 from shared import kernels
@@ -136,107 +139,6 @@ def run_physics(args: argparse.Namespace, console: Console) -> int:
     return 0 if report["hash_equal_to_c"] is not False and report["obstacles_agree"] else 1
 
 
-def run_server(args: argparse.Namespace, console: Console) -> int:
-    seconds, resolution, steps, searches = (1.5, 0.2, 3, 1) if args.quick else (5.0, 0.04, 9, 3)
-    cores = os.cpu_count() or 1
-    runs: list[dict[str, Any]] = []
-    bounds: list[dict[str, Any]] = []
-    if args.crowd:
-        return run_crowd(args, console, seconds)
-
-    def report(stage: dict[str, Any]) -> None:
-        console.print(
-            f"  {stage['clients']:5} clients: {'held' if stage['held'] else 'not held'}, ticks late "
-            f"{stage['tick_lateness_ms']['p99']:.1f} ms (p99), worst client {stage['snapshots_share_worst']:.0%}, "
-            f"{stage['cpu_us_per_client_tick']:.1f} us, generator {stage['generator_cpu_share']:.0%}",
-            highlight=False,
-            soft_wrap=True,
-        )
-
-    for number in range(searches):
-        load = os.getloadavg()[0]
-        console.print(f"search {number + 1} of {searches}: the game (load of the machine before: {load:.1f})")
-        with server.rig("game", seed=number + 1) as running:
-            stages = server.search(running, 400, seconds, resolution, steps, report)
-        best = server.most(stages)
-        by = best or stages[-1]
-        cpu_us = statistics.median(
-            stage["cpu_us_per_client_tick"] for stage in stages if stage["ticks_share"] > 0.5 or stage is by
-        )
-        size = int(by["bytes_down_per_client_per_s"] / server.RATE)
-        console.print(f"  the same gateway without a game, {size} bytes a tick")
-        with server.rig("echo", str(size), seed=number + 1) as running:
-            first = int(0.5 * min(1e6 / server.RATE / cpu_us, server.CAPACITY)) if args.quick else 1000
-            echoed = server.search(running, first, seconds, resolution, 1 if args.quick else steps, report)
-        console.print("  the same on picows, which no game is played over: what another library could gain")
-        with server.rig(server.ECHO_PICOWS, str(size), seed=number + 1) as running:
-            picows = server.search(running, first, seconds, resolution, 1 if args.quick else steps, report)
-        shares = server.profile(max(50, by["clients"] // 2), seconds)
-        runs.append(
-            {
-                "gateway": "websockets",
-                "max_clients": best["clients"] if best else 0,
-                "cpu_us_per_client_tick": cpu_us,
-                "clients_by_cpu": int(1e6 / server.RATE / cpu_us),
-                **bound(echoed),
-                "parts": {name: share * cpu_us for name, share in shares.items()},
-                "entities_in_view": by["entities_in_view"],
-                "bytes_per_client_per_s": by["bytes_down_per_client_per_s"],
-                "snapshot_age_ms": by["snapshot_age_ms"],
-                "generator_cpu_share": by["generator_cpu_share"],
-                "generator_late_ms": by["generator_late_ms"],
-                "load_before": load,
-                "stages": stages,
-                "echo_stages": echoed,
-            }
-        )
-        bounds.append({"gateway": "picows", "max_clients": None, "load_before": load, **bound(picows)})
-    console.print(capacity_table(runs, bounds))
-    if max(run["load_before"] for run in runs) > cores / 2:
-        console.print("other processes were at work: the numbers of clients are too low, go by the CPU time")
-    if args.json:
-        report_ = {"quick": args.quick, "rate": server.RATE, "cores": cores, "runs": runs + bounds}
-        args.json.write_text(json.dumps(report_, indent=1) + "\n", encoding="utf-8")
-    return 0
-
-
-def bound(stages: list[dict[str, Any]]) -> dict[str, Any]:
-    """What a server that only echoes comes to."""
-    most = server.most(stages)
-    cpu_us = statistics.median(stage["cpu_us_per_client_tick"] for stage in stages)
-    return {
-        "echo_bound_clients": most["clients"] if most else 0,
-        "echo_cpu_us_per_client_tick": cpu_us,
-        "echo_clients_by_cpu": int(1e6 / server.RATE / cpu_us),
-    }
-
-
-def run_crowd(args: argparse.Namespace, console: Console, seconds: float) -> int:
-    """So many players in one segment, each seeing all."""
-    with server.rig("game", capacity=args.crowd, per_segment=args.crowd) as running:
-        stage = server.packed(running.hold(args.crowd, seconds))
-    made = Table("figure", title=f"server: {args.crowd} players in one segment, 30 Hz")
-    made.add_column("", justify="right")
-    for name, form in (
-        ("held", "{}"),
-        ("entities_in_view", "{:.0f}"),
-        ("cpu_us_per_client_tick", "{:.1f}"),
-        ("server_cpu_share", "{:.0%}"),
-        ("ticks_share", "{:.1%}"),
-        ("snapshots_share_worst", "{:.1%}"),
-        ("fairness", "{:.3f}"),
-        ("bytes_per_client_per_s", "{:,.0f}"),
-        ("generator_cpu_share", "{:.0%}"),
-    ):
-        made.add_row(name, "" if stage[name] is None else form.format(stage[name]))
-    console.print(made)
-    if args.json:
-        args.json.write_text(
-            json.dumps({"quick": args.quick, "rate": server.RATE, "crowd": stage}, indent=1) + "\n", "utf-8"
-        )
-    return 0
-
-
 def run_bytes(args: argparse.Namespace, console: Console) -> int:
     """What a client is sent, by how the others move; some of them pause, so there are more in view than move."""
     ticks, seeds = (200, 1) if args.quick else (600, 3)
@@ -285,30 +187,6 @@ def run_entities(args: argparse.Namespace, console: Console) -> int:
     return 0
 
 
-def capacity_table(runs: list[dict[str, Any]], bounds: list[dict[str, Any]]) -> Table:
-    made = Table("figure", title="server: 30 Hz, one process; each search apart")
-    for number in range(len(runs)):
-        made.add_column(f"search {number + 1}", justify="right")
-    for name, form in (
-        ("max_clients", "{:,}"),
-        ("echo_bound_clients", "{:,}"),
-        ("cpu_us_per_client_tick", "{:.1f}"),
-        ("echo_cpu_us_per_client_tick", "{:.1f}"),
-        ("clients_by_cpu", "{:,}"),
-        ("echo_clients_by_cpu", "{:,}"),
-        ("entities_in_view", "{:.0f}"),
-        ("bytes_per_client_per_s", "{:,.0f}"),
-        ("generator_cpu_share", "{:.0%}"),
-    ):
-        made.add_row(name, *("" if run[name] is None else form.format(run[name]) for run in runs))
-    for name, form in (("echo_cpu_us_per_client_tick", "{:.1f}"), ("echo_clients_by_cpu", "{:,}")):
-        made.add_row(f"picows: {name}", *(form.format(run[name]) for run in bounds))
-    made.add_section()
-    for part in sorted(runs[0]["parts"], key=lambda part: -runs[0]["parts"][part]):
-        made.add_row(f"us in {part}", *(f"{run['parts'][part]:.2f}" for run in runs))
-    return made
-
-
 def table(rows: list[Row]) -> Table:
     made = Table("figure", "unit", title="physics: per entity and tick, per tick, or per call")
     for heading in ("median", "range", "target"):
@@ -334,7 +212,7 @@ def main(argv: list[str] | None = None) -> int:
     command.add_argument(
         "--crowd", type=int, nargs="?", const=300, metavar="N", help="N players in one segment instead (300)"
     )
-    command.set_defaults(run=run_server)
+    command.set_defaults(run=capacity.run)
     command = commands.add_parser("bytes", help="what a client is sent")
     command.add_argument("--entities", type=int, default=100, metavar="N", help="how many of them move (100)")
     command.add_argument("--json", type=Path, metavar="OUT", help="write all figures to this file")
@@ -350,6 +228,12 @@ def main(argv: list[str] | None = None) -> int:
     command.add_argument("--seeds", type=int, default=2, metavar="N", help="runs (2)")
     command.add_argument("--json", type=Path, metavar="OUT", help="write all figures to this file")
     command.set_defaults(run=run_entities)
+    command = commands.add_parser("jitter", help="how late ticks are, by garbage collection and event loop (Linux)")
+    command.add_argument("--clients", type=int, default=200, metavar="N", help="that play (200)")
+    command.add_argument("--rounds", type=int, default=4, metavar="N", help="of 10 s for each variant (4)")
+    command.add_argument("--json", type=Path, metavar="OUT", help="write all figures to this file")
+    command.add_argument("--quick", action="store_true", help="one round of 3 s each, within a minute")
+    command.set_defaults(run=jitter.run)
     args = parser.parse_args(argv)
     return int(args.run(args, Console()))
 

@@ -10,6 +10,7 @@ import pytest
 from shared.scene import Scene
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "scripts"))
+import _bench_jitter as jitter
 import _bench_server as bench
 
 needs_linux = pytest.mark.skipif(sys.platform != "linux", reason="the generator polls with epoll")
@@ -74,3 +75,31 @@ def test_each_kind_of_server_holds_a_few_players(kind: str) -> None:
         assert stage["inputs_used"] > 0
     else:
         assert stage["bytes_per_client_per_s"] > 1000 * bench.RATE / 2
+
+
+@needs_linux
+@pytest.mark.slow
+@pytest.mark.e2e
+@pytest.mark.parametrize("kind", jitter.VARIANTS)
+def test_each_variant_of_the_product_differs_in_what_it_says_only(kind: str) -> None:
+    uvloop = pytest.importorskip("uvloop")
+    with bench.rig(kind, capacity=4, per_segment=4) as running:
+        running.hold(4, 0.5)
+        made = running.stats()
+        assert running.collect() > 0
+        assert running.stats()["collections"] > made["collections"]
+    assert made["collecting"] == (kind != "off")
+    assert (made["frozen"] > 10_000) == (kind in ("product", "asyncio"))
+    assert made["loop"] == ("asyncio" if kind == "asyncio" else uvloop.__name__)
+    assert sum(n for _, n in made["tick_cpu_counts"]) == sum(n for _, n in made["before_step_cpu_counts"]) > 15
+
+
+def test_a_variants_quantiles_are_of_all_its_rounds_together() -> None:
+    def played(lateness: list[list[int]]) -> bench.Figures:
+        times = {f"{name}_counts": lateness for name in jitter.TIMES}
+        return dict.fromkeys(jitter.FIGURES, 1.0) | times | {"snapshots_share_worst": 1.0, "generator_cpu_share": 0.2}
+
+    found = jitter.summary([played([[100, 300]]), played([[100, 295], [40_000, 5]])])
+    assert found["tick_lateness_ms"] == {"p50": 0.1, "p99": 0.1, "max": 40.0}
+    assert found["tick_lateness_ms_of_rounds"]["p99"] == [0.1, 40.0]
+    assert found["rss_mb"] == [1.0, 1.0]

@@ -1,0 +1,137 @@
+"""`bench.py server`: the searches of `_bench_server.py`, one after the other, and their table."""
+
+import argparse
+import json
+import os
+import statistics
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+
+import _bench_server as server
+
+
+def run(args: argparse.Namespace, console: Console) -> int:
+    seconds, resolution, steps, searches = (1.5, 0.2, 3, 1) if args.quick else (5.0, 0.04, 9, 3)
+    cores = os.cpu_count() or 1
+    runs: list[dict[str, Any]] = []
+    bounds: list[dict[str, Any]] = []
+    if args.crowd:
+        return run_crowd(args, console, seconds)
+
+    def report(stage: dict[str, Any]) -> None:
+        console.print(
+            f"  {stage['clients']:5} clients: {'held' if stage['held'] else 'not held'}, ticks late "
+            f"{stage['tick_lateness_ms']['p99']:.1f} ms (p99), worst client {stage['snapshots_share_worst']:.0%}, "
+            f"{stage['cpu_us_per_client_tick']:.1f} us, generator {stage['generator_cpu_share']:.0%}",
+            highlight=False,
+            soft_wrap=True,
+        )
+
+    for number in range(searches):
+        load = os.getloadavg()[0]
+        console.print(f"search {number + 1} of {searches}: the game (load of the machine before: {load:.1f})")
+        with server.rig("game", seed=number + 1) as running:
+            stages = server.search(running, 400, seconds, resolution, steps, report)
+        best = server.most(stages)
+        by = best or stages[-1]
+        cpu_us = statistics.median(
+            stage["cpu_us_per_client_tick"] for stage in stages if stage["ticks_share"] > 0.5 or stage is by
+        )
+        size = int(by["bytes_down_per_client_per_s"] / server.RATE)
+        console.print(f"  the same gateway without a game, {size} bytes a tick")
+        with server.rig("echo", str(size), seed=number + 1) as running:
+            first = int(0.5 * min(1e6 / server.RATE / cpu_us, server.CAPACITY)) if args.quick else 1000
+            echoed = server.search(running, first, seconds, resolution, 1 if args.quick else steps, report)
+        console.print("  the same on picows, which no game is played over: what another library could gain")
+        with server.rig(server.ECHO_PICOWS, str(size), seed=number + 1) as running:
+            picows = server.search(running, first, seconds, resolution, 1 if args.quick else steps, report)
+        shares = server.profile(max(50, by["clients"] // 2), seconds)
+        runs.append(
+            {
+                "gateway": "websockets",
+                "max_clients": best["clients"] if best else 0,
+                "cpu_us_per_client_tick": cpu_us,
+                "clients_by_cpu": int(1e6 / server.RATE / cpu_us),
+                **bound(echoed),
+                "parts": {name: share * cpu_us for name, share in shares.items()},
+                "entities_in_view": by["entities_in_view"],
+                "bytes_per_client_per_s": by["bytes_down_per_client_per_s"],
+                "snapshot_age_ms": by["snapshot_age_ms"],
+                "generator_cpu_share": by["generator_cpu_share"],
+                "generator_late_ms": by["generator_late_ms"],
+                "load_before": load,
+                "stages": stages,
+                "echo_stages": echoed,
+            }
+        )
+        bounds.append({"gateway": "picows", "max_clients": None, "load_before": load, **bound(picows)})
+    console.print(capacity_table(runs, bounds))
+    if max(run["load_before"] for run in runs) > cores / 2:
+        console.print("other processes were at work: the numbers of clients are too low, go by the CPU time")
+    if args.json:
+        report_ = {"quick": args.quick, "rate": server.RATE, "cores": cores, "runs": runs + bounds}
+        args.json.write_text(json.dumps(report_, indent=1) + "\n", encoding="utf-8")
+    return 0
+
+
+def bound(stages: list[dict[str, Any]]) -> dict[str, Any]:
+    """What a server that only echoes comes to."""
+    most = server.most(stages)
+    cpu_us = statistics.median(stage["cpu_us_per_client_tick"] for stage in stages)
+    return {
+        "echo_bound_clients": most["clients"] if most else 0,
+        "echo_cpu_us_per_client_tick": cpu_us,
+        "echo_clients_by_cpu": int(1e6 / server.RATE / cpu_us),
+    }
+
+
+def run_crowd(args: argparse.Namespace, console: Console, seconds: float) -> int:
+    """So many players in one segment, each seeing all."""
+    with server.rig("game", capacity=args.crowd, per_segment=args.crowd) as running:
+        stage = server.packed(running.hold(args.crowd, seconds))
+    made = Table("figure", title=f"server: {args.crowd} players in one segment, 30 Hz")
+    made.add_column("", justify="right")
+    for name, form in (
+        ("held", "{}"),
+        ("entities_in_view", "{:.0f}"),
+        ("cpu_us_per_client_tick", "{:.1f}"),
+        ("server_cpu_share", "{:.0%}"),
+        ("ticks_share", "{:.1%}"),
+        ("snapshots_share_worst", "{:.1%}"),
+        ("fairness", "{:.3f}"),
+        ("bytes_per_client_per_s", "{:,.0f}"),
+        ("generator_cpu_share", "{:.0%}"),
+    ):
+        made.add_row(name, "" if stage[name] is None else form.format(stage[name]))
+    console.print(made)
+    if args.json:
+        args.json.write_text(
+            json.dumps({"quick": args.quick, "rate": server.RATE, "crowd": stage}, indent=1) + "\n", "utf-8"
+        )
+    return 0
+
+
+def capacity_table(runs: list[dict[str, Any]], bounds: list[dict[str, Any]]) -> Table:
+    made = Table("figure", title="server: 30 Hz, one process; each search apart")
+    for number in range(len(runs)):
+        made.add_column(f"search {number + 1}", justify="right")
+    for name, form in (
+        ("max_clients", "{:,}"),
+        ("echo_bound_clients", "{:,}"),
+        ("cpu_us_per_client_tick", "{:.1f}"),
+        ("echo_cpu_us_per_client_tick", "{:.1f}"),
+        ("clients_by_cpu", "{:,}"),
+        ("echo_clients_by_cpu", "{:,}"),
+        ("entities_in_view", "{:.0f}"),
+        ("bytes_per_client_per_s", "{:,.0f}"),
+        ("generator_cpu_share", "{:.0%}"),
+    ):
+        made.add_row(name, *("" if run[name] is None else form.format(run[name]) for run in runs))
+    for name, form in (("echo_cpu_us_per_client_tick", "{:.1f}"), ("echo_clients_by_cpu", "{:,}")):
+        made.add_row(f"picows: {name}", *(form.format(run[name]) for run in bounds))
+    made.add_section()
+    for part in sorted(runs[0]["parts"], key=lambda part: -runs[0]["parts"][part]):
+        made.add_row(f"us in {part}", *(f"{run['parts'][part]:.2f}" for run in runs))
+    return made
