@@ -78,11 +78,22 @@ def play(store: Store, ticks: int, rng: random.Random) -> list[tuple[int, bytes]
 
 
 def crashed(store: Store, directory: Path) -> Path:
-    """What a process that dies now leaves behind, in another place."""
-    until(lambda: store.durable_tick == store.world.tick)
+    """What a process that dies now leaves behind, in another place: all its files as they are at one moment."""
     copy = directory / f"crashed-{store.world.tick}"
-    shutil.copytree(directory / "data", copy)
+
+    def copied() -> bool:
+        """Not while the store's thread writes: one file from before that and one from after it never were together."""
+        before = written(directory / "data")
+        shutil.copytree(directory / "data", copy, dirs_exist_ok=True)
+        return written(directory / "data") == before
+
+    until(lambda: store.durable_tick == store.world.tick and copied())
     return copy
+
+
+def written(directory: Path) -> dict[str, tuple[int, int]]:
+    """When each file was written last, and its size."""
+    return {path.name: (path.stat().st_mtime_ns, path.stat().st_size) for path in directory.iterdir()}
 
 
 def test_a_world_comes_back_with_its_hash_after_a_crash_and_after_a_stop(
