@@ -147,7 +147,7 @@ class Arena(ParallelEnv):  # type: ignore[misc]  # it says nothing of its types
         self._seats = {agent: Session(0, _Nobody(), 0.0) for agent in self.agents}
         self._wheels: dict[str, _Wheel] = {}
         for agent, seat in self._seats.items():
-            player = game.enter(seat, agent)
+            player = game.roster.enter(seat, agent)
             if player is None:
                 raise ValueError(f"{len(self.agents)} agents: no room to spawn {agent} in {self.scene.name}")
             player.inputs = self._wheels[agent] = _Wheel()

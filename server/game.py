@@ -9,9 +9,6 @@ through.
 """
 
 import dataclasses
-import hashlib
-import math
-import secrets
 from collections.abc import Callable
 from itertools import count
 from typing import Any
@@ -24,9 +21,9 @@ from server.limits import Limits
 from server.orders import Orders
 from server.recorder import RecordedWorld, Saves
 from server.rewind import Past, Rewind
+from server.roster import Roster
 from server.rules import Rules
-from server.session import Link, Player, Session
-from server.spawning import Spawns
+from server.session import Link, Session
 from server.stage import Stage
 from shared import messages
 from shared.inputs import Input
@@ -50,8 +47,6 @@ RESYNC_S = 1.0
 """A client may ask for everything anew so often."""
 AWAY_S = 1.0
 """A tick that begins so late says nothing about the clients."""
-UNHEARD_S = 2.0
-"""Who is cut off before it has acknowledged anything is kept for no longer than this."""
 
 
 class Game:
@@ -99,13 +94,11 @@ class Game:
         self.log.faults = self.faults
         self.delivery = Delivery(self.world, self.log, self.limits, self.counters)
         self.sessions: list[Session] = []
-        self.players: dict[int, Player] = self.stage.players
-        """By entity, in the order in which they joined; also those whose connection is lost, for a while."""
+        self.roster = Roster(self.world, self.stage, self.limits, self.counters)
+        self.players = self.roster.players
         self._authenticate = authenticate
         self.orders = Orders(self.world, self.stage, self.limits, self.faults, saves)
-        self._spawns = Spawns(self.world)
         self._numbers = count(1)
-        self._respawn: list[int] = []
         self._deadline: float | None = None
         self._rules = scene.to_table()
 
@@ -159,7 +152,7 @@ class Game:
                 self.counters.resyncs += 1
                 self.delivery.forget(session)
         elif isinstance(message, Bye):
-            self._leave_for_good(session)
+            self.roster.dismiss(session)
             session.close(messages.GOING_AWAY, "goodbye")
         else:
             self._kick(session, messages.MALFORMED, f"{type(message).__name__} at this point")
@@ -169,13 +162,7 @@ class Game:
         session.closed = True
         if session in self.sessions:
             self.sessions.remove(session)
-        player = session.player
-        if player is not None and player.session is session:
-            known = session.acked >= 0 or len(player.tokens) > 1
-            if session.acked >= 0:
-                player.heard()
-            player.session = None
-            player.away_until = now + (self.limits.resume_s if known else min(UNHEARD_S, self.limits.resume_s))
+        self.roster.lost(session, now)
 
     def shut_down(self, reason: str, wait: float) -> None:
         """Tells every client, with the seconds after which to come back, and closes the connections."""
@@ -205,16 +192,16 @@ class Game:
         """One tick. `deadline`: the time it was due, by the same clock as `now`; it ends tick T at `deadline`."""
         self._deadline = deadline
         self._excuse(deadline, now)
-        self._leave(now)
+        self.roster.leave(now)
         self._join()
-        self._revive()
+        self.roster.revive()
         self.orders.carry_out()
         self.stage.act()
         inputs = self._take_inputs()
         self.world.step(inputs)
         self.log.record()
         self.rewind.record()
-        self._fell_out()
+        self.roster.fell_out()
         self._send(now)
         self._check_clocks(now)
 
@@ -223,20 +210,6 @@ class Game:
         if now - deadline > AWAY_S:
             for session in self.sessions:
                 session.opened = session.heard = session.sent_at = now
-
-    def _leave(self, now: float) -> None:
-        away = [player for player in self.players.values() if player.session is None]
-        for player in away:
-            if player.away_until == math.inf:  # the server has been away
-                player.away_until = now + self.limits.resume_s
-        self._let_go([player for player in away if now >= player.away_until])
-
-    def _let_go(self, leaving: list[Player]) -> None:
-        for player in leaving:
-            del self.players[player.entity]
-            self.counters.left += 1
-            self.counters.add(player.inputs)
-            self.stage.left(player)
 
     def _join(self) -> None:
         joining = [session for session in self.sessions if session.hello is not None and not session.closed]
@@ -248,60 +221,20 @@ class Game:
 
     def _welcome(self, session: Session) -> None:
         assert session.hello is not None
-        player = self._returning(session, session.hello)
-        if player is None:
-            player = self.enter(session, session.hello.name)
+        player = self.roster.find(session.hello.resume, session.subject)
+        if player is not None:
+            self.counters.resumed += 1
+            if player.session is not None and not player.session.closed:
+                self._end(player.session, messages.TAKEN_OVER, "the player goes on over another connection")
+            session.seat(player)
+        else:
+            player = self.roster.enter(session, session.hello.name)
             if player is None:
                 self._refuse(session, messages.FULL, "no room to spawn")
                 return
-        else:
-            self.counters.resumed += 1
-            session.seat(player)
-        token = secrets.token_bytes(messages.RESUME_BYTES)
-        player.tokens.append(_digest(token))
-        self.world.note(keeping.note_of(player))
+        token = self.roster.issue(player)
         welcome = encode(Welcome(messages.VERSION, self.world.tick, player.entity, self._rules, token))
         session.greeting = (self.world.tick + 1, welcome)
-
-    def enter(self, session: Session, name: str) -> Player | None:
-        """A new player at a spawn, with that connection; ask between two ticks. None: there is no room."""
-        self._make_room()
-        entity = self._spawns.spawn()
-        if entity is None:
-            return None
-        player = self.players[entity] = Player(entity, name, session.subject)
-        player.edits_left = 0.0  # else leaving and joining anew would give a burst each time
-        self.counters.joined += 1
-        session.seat(player)
-        self.stage.joined(player)
-        return player
-
-    def _make_room(self) -> None:
-        """Lets go of those whose time to come back ends first, where there are as many players as there may be."""
-        excess = len(self.players) + 1 - self.limits.clients_max
-        if excess > 0:
-            away = [player for player in self.players.values() if player.session is None]
-            self._let_go(sorted(away, key=lambda player: player.away_until)[:excess])
-
-    def _returning(self, session: Session, hello: Hello) -> Player | None:
-        """The player that this is, if it was here before and still is; a connection that it still has is closed."""
-        wanted = _digest(hello.resume)
-        for player in self.players.values() if hello.resume else ():
-            old = player.session
-            if old is not None and old.acked >= 0:
-                player.heard()
-            if wanted in player.tokens and player.subject == session.subject:
-                player.tokens[:] = [wanted]  # the ones before it are used up, and one after it was never heard of
-                if old is not None and not old.closed:
-                    self._end(old, messages.TAKEN_OVER, "the player goes on over another connection")
-                return player
-        return None
-
-    def _revive(self) -> None:
-        for entity in self._respawn:
-            if entity in self.world and not self.stage.fell_out(entity) and self._spawns.put_back(entity):
-                self.log.note_act(entity)
-        self._respawn.clear()
 
     def _take_inputs(self) -> dict[int, Input]:
         tick = self.world.tick + 1
@@ -309,11 +242,6 @@ class Game:
         inputs.update(self.stage.steered)
         self.stage.steered.clear()
         return inputs
-
-    def _fell_out(self) -> None:
-        """Who is below the floor comes back at a spawn, in the next tick, unless the rules have other plans."""
-        self._respawn = self.world.fell
-        self.counters.fell_out += len(self._respawn)
 
     def _send(self, now: float) -> None:
         self.orders.answer()
@@ -390,7 +318,7 @@ class Game:
     def _kick(self, session: Session, code: int, reason: str) -> None:
         self.counters.kicked += 1
         if code != messages.TOO_SLOW:  # that is the network's fault
-            self._leave_for_good(session)
+            self.roster.dismiss(session)
         self._end(session, code, reason)
 
     def _break(self, session: Session, what: str) -> None:
@@ -401,12 +329,6 @@ class Game:
         except Exception:
             self.faults.report("closing a link")
         self.lost(session, session.heard)
-
-    def _leave_for_good(self, session: Session) -> None:
-        """The player of this connection is not kept for a return."""
-        if session.player is not None and session.player.session is session:
-            session.player.session = None
-            session.player.away_until = -math.inf
 
     def _end(self, session: Session, code: int, reason: str, wait: float = -1.0) -> None:
         reason = reason[: messages.REASON_MAX]
@@ -431,8 +353,3 @@ class Game:
             "entities_awake": self.world.awake_count,
             "segments": len(self.world.blocks.rows),
         }
-
-
-def _digest(token: bytes) -> bytes:
-    """What is kept of a token: enough to know it again, not enough to show it."""
-    return hashlib.sha256(token).digest()

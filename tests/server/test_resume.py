@@ -2,8 +2,8 @@
 
 import pytest
 
-from server.game import UNHEARD_S
 from server.limits import Limits
+from server.roster import UNHEARD_S
 from server.session import SETTLED_MAX
 from shared import messages
 from shared.messages import Bye, Hello, Inputs, Snapshot, Welcome
