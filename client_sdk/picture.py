@@ -19,13 +19,13 @@ from shared.units import BLOCK, SPEED
 
 @dataclass(frozen=True)
 class Figure:
-    """One entity as it is to be drawn: position in blocks, velocity in blocks/s, `template` by number in the scene.
+    """One entity as it is to be drawn: position in blocks, velocity in blocks/s, `template` by its name.
 
     `attributes` is what the game's rules say of it ("name", for one).
     """
 
     entity: int
-    template: int
+    template: str
     position: Vec
     velocity: Vec
     attributes: Mapping[str, Any] = field(default_factory=dict)
@@ -60,6 +60,7 @@ class Picture:
     def __init__(self, scene: Scene, prediction: Prediction) -> None:
         self.interpolation = Interpolation(scene.tick_rate)
         self._prediction = prediction
+        self._templates = [template.name for template in scene.templates]
         self._predicted = {i for i, template in enumerate(scene.templates) if template.shown == "predicted"}
         self._smoothing: dict[int, Smoothing] = {}
 
@@ -110,4 +111,4 @@ class Picture:
         x, y, z = place
         vx, vy, vz = (part / SPEED for part in state[VX : VX + 3])
         said = self._prediction.attributes.get(state[ID], NONE_SAID)
-        return Figure(state[ID], state[TEMPLATE], (x, y, z), (vx, vy, vz), said)
+        return Figure(state[ID], self._templates[state[TEMPLATE]], (x, y, z), (vx, vy, vz), said)

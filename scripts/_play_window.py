@@ -14,7 +14,6 @@ from client_sdk.events import Answered, Disconnected, Diverged, Event, Happened,
 from client_sdk.links import Path
 from client_sdk.picture import Figure, View
 from shared.checks import Cell, Vec
-from shared.scene import Scene
 
 SIZE = 1280, 800
 SKY = (122, 184, 232), (222, 240, 250)
@@ -171,7 +170,7 @@ class Window:
         if pointed is not None:
             rim = [(round(x - camera[0]), round(y - camera[1])) for x, y in top_of(pointed[0])]
             pygame.draw.polygon(target, WHITE, rim, 2)
-        self.actors = self._cast(view, scene)
+        self.actors = self._cast(view)
         for actor in sorted(self.actors, key=lambda actor: actor.depth):
             actor.draw(target, camera, self._ground, blocks.get, self._look(actor.figure))
         if self.ghost and view.me.entity in prediction.confirmed:
@@ -193,16 +192,15 @@ class Window:
         )
         pygame.display.flip()
 
-    def _cast(self, view: View, scene: Scene) -> list[Actor]:
+    def _cast(self, view: View) -> list[Actor]:
         """The figures in sight, with what the game says of them."""
-        it = scene.index_of.get("it")
         found = []
         for figure in (*view.others, *([view.me] if view.me else [])):
             own = figure is view.me
             safe = figure.attributes.get("safe", 0)
             safe = isinstance(safe, int) and safe > view.tick
             tone = OWN if own else self._tone(figure.entity)
-            found.append(Actor(figure, tone, it=figure.template == it, own=own, safe=safe))
+            found.append(Actor(figure, tone, it=figure.template == "it", own=own, safe=safe))
         seen = {actor.figure.entity for actor in found}
         self._tones = {entity: tone for entity, tone in self._tones.items() if entity in seen}
         return found

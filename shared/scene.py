@@ -112,6 +112,11 @@ class Scene:
     player: str = "player"
     reach: float = 6.0
 
+    def __repr__(self) -> str:
+        """Short, for events show it; all of it is `to_table`."""
+        blocks = " x ".join(str(SEGMENT * part) for part in self.size)
+        return f"<Scene {self.name!r}, {blocks} blocks, {self.tick_rate} ticks/s>"
+
     def __post_init__(self) -> None:
         text(self.name, "name")
         whole(self.tick_rate, "tick_rate", 1, TICK_RATE_MAX)

@@ -6,6 +6,7 @@ from client_sdk.client import Client
 from client_sdk.events import Answered, Disconnected, Event, Happened, Joined, Left, Resumed
 from client_sdk.links import PRESETS
 from client_sdk.transports.loopback import LEAP_S, Loopback
+from scripts.examples.freeze import Freeze
 from scripts.examples.tag import Tag
 from server.auth import AuthError
 from server.game import Game
@@ -107,6 +108,16 @@ def test_two_see_each_other_and_what_they_build() -> None:
     prediction = bob.core.prediction
     assert prediction is not None
     assert prediction.confirmed.blocks.get(x + 2, y, z + 2) == 5
+
+
+def test_figures_name_their_templates() -> None:
+    rules = Freeze()
+    program = Program(Game(rules.prepare(load_scene(rules.scene)), rules=rules))
+    ann, bob = program.join("Ann"), program.join("Bob")
+    program.run(1)
+    for client in (ann, bob):
+        found = {figure.entity: figure.template for figure in client.view(program.now).figures}
+        assert found == {ann.entity: "freezer", bob.entity: "player"}
 
 
 def test_who_stood_still_comes_back_to_the_same_world() -> None:

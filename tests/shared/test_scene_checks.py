@@ -5,6 +5,7 @@ from typing import Any
 
 import pytest
 
+from client_sdk.events import Joined
 from shared.checks import SceneError
 from shared.inputs import MOVE_MAX, Input, clamp, make_input
 from shared.scene import SCENES, Scene, Template, load_scene
@@ -151,3 +152,9 @@ def test_a_wish_within_the_range_is_left_alone() -> None:
         assert clamp(wish) == wish
     assert make_input(1, 1) == clamp(Input(127, 127))
     assert make_input(0.5, -0.5, jump=True, buttons=2) == Input(64, -64, 3)
+
+
+def test_an_event_that_is_printed_does_not_show_the_whole_scene() -> None:
+    assert repr(Joined(1, load_scene("meadow"), 7)) == (
+        "Joined(entity=1, scene=<Scene 'meadow', 64 x 64 x 32 blocks, 32 ticks/s>, tick=7)"
+    )
