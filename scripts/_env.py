@@ -44,7 +44,7 @@ def ensure(requirements: str) -> Path:
         return PYTHON
 
     base = _base_python()
-    print("setting up .venv ... ", end="", flush=True)
+    print(f"setting up {VENV} with what {requirements} pins, once: up to a minute ... ", end="", flush=True)
     started = time.perf_counter()
     if usable:
         STAMP.unlink()

@@ -13,7 +13,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from types import FrameType
-from typing import Any
+from typing import Any, TextIO
 
 import structlog
 
@@ -36,6 +36,7 @@ from server.ticker import Ticker, best_alarm
 from server.warmup import warm_up
 from server.watchdog import Watchdog
 from shared.checks import SceneError
+from shared.kernels import compiling
 from shared.scene import Scene, load_scene
 
 READY_S = 1.0
@@ -97,7 +98,8 @@ def run(settings: Settings) -> int:
     if settings.reach is not None:
         scene = dataclasses.replace(scene, reach=settings.reach)
     scene = rules.prepare(scene)
-    warm_up(scene)
+    with compiling(lambda: announce_compiling(sys.stderr)):
+        warm_up(scene)
     with asyncio.Runner(loop_factory=_loop_factory()) as runner, contextlib.ExitStack() as stack:
         store = world = None
         if settings.data is not None:
@@ -115,6 +117,12 @@ def run(settings: Settings) -> int:
             authenticate=authenticate,
         )
         return runner.run(Server(settings, game, store).serve())
+
+
+def announce_compiling(terminal: TextIO) -> None:
+    """What whoever waits in front of a terminal should know; a log has no use for it."""
+    if terminal.isatty():
+        print("compiling the physics for this machine, which takes 5 to 20 s the first time ...", file=terminal)
 
 
 class Server:

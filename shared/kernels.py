@@ -4,9 +4,11 @@
 one source, and neither instance can drift from the other.
 """
 
+import contextlib
 import functools
 import importlib.util
 import sys
+from collections.abc import Callable, Iterator
 from types import ModuleType
 from typing import Any
 
@@ -20,6 +22,29 @@ PLAIN: ModuleType = kernel
 def available() -> bool:
     """Whether Numba is installed, without importing it."""
     return importlib.util.find_spec("numba") is not None
+
+
+@contextlib.contextmanager
+def compiling(tell: Callable[[], None]) -> Iterator[None]:
+    """Meanwhile calls `tell`, once, as soon as Numba has to compile what is not in its cache on disk."""
+    if not available():
+        yield
+        return
+    from numba.core import event
+
+    class Once(event.Listener):
+        told = False
+
+        def on_start(self, _: object) -> None:
+            if not self.told:
+                self.told = True
+                tell()
+
+        def on_end(self, _: object) -> None:
+            pass
+
+    with event.install_listener("numba:compile", Once()):
+        yield
 
 
 def lent(array: np.ndarray[Any, Any], to_compiled: bool) -> Any:

@@ -1,11 +1,13 @@
 """The real process: what it prints, how it ends, and that rubbish from a peer leaves no trace in its log."""
 
 import asyncio
+import io
 import os
 import random
 import re
 import signal
 import socket
+import subprocess
 import sys
 import time
 import urllib.error
@@ -19,9 +21,11 @@ from websockets.sync.client import ClientConnection, connect
 
 from client_sdk.client import Client
 from client_sdk.transports.connection import ConnectError
+from server.app import announce_compiling
 from server.tokens import issue
+from shared import kernels
 from shared.messages import UNAUTHORISED, VERSION, Bye, Hello, Inputs, Message, Welcome, decode_from_server, encode
-from tests.e2e.processes import END_S, START_S, UPGRADE, ServerProcess, page, running, stats, until
+from tests.e2e.processes import END_S, ROOT, START_S, UPGRADE, ServerProcess, page, running, stats, until
 
 pytestmark = pytest.mark.e2e
 
@@ -238,6 +242,40 @@ def test_other_hosts(host: str) -> None:
         with socket.create_connection(address):
             pass
         assert server.end(signal.SIGTERM) == 0
+
+
+def on_a_terminal(cache: Path) -> list[str]:
+    """The lines that somebody sees who starts a server, up to the one that it listens."""
+    seen, its = os.openpty()
+    command = [sys.executable, "-m", "server", "--port", "0", "--scene", "flat", "--log-level", "warning"]
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(cache)}
+    with subprocess.Popen(command, cwd=ROOT, env=environment, stdin=its, stdout=its, stderr=its) as process:
+        os.close(its)
+        try:
+            text = ""
+            while "listening on" not in text:
+                text += os.read(seen, 1000).decode()
+        finally:
+            process.terminate()
+            os.close(seen)
+    return [line.partition(" ")[0] for line in text.splitlines()]
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(os.name == "nt" or not kernels.available(), reason="needs a terminal, and something to compile")
+def test_the_first_start_says_on_a_terminal_what_takes_so_long(tmp_path: Path) -> None:
+    assert on_a_terminal(tmp_path) == ["compiling", "listening"]
+    assert on_a_terminal(tmp_path) == ["listening"]
+
+
+def test_a_log_is_not_told() -> None:
+    class Terminal(io.StringIO):
+        def isatty(self) -> bool:
+            return True
+
+    for stream, lines in ((Terminal(), 1), (io.StringIO(), 0)):
+        announce_compiling(stream)
+        assert stream.getvalue().count("\n") == lines
 
 
 def broken(tmp_path: Path, text: str) -> str:

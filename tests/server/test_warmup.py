@@ -71,6 +71,20 @@ def play(game: Game, seed: int, ticks: int) -> None:
             game.receive(asker, encode(Resync()), now)
 
 
+def test_that_something_is_compiled_is_told_once_and_only_then() -> None:
+    numba = pytest.importorskip("numba")
+    one, other = numba.njit(lambda: 1), numba.njit(lambda: 2)
+    told: list[str] = []
+    with kernels.compiling(lambda: told.append("compiling")):
+        assert told == []
+        assert (one(), other()) == (1, 2)
+        assert told == ["compiling"]
+    with kernels.compiling(lambda: told.append("again")):
+        assert (one(), other()) == (1, 2)
+    assert numba.njit(lambda: 3)() == 3
+    assert told == ["compiling"]
+
+
 @pytest.mark.parametrize("scene", ["arena", "topdown"])
 def test_nothing_is_compiled_while_clients_play(cold: None, scene: str) -> None:
     warm_up(load_scene(scene))
