@@ -23,7 +23,7 @@ from typing import Any, cast
 
 import msgpack
 
-from server import app, log
+from server import app, log, process
 from server.delivery import Delivery
 from server.faults import Faults
 from server.game import Game
@@ -197,7 +197,7 @@ def serve(served: Game) -> None:
     """As `python -m server` does, on a port that the system picks."""
     settings = Settings(port=0, page=False, log_level="warning")
     log.set_up(settings.log_level, settings.log_format, sys.stderr)
-    with asyncio.Runner(loop_factory=app._loop_factory()) as runner:
+    with asyncio.Runner(loop_factory=process.loop_factory()) as runner:
         runner.run(app.Server(settings, served).serve())
 
 

@@ -4,7 +4,6 @@ import asyncio
 import contextlib
 import dataclasses
 import errno
-import gc
 import os
 import signal
 import ssl
@@ -12,8 +11,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from types import FrameType
-from typing import Any, TextIO
+from typing import Any
 
 import structlog
 
@@ -28,6 +26,7 @@ from server.kinds import SettingsError, nearest
 from server.live import Live
 from server.metrics import metrics_page
 from server.pages import Pages, json_page, ready_page
+from server.process import announce_compiling, freeze, leave, loop_factory, on_signals, rss_mb, signals
 from server.recorder import RecordedWorld
 from server.rules import Rules, RulesError, load_rules
 from server.settings import Settings, parse
@@ -50,8 +49,8 @@ logger = structlog.stdlib.get_logger("server")
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs until a signal, or one of the other commands; returns the exit code."""
-    for number in _signals():
-        signal.signal(number, _leave)  # until the event loop takes over
+    for number in signals():
+        signal.signal(number, leave)  # until the event loop takes over
     arguments = sys.argv[1:] if arguments is None else arguments
     try:
         if arguments and not arguments[0].startswith("-"):
@@ -100,7 +99,7 @@ def run(settings: Settings) -> int:
     scene = rules.prepare(scene)
     with compiling(lambda: announce_compiling(sys.stderr)):
         warm_up(scene)
-    with asyncio.Runner(loop_factory=_loop_factory()) as runner, contextlib.ExitStack() as stack:
+    with asyncio.Runner(loop_factory=loop_factory()) as runner, contextlib.ExitStack() as stack:
         store = world = None
         if settings.data is not None:
             store = stack.enter_context(saved(scene, settings))
@@ -117,12 +116,6 @@ def run(settings: Settings) -> int:
             authenticate=authenticate,
         )
         return runner.run(Server(settings, game, store).serve())
-
-
-def announce_compiling(terminal: TextIO) -> None:
-    """What whoever waits in front of a terminal should know; a log has no use for it."""
-    if terminal.isatty():
-        print("compiling the physics for this machine, which takes 5 to 20 s the first time ...", file=terminal)
 
 
 class Server:
@@ -157,7 +150,7 @@ class Server:
         loop = asyncio.get_running_loop()
         loop.set_exception_handler(self._loop_failed)
         self._stop = loop.create_future()
-        with _on_signals(loop, lambda name: self._end(name, 0)):
+        with on_signals(loop, lambda name: self._end(name, 0)):
             host, port = await self._listen(tls_context(self.settings))
             rate = self.game.scene.tick_rate
             if self.store is not None:
@@ -286,63 +279,3 @@ def recorded(scene: Scene, path: str, world: RecordedWorld | None = None) -> Ite
     finally:
         with contextlib.suppress(OSError):
             file.close()
-
-
-def freeze() -> None:
-    """Takes everything that exists by now out of the garbage collector's rounds: it stays until the end anyway.
-
-    Measured with 150 clients on `hills`: a full collection took 29 ms before, and does not come up any more; what is
-    left are the young ones, 0.7 ms at most and 5 ms in all in 8 s, for which other thresholds gained nothing.
-    """
-    gc.collect()
-    gc.freeze()
-
-
-def rss_mb() -> float:
-    """Memory of this process that is in RAM, in MB; where the system does not say, the most it ever was, or 0."""
-    try:
-        return int(Path("/proc/self/statm").read_bytes().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
-    except OSError:  # not Linux
-        pass
-    try:
-        import resource
-    except ImportError:  # Windows
-        return 0.0
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return peak / 1e6 if sys.platform == "darwin" else peak / 1e3
-
-
-def _loop_factory() -> Callable[[], asyncio.AbstractEventLoop]:
-    try:
-        import uvloop
-    except ImportError:
-        return asyncio.new_event_loop
-    return uvloop.new_event_loop
-
-
-def _signals() -> list[signal.Signals]:
-    """What ends a server: SIGINT and SIGTERM, and on Windows Ctrl-Break."""
-    names = ("SIGINT", "SIGTERM", "SIGBREAK")
-    return [getattr(signal, name) for name in names if hasattr(signal, name)]
-
-
-def _leave(number: int, frame: FrameType | None) -> None:
-    """Before there are clients, nobody has to be told."""
-    raise SystemExit(0)
-
-
-@contextlib.contextmanager
-def _on_signals(loop: asyncio.AbstractEventLoop, stop: Callable[[str], None]) -> Iterator[None]:
-    """Calls `stop(name)` for the first signal; from then on signals do what they do by default: end at once."""
-
-    def first(number: signal.Signals) -> None:
-        for each in _signals():
-            signal.signal(each, signal.SIG_DFL)
-        stop(number.name)
-
-    for number in _signals():
-        try:
-            loop.add_signal_handler(number, first, number)
-        except NotImplementedError:  # Windows
-            signal.signal(number, lambda n, _: loop.call_soon_threadsafe(first, signal.Signals(n)))
-    yield

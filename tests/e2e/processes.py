@@ -103,6 +103,12 @@ def running(*arguments: str, **environment: str) -> Iterator[ServerProcess]:
         server.close()
 
 
+def other(*arguments: str, **environment: str) -> tuple[int, list[str]]:
+    """Exit code and output of one of the other commands."""
+    with running(*arguments, **environment) as command:
+        return command.end(), command.rest()
+
+
 def until(condition: Callable[[], bool], seconds: float = END_S) -> None:
     deadline = time.monotonic() + seconds
     while not condition():
