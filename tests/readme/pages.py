@@ -1,4 +1,4 @@
-"""What people read: the README and docs/, and the programs in them by the heading that they stand under."""
+"""What people read: the README and docs/, and the programs (or files) in them by the heading that they stand under."""
 
 import re
 from pathlib import Path
@@ -8,15 +8,15 @@ PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 _HEADING_OR_FENCE = re.compile(r"^#+ ([^\n]+)$|^```(\w*)[^\n]*\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 
 
-def programs() -> dict[str, str]:
-    """All Python in the pages, in order; each heading has one at most."""
+def programs(language: str = "python") -> dict[str, str]:
+    """All blocks of a language in the pages, in order; each heading has one at most."""
     found: dict[str, str] = {}
     for page in PAGES:
         heading = ""
         for title, kind, text in _HEADING_OR_FENCE.findall(page.read_text("utf-8")):
             heading = title or heading
-            if kind == "python":
-                assert heading not in found, f"{page.name}: a second program under {heading!r}"
+            if kind == language:
+                assert heading not in found, f"{page.name}: a second block of {language} under {heading!r}"
                 found[heading] = text
     return found
 

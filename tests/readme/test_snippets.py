@@ -4,12 +4,18 @@ pygame-ce is installed for the tests and runs without a display. The other engin
 (they are heavy: 12 to 200 MB); elsewhere the least that has the shape of their loop stands in for them.
 """
 
+import dataclasses
+import re
 import subprocess
 import sys
+from pathlib import Path
 from typing import Any
 
 import pytest
 
+from client_sdk import Loopback
+from server.game import Game
+from shared.scene import Scene, Template, load_scene
 from tests.client_sdk.servers import ROOT, real_server
 from tests.readme.pages import programs
 from tests.readme.run_snippet import LOOP
@@ -80,3 +86,23 @@ def test_a_game() -> None:
     text = (ROOT / "scripts" / "examples" / "freeze.py").read_text("utf-8")
     assert len(text.splitlines()) < 30
     assert programs()[A_FILE] == text
+
+
+def test_a_scene(tmp_path: Path) -> None:
+    ((heading, text),) = programs("toml").items()
+    (file := tmp_path / "island.toml").write_text(text, "utf-8")
+    scene = load_scene(str(file))
+    assert (heading, repr(scene)) == ("Scenes", "<Scene 'island', 96 x 64 x 32 blocks, 32 ticks/s>")
+    assert scene == dataclasses.replace(scene, tick_rate=Scene.tick_rate, gravity=Scene.gravity), "the defaults"
+    client = Loopback(Game(scene)).join("Ann")
+    for frame in range(120):
+        client.poll(frame / 60)
+        client.update(frame / 60)
+    assert client.playing
+
+
+def test_the_table_of_templates() -> None:
+    page = (ROOT / "docs" / "games.md").read_text("utf-8")
+    assert set(re.findall(r"^\| `(\w+)` \|", page, re.MULTILINE)) == {
+        field.name for field in dataclasses.fields(Template) if field.name != "name"
+    }
