@@ -2,9 +2,12 @@
 
 from typing import Any
 
+import numpy as np
+
 from client_sdk.events import Answered
 from shared import edits, messages
 from shared.messages import Command, encode
+from shared.snapshot import VERDICT
 
 
 class Orders:
@@ -36,12 +39,14 @@ class Orders:
         """Keeps an order until it is answered; what to send."""
         return self._unanswered.setdefault(command.number, encode(command))
 
-    def answer(self, number: int, verdict: int) -> Answered | None:
-        """The server's word on an order; None: it was asked twice, and this is the second answer."""
-        if self._unanswered.pop(number, None) is None:
-            return None
-        text = messages.VERDICT_TEXTS[min(verdict, len(messages.VERDICT_TEXTS) - 1)]
-        return Answered(number, verdict == messages.DONE, text)
+    def answer(self, verdicts: bytes) -> list[Answered]:
+        """The server's word on orders, as `Snapshot.verdicts`; without second answers to what was asked twice."""
+        answers = []
+        for number, verdict in np.frombuffer(verdicts, VERDICT).tolist() if verdicts else ():
+            if self._unanswered.pop(number, None) is not None:
+                text = messages.VERDICT_TEXTS[min(verdict, len(messages.VERDICT_TEXTS) - 1)]
+                answers.append(Answered(number, verdict == messages.DONE, text))
+        return answers
 
     def again(self) -> list[bytes]:
         """What to send once more, to a server that knows which of them it has carried out."""

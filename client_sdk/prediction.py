@@ -234,11 +234,15 @@ class Prediction:
                 return wish
         return NEUTRAL
 
+    @property
+    def next_order(self) -> int:
+        """The next tick that has no input yet: what is ordered now is done then."""
+        return self.predicted.tick + self.ahead + 1
+
     def edit(self, number: int, edit: Edit) -> int:
         """Files an edit for the next tick that has no input yet; that tick."""
-        tick = self.predicted.tick + self.ahead + 1
-        self._edits[number] = (tick, edit)
-        return tick
+        self._edits[number] = (self.next_order, edit)
+        return self.next_order
 
     def reconcile(self, late: bool) -> Reconciled:
         """Compares the newest confirmed tick with what was predicted for it, and replays if they differ.
@@ -332,17 +336,3 @@ def _offsets(before: Int64s, after: Int64s) -> dict[int, Place]:
             x, y, z = ((a - b) / BLOCK for a, b in zip(old, place, strict=True))
             offsets[entity] = (x, y, z)
     return offsets
-
-
-def check_scene(table: object) -> Scene:
-    """The scene in a welcome.
-
-    Raises:
-        ProtocolError: it is not a scene.
-    """
-    try:
-        scene = Scene.from_table(table)  # type: ignore[arg-type]
-        assert scene.digests  # computed here, where a table that cannot be is refused
-        return scene
-    except (ValueError, TypeError, RecursionError) as error:
-        raise ProtocolError(f"Welcome.scene: {error}") from error

@@ -5,17 +5,38 @@ from client_sdk.picture import Picture
 from client_sdk.prediction import Prediction
 from shared.blocks import unpack
 from shared.checks import Cell
-from shared.messages import ProtocolError, Snapshot, Terrain
+from shared.messages import ProtocolError, Snapshot, Terrain, Welcome
 from shared.scene import Scene
+
+CLOCK_S = 1.0
+"""A server whose time is this far from what it was believed to be is not the same one any more, or was away."""
 
 
 class Replica:
-    """Is filled by messages; after a return beside the one that is still played in."""
+    """Is filled by messages; after a return beside the one that is still played in.
 
-    def __init__(self, scene: Scene, prediction: Prediction, clock: ServerClock) -> None:
-        self.prediction = prediction
-        self.picture = Picture(scene, prediction)
+    Args:
+        clock: that of the server known before, which may be the same one.
+        neighbours, compiled: see `Prediction`.
+
+    Raises:
+        ProtocolError: the welcome is malformed.
+    """
+
+    def __init__(
+        self, welcome: Welcome, clock: ServerClock, now: float, *, neighbours: bool, compiled: bool | None
+    ) -> None:
+        self.scene = check_scene(welcome.scene)
+        self.prediction = Prediction(self.scene, welcome.entity, neighbours=neighbours, compiled=compiled)
+        self.picture = Picture(self.scene, self.prediction)
         self.clock = clock
+        if clock.rate == 0 or abs(clock.tick(now) - welcome.tick) > CLOCK_S * self.scene.tick_rate:
+            self.clock = ServerClock()
+            self.clock.rate = float(self.scene.tick_rate)
+        self.heard = -1
+        """The newest tick that the server has an input for."""
+        self.wrong = ""
+        """What is not as the server has it, if anything."""
         self._pieces: tuple[Cell, bytearray] = ((0, 0, 0), bytearray())
 
     @property
@@ -57,8 +78,34 @@ class Replica:
             raise ProtocolError(f"Snapshot.tick = {snapshot.tick}: not newer than the one before")
         return snapshot.tick - confirmed.tick - 1 if len(confirmed) else 0
 
-    def apply(self, snapshot: Snapshot) -> str:
-        """The confirmed world becomes that of the snapshot; what is wrong with it, or nothing."""
-        wrong = self.prediction.apply(snapshot)
+    def apply(self, snapshot: Snapshot) -> None:
+        """The confirmed world becomes that of the snapshot.
+
+        Raises:
+            ProtocolError: a part of it is malformed.
+        """
+        self.heard = max(self.heard, snapshot.newest)
+        self.wrong = self.prediction.apply(snapshot) or self.wrong
         self.picture.interpolation.push(snapshot.tick, self.prediction.truth)
-        return wrong
+
+    def take_over(self, old: "Replica") -> bool:
+        """Takes the place of an earlier copy; whether the own entity is the same, so that what it does goes on."""
+        self.wrong = self.wrong or old.wrong  # an alarm is not lost with the connection
+        same = self.prediction.entity == old.prediction.entity
+        if same:
+            self.prediction.adopt(old.prediction)
+        return same
+
+
+def check_scene(table: object) -> Scene:
+    """The scene in a welcome.
+
+    Raises:
+        ProtocolError: it is not a scene.
+    """
+    try:
+        scene = Scene.from_table(table)  # type: ignore[arg-type]
+        assert scene.digests  # computed here, where a table that cannot be is refused
+        return scene
+    except (ValueError, TypeError, RecursionError) as error:
+        raise ProtocolError(f"Welcome.scene: {error}") from error

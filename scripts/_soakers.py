@@ -14,7 +14,8 @@ import msgpack
 import numpy as np
 
 from _generator import REQUEST, frame
-from client_sdk.prediction import Prediction, check_scene
+from client_sdk.prediction import Prediction
+from client_sdk.replica import check_scene
 from shared import edits, messages
 from shared.messages import Bye, Command, Hello, Inputs, Ping, Snapshot, Welcome, decode_from_server, encode
 from shared.snapshot import VERDICT

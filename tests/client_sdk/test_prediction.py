@@ -9,7 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from client_sdk.prediction import NONDETERMINISM, Prediction, check_scene
+from client_sdk.prediction import NONDETERMINISM, Prediction
+from client_sdk.replica import check_scene
 from shared.checks import Cell
 from shared.edits import Edit
 from shared.inputs import NEUTRAL, Input
