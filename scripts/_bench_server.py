@@ -44,8 +44,12 @@ ECHO_PICOWS = "echo_picows"
 Figures = dict[str, Any]
 
 
-def scene_toml(capacity: int, per_segment: int = PER_SEGMENT) -> str:
-    """`hills`, as large as that many players need, with a spawn for each, segment by segment."""
+def scene_toml(capacity: int, per_segment: int = PER_SEGMENT, margin: int = 0) -> str:
+    """`hills`, as large as that many players need, with a spawn for each, segment by segment.
+
+    Args:
+        margin: more segments on two sides, where nobody appears.
+    """
     hills = (ROOT / "shared" / "scenes" / "hills.toml").read_text("utf-8")
     rest = "\n".join(line for line in hills.splitlines() if not line.startswith(("#", "size", "spawns")))
     side = math.ceil(math.sqrt(capacity / per_segment))
@@ -55,7 +59,7 @@ def scene_toml(capacity: int, per_segment: int = PER_SEGMENT) -> str:
         for x, y in sorted(((x, y) for x in range(side) for y in range(side)), key=lambda at: (max(at), at))
         for _ in range(per_segment)
     ]
-    return f"tick_rate = {RATE}\nsize = [{side}, {side}, 1]\nspawns = {spawns}\n{rest}\n"
+    return f"tick_rate = {RATE}\nsize = [{side + margin}, {side + margin}, 1]\nspawns = {spawns}\n{rest}\n"
 
 
 class Rig:
@@ -129,6 +133,10 @@ class Rig:
             "cpu_share", "late_ms",
         )}  # fmt: skip
 
+    def leaving(self, per_s: float) -> None:
+        """From now on the oldest clients leave at that rate, and others come instead."""
+        self._tell(f"leaving {per_s}")
+
     def collect(self) -> float:
         """Has the server collect all its garbage; the CPU time of that, in seconds. Not every kind of server can."""
         self._server.send_signal(signal.SIGUSR1)
@@ -187,11 +195,16 @@ class Rig:
 
 @contextlib.contextmanager
 def rig(
-    kind: str, *more: str, seed: int = 1, capacity: int = CAPACITY, per_segment: int = PER_SEGMENT
+    kind: str,
+    *more: str,
+    seed: int = 1,
+    capacity: int = CAPACITY,
+    per_segment: int = PER_SEGMENT,
+    margin: int = 0,
 ) -> Iterator[Rig]:
     with tempfile.TemporaryDirectory() as folder:
         scene = Path(folder) / "wide.toml"
-        scene.write_text(scene_toml(capacity, per_segment), "utf-8")
+        scene.write_text(scene_toml(capacity, per_segment, margin), "utf-8")
         running = Rig(kind, scene, *more, seed=seed)
         try:
             yield running

@@ -6,6 +6,7 @@ _busy_server.py product SCENE      the product; /stats shows the CPU time of its
 _busy_server.py default SCENE      the same, but what is there after the start is not frozen
 _busy_server.py off SCENE          the same without a collector
 _busy_server.py asyncio SCENE      the same on asyncio's own event loop
+_busy_server.py churn SCENE        the product, in which entities come and go, and segments are unloaded and loaded
 _busy_server.py echo SCENE BYTES   the product's gateway and ticker without a game: the bound. What comes is taken in
                                    unread; every tick each client is sent a message of so many bytes
 """
@@ -18,7 +19,7 @@ import signal
 import sys
 import time
 from collections.abc import Callable, Mapping
-from types import FrameType, FunctionType
+from types import FrameType, FunctionType, ModuleType
 from typing import Any, cast
 
 import msgpack
@@ -31,13 +32,16 @@ from server.gateway import Connection
 from server.histogram import Histogram
 from server.replication import ChangeLog
 from server.rewind import Rewind
+from server.rules import Rules
 from server.session import Link, Session
 from server.settings import Settings
 from server.warmup import warm_up
+from shared.checks import Cell
 from shared.inputs import Input
 from shared.layout import X
 from shared.messages import Hello, Ping, Pong, Welcome, decode_from_client, encode, join_snapshot
 from shared.scene import load_scene
+from shared.terrain import generate
 from shared.units import BLOCK_SHIFT, SEGMENT_SHIFT
 from shared.world import World
 
@@ -130,6 +134,40 @@ class Profile:
         self._latest = now
 
 
+class Churn(Rules):
+    """In every tick something appears among the players; it lives for `LIFE_S`.
+
+    Every second a segment at the far end of the world is unloaded, and loaded anew half a second later.
+    """
+
+    LIFE_S = 5.0
+    AREA = 160
+    """The players' side of the world, in blocks."""
+
+    def __init__(self) -> None:
+        self.alive: collections.deque[tuple[int, int]] = collections.deque()
+        """Until which tick, and who."""
+        self.counts = dict.fromkeys(("spawned", "removed", "segments_loaded"), 0)
+
+    def on_tick(self) -> None:
+        game, world = self.game, self.world
+        while self.alive and game.tick >= self.alive[0][0]:
+            game.remove(self.alive.popleft()[1])
+            self.counts["removed"] += 1
+        at = (game.random.uniform(2, self.AREA - 2), game.random.uniform(2, self.AREA - 2), 28.0)
+        self.alive.append((game.tick + game.ticks(self.LIFE_S), game.spawn("player", at)))
+        self.counts["spawned"] += 1
+        corner: Cell = (game.scene.size[0] - 1, game.scene.size[1] - 1, 0)
+        if game.tick % game.ticks(1.0) == 0:
+            world.unload_segment(corner)
+        elif corner not in world.blocks and game.tick % game.ticks(0.5) == 0:
+            world.load_segment(corner, generate(game.scene.terrain, corner))
+            self.counts["segments_loaded"] += 1
+
+    world: World
+    """The game's; rules have no business with segments."""
+
+
 class Stopwatch:
     """CPU time of a game's ticks, of what in them comes before the step, and of each garbage collection."""
 
@@ -177,10 +215,10 @@ class Stopwatch:
             self.collections.record(time.thread_time() - self._collection_began)
 
 
-VARIANTS: dict[str, tuple[str, Callable[[], Any]]] = {
-    "default": ("freeze", lambda: None),
-    "off": ("freeze", gc.disable),
-    "asyncio": ("_loop_factory", lambda: asyncio.new_event_loop),
+VARIANTS: dict[str, tuple[ModuleType, str, Callable[[], Any]]] = {
+    "default": (app, "freeze", lambda: None),
+    "off": (app, "freeze", gc.disable),
+    "asyncio": (process, "loop_factory", lambda: asyncio.new_event_loop),
 }
 """What the product does otherwise, and what does it instead."""
 
@@ -208,13 +246,19 @@ def main(argv: list[str]) -> int:
         return 0
     rules = load_scene(scene)
     warm_up(rules)
-    made = Game(rules)
+    churn = Churn() if kind == "churn" else None
+    made = Game(rules, rules=churn)
     plain_stats = made.stats
     more: list[Callable[[], dict[str, Any]]] = [lambda: {"entities_in_view": in_view(made)}]
+    if churn is not None:
+        churn.world = made.world
+        more.append(lambda: dict(churn.counts))
     if kind in ("product", *VARIANTS):
         more.append(Stopwatch(made).stats)
         if kind != "product":
-            setattr(app, *VARIANTS[kind])
+            module, name, other = VARIANTS[kind]
+            assert hasattr(module, name)
+            setattr(module, name, other)
     if kind == "profile":
         profile = Profile()
         more.append(lambda: {"samples": dict(profile.samples)})

@@ -1,7 +1,8 @@
 """A thousand players in one process, on the wire alone: no prediction, no world, one epoll. For `bench.py server`.
 
 argument  {"port", "seed", "rate", "joins_per_s"}, as JSON
-stdin     "clients N": have so many; "begin": the window begins; "end": it ends, tell; the end of the pipe: stop
+stdin     "clients N": have so many; "leaving N": the oldest leaves N times a second, and another one comes; "begin":
+          the window begins; "end": it ends, tell; the end of the pipe: stop
 stdout    a JSON object per line: {"playing", "gone"} at the reports, and the window's figures after "end"
 
 Every client says hello, pings once a second, acknowledges, and sends the input of each tick at a moment of its own
@@ -23,8 +24,9 @@ from typing import Any
 
 from websockets.speedups import apply_mask
 
+from server.histogram import between
 from shared import messages
-from shared.messages import Hello, Inputs, Ping, decode_from_server, encode
+from shared.messages import Bye, Hello, Inputs, Ping, decode_from_server, encode
 
 LEAD_TICKS = 2
 """An input goes out at most so long before the deadline of its tick, and up to a tick later."""
@@ -81,6 +83,7 @@ class Swarm:
         self.players: dict[int, Player] = {}
         self.by_slot: list[list[Player]] = [[] for _ in range(self.slots)]
         self.made = self.gone = self.wanted = 0
+        self.leaving_per_s = 0.0
         self.server_tick_0 = self.best = self.asked = -math.inf
         """The server's time in ticks at time 0 of the clock, by the quickest pong of the last second."""
         self.reset()
@@ -206,7 +209,7 @@ class Swarm:
         self.poll.register(0, select.EPOLLIN)
         os.set_blocking(0, False)
         slot, begun = 0, time.monotonic()
-        next_join = next_report = begun
+        next_join = next_report = next_leave = begun
         commands = b""
         while True:
             now = time.monotonic()
@@ -227,6 +230,9 @@ class Swarm:
                 self.join()
             elif len(self.players) > self.wanted:
                 self.drop(self.players[next(reversed(self.players))])
+            if self.leaving_per_s and now >= next_leave and self.players:
+                next_leave = max(now, next_leave) + 1 / self.leaving_per_s
+                self.leave(next(iter(self.players.values())))
             if now >= next_report:
                 next_report = now + REPORT_S
                 playing = sum(player.acked >= 0 for player in self.players.values())
@@ -248,6 +254,8 @@ class Swarm:
         match command:
             case ["clients", n]:
                 self.wanted = int(n)
+            case ["leaving", n]:
+                self.leaving_per_s = float(n)
             case ["begin"]:
                 gc.collect()
                 gc.freeze()
@@ -260,6 +268,12 @@ class Swarm:
         self.made += 1
         self.players[player.sock.fileno()] = player
         self.poll.register(player.sock.fileno(), select.EPOLLIN)
+
+    def leave(self, player: Player) -> None:
+        """Every other one says goodbye; the server waits for the return of those that do not."""
+        if player.number % 2:
+            self.out(player, frame(encode(Bye(messages.GOING_AWAY, "", -1.0))))
+        self.drop(player)
 
     def drop(self, player: Player) -> None:
         fd = player.sock.fileno()
@@ -291,17 +305,9 @@ class Swarm:
         }
 
 
-def quantiles(counts: list[int]) -> dict[str, int]:
+def quantiles(counts: list[int]) -> dict[str, float]:
     """p50, p99 and max of values counted by whole milliseconds, rounded up."""
-    found, total = {}, sum(counts)
-    for name, q in (("p50", 0.5), ("p99", 0.99), ("max", 1.0)):
-        left = q * total
-        for value, n in enumerate(counts):
-            left -= n
-            if n and left <= 1e-9:
-                found[name] = value + 1
-                break
-    return found
+    return between([], [(1000 * (ms + 1), n) for ms, n in enumerate(counts)])
 
 
 def say(what: dict[str, Any]) -> None:

@@ -15,7 +15,8 @@ event loop as the product has them and otherwise, in turns.
 `bytes` tells what one client is sent at 20 Hz while 100 entities (or N) move in its view, and that its copy of them is
 exact in every tick.
 
-`memory` tells the bytes per connection, entity and loaded segment, and what is in use after each cycle of churn.
+`memory` tells the bytes per connection, entity and loaded segment, and what is in use after each cycle of churn; the
+same of a server process over sockets, by what it has in RAM: between 200 and 400 clients, and in --minutes of churn.
 
 `entities` tells the CPU time of a tick with 100,000 entities, a tenth of them walking, before, while and after 200
 clients join.
@@ -39,6 +40,7 @@ import _bench_entities as entities
 import _bench_jitter as jitter
 import _bench_memory as memory
 import _bench_physics as physics
+import _bench_rss as rss
 import _step_c
 from _crowds import Samples
 from shared import kernels
@@ -168,6 +170,14 @@ def run_memory(args: argparse.Namespace, console: Console) -> int:
     after = report["bytes_after_each_cycle"]
     console.print(f"{after[0]:10,} bytes after a cycle of churn, and in the {len(after) - 1} after it more by")
     console.print("           " + " ".join(f"{b - a:,}" for a, b in itertools.pairwise(after)))
+    if sys.platform == "linux":
+        apart = report["rss_bytes_per_connection"] = rss.connections(args.rounds)
+        console.print(f"{statistics.median(apart):10,.0f} bytes of RSS per connection over sockets,", end=" ")
+        console.print("on servers apart: " + " ".join(f"{value:,.0f}" for value in apart))
+    if args.minutes:
+        report["churn"] = churn = rss.churn(args.minutes, lambda minute: console.print(f"  {minute}", soft_wrap=True))
+        console.print(f"{churn['slope_kb_per_minute']:+10,.1f} KB of RSS per minute of churn over sockets,", end=" ")
+        console.print(f"{churn['slope_kb_per_minute_second_half']:+,.1f} in the second half")
     if args.json:
         args.json.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
     return 0
@@ -219,7 +229,9 @@ def main(argv: list[str] | None = None) -> int:
     command.add_argument("--quick", action="store_true", help="ten seconds of one seed each")
     command.set_defaults(run=run_bytes)
     command = commands.add_parser("memory", help="bytes per connection, entity and segment, and under churn")
-    command.add_argument("--cycles", type=int, default=10, metavar="N", help="of churn, 2 s each (10)")
+    command.add_argument("--cycles", type=int, default=10, metavar="N", help="of churn in process, 2 s each (10)")
+    command.add_argument("--rounds", type=int, default=3, metavar="N", help="of connections over sockets (3; Linux)")
+    command.add_argument("--minutes", type=float, default=0.0, metavar="M", help="of churn over sockets (none; Linux)")
     command.add_argument("--json", type=Path, metavar="OUT", help="write all figures to this file")
     command.set_defaults(run=run_memory)
     command = commands.add_parser("entities", help="a tick of a large world")

@@ -11,6 +11,7 @@ from shared.scene import Scene
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "scripts"))
 import _bench_jitter as jitter
+import _bench_rss as rss
 import _bench_server as bench
 
 needs_linux = pytest.mark.skipif(sys.platform != "linux", reason="the generator polls with epoll")
@@ -103,3 +104,40 @@ def test_a_variants_quantiles_are_of_all_its_rounds_together() -> None:
     assert found["tick_lateness_ms"] == {"p50": 0.1, "p99": 0.1, "max": 40.0}
     assert found["tick_lateness_ms_of_rounds"]["p99"] == [0.1, 40.0]
     assert found["rss_mb"] == [1.0, 1.0]
+
+
+@needs_linux
+@pytest.mark.slow
+@pytest.mark.e2e
+def test_churn_over_sockets_leaves_nothing_behind(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(rss, "SETTLE_S", 18.0)  # who says no goodbye is kept for 15 s
+    told: list[bench.Figures] = []
+    found = rss.churn(1 / 3, told.append)
+    first, last = found["minutes"]
+    assert told == [first, last]
+    assert found["rules_failed"] == found["internal_errors"] == 0
+    assert last["joined"] > 100
+    assert last["removed"] == last["spawned"] > 300
+    assert last["segments_loaded"] > 10
+    for level, slack in (("clients", 5), ("players", 10), ("entities", 12), ("segments", 1)):
+        assert abs(last[level] - first[level]) <= slack, (level, first, last)
+    # A connection in process takes 8.5 KB, and over its socket 15.
+    assert (last["rss_mb"] - first["rss_mb"]) * 1e6 < 8_500 * last["joined"], (first, last)
+
+
+def test_the_slope_is_that_of_the_line() -> None:
+    assert rss.slope([(0.0, 100.0), (1.0, 100.5), (2.0, 101.0)]) == pytest.approx(500.0)
+    first = dict.fromkeys(("rss_mb", *rss.LEVELS, *rss.COUNTS), 7)
+    assert rss.sample(first, first | {"clients": 9, "joined": 10}, 0.25) == {
+        **dict.fromkeys(("rss_mb", *rss.LEVELS), 7),
+        **dict.fromkeys(rss.COUNTS, 0),
+        "minute": 0.25,
+        "clients": 9,
+        "joined": 3,
+    }
+
+
+def test_a_margin_is_where_nobody_appears() -> None:
+    scene = Scene.from_table({"name": "wide", **tomllib.loads(bench.scene_toml(20, 5, margin=3))})
+    assert scene.size[:2] == (5, 5)
+    assert all(max(x, y) < 2 * 32 for x, y, _ in scene.spawns)
