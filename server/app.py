@@ -249,7 +249,8 @@ def saved(scene: Scene, settings: Settings) -> Iterator[Store]:
     power = settings.durability == "power"
     store = Store(settings.data, scene, game=settings.game or "", power=power, checkpoint_s=settings.checkpoint_s)
     tick, state_hash = store.restored
-    logger.info("restored", directory=settings.data, tick=tick, state_hash=state_hash)
+    found = tick > 0 or store.kept is not None
+    logger.info("restored" if found else "a new world", directory=settings.data, tick=tick, state_hash=state_hash)
     try:
         yield store
     finally:

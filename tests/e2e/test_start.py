@@ -66,6 +66,14 @@ def fails(*arguments: str, **environment: str) -> str:
         return server.errors[0]
 
 
+def test_the_log_tells_a_new_world_from_one_that_goes_on(tmp_path: Path) -> None:
+    for event in ("a new world", "restored"):
+        with running("--port", "0", "--scene", "flat", "--data", str(tmp_path)) as server:
+            server.address()
+            assert server.end(signal.SIGTERM) == 0
+            assert server.log()[0]["event"] == event
+
+
 def test_bad_settings(tmp_path: Path) -> None:
     assert fails("--port", "x") == "error: port = 'x' (from --port): must be a whole number from 0 to 65535\n"
     assert "--prot 1 (did you mean --port?)" in fails("--prot", "1")
