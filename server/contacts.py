@@ -21,10 +21,15 @@ class Contacts:
         self._low, self._high = boxes[:, :3], boxes[:, :3] + boxes[:, 3:]
         self._widest = int(boxes[:, 3].max())
         self._touching: set[Pair] = set()
+        self._stepped = np.zeros(0, np.int64)
+
+    def stepped(self) -> None:
+        """A step is over: whom it has changed, the world forgets as soon as anything is written."""
+        self._stepped = self._world.changed[:, ID]
 
     def begun(self) -> list[Pair]:
-        """The pairs (a < b, ascending) that touch since the latest step and did not before it."""
-        changed = np.unique(self._world.changed[:, ID])
+        """The pairs (a < b, ascending) that touch since the latest step, or have been put so, and did not before it."""
+        changed = np.union1d(self._stepped, self._world.changed[:, ID])
         if not len(changed):
             return []
         now = self._touched(self._world.states(), changed)

@@ -199,6 +199,7 @@ class Game:
         self.stage.act()
         inputs = self._take_inputs()
         self.world.step(inputs)
+        self.stage.stepped()
         self.log.record()
         self.rewind.record()
         self.roster.fell_out()

@@ -305,6 +305,11 @@ class Stage:
                 self._call(self._rules.on_contact, a, b)
         self._call(self._rules.on_tick)
 
+    def stepped(self) -> None:
+        """The step is over."""
+        if self._told_contacts:
+            self._contacts.stepped()
+
     def tell(self, session: Session) -> None:
         """Files what the rules have said since the last tick for a client."""
         for entities, message in self._outgoing:

@@ -133,6 +133,17 @@ def test_contact_is_told_once_when_it_begins(table: Table, rules: Told) -> None:
     assert contacts[1][3] > begun + 10
 
 
+def test_a_contact_is_not_missed_in_a_tick_in_which_somebody_joins(table: Table, rules: Told) -> None:
+    game = table.game.stage
+    table.tick()
+    a, b = game.spawn("runner", (10.0, 16.0, 1.0)), game.spawn("runner", (12.0, 16.0, 1.0))
+    game.steer(a, 1, 0)
+    while not game.touching(a):
+        table.tick()
+    table.join()  # which is written ahead of the contacts of the step before
+    assert [told[:3] for told in rules.told if told[0] == "contact"] == [("contact", a, b)]
+
+
 def test_who_touches_now_is_told_however_long_it_lasts(table: Table) -> None:
     game = table.game.stage
     a, b, c = (game.spawn("runner", (x, 16.0, 1.0)) for x in (10.0, 11.0, 10.0 - 0.625))
