@@ -99,7 +99,7 @@ class ChangeLog:
         self._home: dict[int, Cell] = {
             entity: (x, y, z) for entity, (x, y, z) in zip(states[:, ID].tolist(), homes, strict=True)
         }
-        self._spans: dict[int, _Span | None] = {}
+        self._spans: dict[int, _Span] = {}
         self._parts: dict[int, _Parts] = {}
         self._packed: dict[Cell, tuple[int, bytes]] = {}
         self._packs_left = PACKS_PER_TICK
@@ -169,11 +169,6 @@ class ChangeLog:
         self._spans.clear()
         self._packs_left = PACKS_PER_TICK
 
-    def changed_segments(self, since: int) -> set[Cell] | None:
-        """The segments in which anything changed after tick `since`; None: too long ago to tell."""
-        span = self._span(since)
-        return None if span is None else span.segments
-
     def since(self, since: int) -> Mapping[Cell, bytes]:
         """Each segment's encoded changes after tick `since`, `KEYFRAME` or at most `HISTORY` ago; empty: none."""
         parts = self._parts.get(since)
@@ -186,7 +181,6 @@ class ChangeLog:
         if since == KEYFRAME:
             return self._keyframe(segment)
         span = self._span(since)
-        assert span is not None, "lost track"
         return self._changes(segment, since, span) if segment in span.segments else b""
 
     def packed(self, segment: Cell) -> bytes | None:
@@ -200,15 +194,16 @@ class ChangeLog:
             known = self._packed[segment] = (digest, pack(self._world.blocks.segment(segment)))
         return known[1]
 
-    def _span(self, since: int) -> _Span | None:
-        if since not in self._spans:
-            newest, span = self._world.tick, None
-            if newest - since <= HISTORY:
-                ticks = [tick for at in range(since + 1, newest + 1) if (tick := self._ticks.get(at)) is not None]
-                more = set().union(*(tick.more() for tick in ticks))
-                span = _Span(ticks, more.union(self._due, *(tick.changed for tick in ticks)), more)
-            self._spans[since] = span
-        return self._spans[since]
+    def _span(self, since: int) -> _Span:
+        span = self._spans.get(since)
+        if span is None:
+            newest = self._world.tick
+            assert newest - since <= HISTORY, "lost track"
+            ticks = [tick for at in range(since + 1, newest + 1) if (tick := self._ticks.get(at)) is not None]
+            more = set().union(*(tick.more() for tick in ticks))
+            changed = more.union(self._due, *(tick.changed for tick in ticks))
+            span = self._spans[since] = _Span(ticks, changed, more)
+        return span
 
     def _keyframe(self, segment: Cell) -> bytes:
         if segment in self._world.blocks:
