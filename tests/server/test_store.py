@@ -78,16 +78,27 @@ def play(store: Store, ticks: int, rng: random.Random) -> list[tuple[int, bytes]
 
 
 def crashed(store: Store, directory: Path) -> Path:
-    """What a process that dies now leaves behind, in another place: all its files as they are at one moment."""
-    copy = directory / f"crashed-{store.world.tick}"
+    """What a process that dies now, with all saved, leaves behind, in another place."""
+    until(lambda: store.durable_tick == store.world.tick)
+    return copied(directory / "data", directory / f"crashed-{store.world.tick}")
 
-    def copied() -> bool:
-        """Not while the store's thread writes: one file from before that and one from after it never were together."""
-        before = written(directory / "data")
-        shutil.copytree(directory / "data", copy, dirs_exist_ok=True)
-        return written(directory / "data") == before
 
-    until(lambda: store.durable_tick == store.world.tick and copied())
+def copied(directory: Path, copy: Path) -> Path:
+    """All files of a store as they are at one moment.
+
+    Not while its thread writes: one from before that and one from after it never were together, or one is gone.
+    """
+
+    def at_rest() -> bool:
+        shutil.rmtree(copy, ignore_errors=True)
+        try:
+            before = written(directory)
+            shutil.copytree(directory, copy)
+            return written(directory) == before
+        except (FileNotFoundError, shutil.Error):
+            return False
+
+    until(at_rest)
     return copy
 
 

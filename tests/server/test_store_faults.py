@@ -15,7 +15,7 @@ from server import database
 from server import store as stores
 from server.database import Database, StoreError
 from server.store import Store
-from tests.server.test_store import SCENE, crashed, keep, play, until
+from tests.server.test_store import SCENE, copied, crashed, keep, play, until
 
 HEAD = 32
 """Bytes of the head of a -wal file."""
@@ -170,6 +170,15 @@ def stepping(store: Store, rng: random.Random, condition: Callable[[], bool]) ->
 FULL = sqlite3.OperationalError("database or disk is full")
 
 
+def into_trouble(store: Store, disk: Disk, rng: random.Random, error: Exception = FULL) -> tuple[int, bytes]:
+    """Plays 30 ticks that are saved, and then until it is noticed that nothing is any more; what was saved."""
+    saved = play(store, 30, rng)[-1]
+    until(lambda: store.durable_tick == 30)
+    disk.error = error
+    stepping(store, rng, lambda: bool(store.trouble))
+    return saved
+
+
 @pytest.mark.parametrize(
     ("error", "said"), [(FULL, "database or disk is full"), (RuntimeError("a bug"), "internal error")]
 )
@@ -177,16 +186,12 @@ def test_no_room_is_told_and_made_up_for_once_there_is_some(
     disk: Disk, store: Store, tmp_path: Path, caplog: pytest.LogCaptureFixture, error: Exception, said: str
 ) -> None:
     rng = random.Random(1)
-    before = play(store, 30, rng)
-    until(lambda: store.durable_tick == 30)
-    disk.error = error
-    stepping(store, rng, lambda: bool(store.trouble))
+    saved = into_trouble(store, disk, rng, error)
     assert store.trouble == said
     assert store.stats()["save_trouble"] == said
     play(store, 50, rng)
     assert store.durable_tick == 30  # what was told until then is all that may be told
-    shutil.copytree(tmp_path / "data", tmp_path / "then")
-    assert found_in(tmp_path / "then") == before[-1]
+    assert found_in(copied(tmp_path / "data", tmp_path / "then")) == saved
     disk.error = None
     stepping(store, rng, lambda: not store.trouble)
     play(store, 20, rng)
@@ -201,16 +206,12 @@ def test_a_crash_in_the_middle_of_making_up_finds_the_world_before_or_after(
     disk: Disk, store: Store, tmp_path: Path
 ) -> None:
     rng = random.Random(1)
-    before = play(store, 30, rng)
-    until(lambda: store.durable_tick == 30)
-    disk.error = FULL
-    stepping(store, rng, lambda: bool(store.trouble))
+    saved = into_trouble(store, disk, rng)
     disk.error = None
     disk.free.clear()  # the checkpoint that closes the gap waits
     stepping(store, rng, lambda: not store._gap)
     hashes = dict(play(store, 20, rng))
-    shutil.copytree(tmp_path / "data", tmp_path / "then")
-    assert found_in(tmp_path / "then") == before[-1]
+    assert found_in(copied(tmp_path / "data", tmp_path / "then")) == saved
     assert store.durable_tick == 30
     disk.free.set()
     stepping(store, rng, lambda: not store.trouble)
@@ -255,13 +256,9 @@ def test_the_end_of_a_store_in_trouble_tries_once_more(disk: Disk, tmp_path: Pat
     store = Store(tmp_path / "data", SCENE, compiled=False)
     store.start(keep)
     rng = random.Random(1)
-    before = play(store, 30, rng)
-    until(lambda: store.durable_tick == 30)
-    disk.error = FULL
-    stepping(store, rng, lambda: bool(store.trouble))
+    saved = into_trouble(store, disk, rng)
     assert not store.close()
-    shutil.copytree(tmp_path / "data", tmp_path / "then")
-    assert found_in(tmp_path / "then") == before[-1]
+    assert found_in(copied(tmp_path / "data", tmp_path / "then")) == saved
     store = Store(tmp_path / "data", SCENE, compiled=False)
     store.start(keep)
     disk.error = None
