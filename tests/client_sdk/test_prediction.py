@@ -6,7 +6,7 @@ from typing import Any
 import msgpack
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from client_sdk.prediction import NONDETERMINISM, Prediction
@@ -338,7 +338,6 @@ TABLES = st.dictionaries(
 )
 
 
-@settings(derandomize=True, deadline=None)
 @given(TABLES)
 def test_any_table_is_a_scene_or_a_protocol_error(changes: dict[str, Any]) -> None:
     try:

@@ -452,7 +452,7 @@ ACTS = st.one_of(
 )
 
 
-@settings(derandomize=True, deadline=None, max_examples=60)
+@settings(max_examples=60)
 @given(st.lists(ACTS, max_size=60))
 def test_any_schedule_comes_to_an_honest_path(schedule: list[tuple[str, int, bytes]]) -> None:
     cheat = Cheat(plain())

@@ -209,7 +209,7 @@ ACTS = st.one_of(
 )
 
 
-@settings(derandomize=True, deadline=None, max_examples=60)
+@settings(max_examples=60)
 @given(st.lists(ACTS, max_size=30))
 def test_nothing_that_clients_do_raises_or_stops_the_tick(acts: list[tuple[str, int, Any]]) -> None:
     table = Table(Limits(clients_max=3, hello_s=2.0, silence_s=3.0, stalled_s=2.0))

@@ -511,7 +511,7 @@ def outcome(chunks: list[bytes], *, plain: bool) -> tuple[list[bytes], list[int]
     return notes.messages, notes.lost_sessions, bytes(wire.written)
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=300)
 @given(st.lists(st.one_of(DATA, DATA, CONTROL, ODD), max_size=12), st.lists(st.integers(0, 2000), max_size=8))
 def test_cut_here_or_parsed_by_websockets_comes_to_the_same(frames: list[bytes | int], cuts: list[int]) -> None:
     whole = [binary(bytes(frame)) if isinstance(frame, int) else frame for frame in frames]

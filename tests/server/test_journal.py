@@ -271,7 +271,7 @@ WORLD.end_recording()
 DATA = FILE.getvalue()
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=300)
 @given(at=st.integers(0, len(DATA) * 8 - 1))
 def test_a_flipped_bit_is_found_wherever_it_is(at: int) -> None:
     data = bytearray(DATA)
@@ -280,7 +280,7 @@ def test_a_flipped_bit_is_found_wherever_it_is(at: int) -> None:
         read(bytes(data))
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 @given(st.data())
 def test_a_record_left_out_doubled_or_exchanged_is_found(draw: st.DataObject) -> None:
     records, at = [], len(MAGIC) + 2

@@ -161,7 +161,7 @@ def through(ray: Ray, low: tuple[float, ...], high: tuple[float, ...]) -> Fracti
     return first if first < last and ray.distance(first) <= ray.length else None
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=300)
 @given(VEC, DIRECTION, st.floats(0, 9), VEC, st.tuples(*[st.integers(1, 40).map(lambda n: n / 16)] * 3))
 def test_a_box_is_hit_where_brute_force_says(origin: Vec, way: Vec, length: float, low: Vec, size: Vec) -> None:
     ray = Ray(origin, way, length)
@@ -169,7 +169,7 @@ def test_a_box_is_hit_where_brute_force_says(origin: Vec, way: Vec, length: floa
     assert ray.enters(low, high) == through(ray, low, high)
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 @given(VEC, DIRECTION, st.floats(0, 4), st.randoms(use_true_random=False))
 def test_the_first_block_is_the_one_that_brute_force_finds(
     origin: Vec, way: Vec, length: float, rng: random.Random
@@ -262,7 +262,7 @@ def test_what_is_not_loaded_stops_a_ray_and_the_void_does_not() -> None:
     assert past.ray((31.5, 0.5, -3.5), (0, 0, -1), 99) == []
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 @given(VEC, DIRECTION, st.integers(0, 1 << 30))
 def test_all_hits_are_those_of_brute_force(origin: Vec, way: Vec, seed: int) -> None:
     rng = random.Random(seed)

@@ -1,6 +1,6 @@
 """One input per tick: what becomes of each, told exactly, whatever a client sends."""
 
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from server.session import InputQueue, Session
@@ -189,7 +189,6 @@ MESSAGES = st.tuples(
 )
 
 
-@settings(derandomize=True, deadline=None)
 @given(st.lists(st.tuples(st.lists(MESSAGES, max_size=3), st.booleans()), max_size=80))
 def test_every_input_of_any_client_has_one_fate_and_memory_is_bounded(
     ticks: list[tuple[list[tuple[int, int]], bool]],

@@ -287,7 +287,7 @@ def mutated(draw: st.DrawFn) -> bytes:
     return bytes(data)
 
 
-@settings(derandomize=True, deadline=None, max_examples=300)
+@settings(max_examples=300)
 @given(st.one_of(st.binary(max_size=300), (structures | near_misses).map(msgpack.packb), mutated()))
 def test_any_bytes_are_a_message_or_a_protocol_error(data: bytes) -> None:
     for decode in (decode_from_client, decode_from_server):

@@ -1,6 +1,6 @@
 """A ring forgets by tick, and by nothing else."""
 
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from shared.ring import Ring
@@ -49,7 +49,6 @@ def test_cleared_it_has_nothing_and_goes_on() -> None:
     assert ring.get(4) == 4
 
 
-@settings(derandomize=True, deadline=None)
 @given(st.integers(1, 9), st.lists(st.integers(-30, 30)))
 def test_it_holds_what_was_put_last_in_each_place(size: int, ticks: list[int]) -> None:
     ring: Ring[int] = Ring(size)

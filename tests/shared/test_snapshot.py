@@ -6,7 +6,7 @@ from typing import Any
 import msgpack
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from shared.blocks import BLOCKS, PACKED_MAX, pack, unpack
@@ -82,7 +82,6 @@ states = st.tuples(
 )  # fmt: skip
 
 
-@settings(derandomize=True, deadline=None)
 @given(
     cells,
     st.integers(-1, TICK_MAX),
@@ -207,7 +206,6 @@ anything = st.recursive(
 field = st.sampled_from(["x", "y", "z", "ago", "heads", "tails", "rows", "gone", "edits", "check"])
 
 
-@settings(derandomize=True, deadline=None)
 @given(st.lists(st.one_of(anything, st.dictionaries(field, anything, max_size=2).map(lambda f: part_of(**f)))))
 def test_any_value_is_a_part_or_a_protocol_error(segments: list[Any]) -> None:
     try:
@@ -244,7 +242,6 @@ def test_what_is_not_one_packed_segment_is_refused(data: bytes) -> None:
         unpack(data)
 
 
-@settings(derandomize=True, deadline=None)
 @given(st.binary(max_size=80), st.integers(0, 60), st.integers(0, 7))
 def test_any_bytes_unpack_to_a_segment_or_a_value_error(data: bytes, at: int, bit: int) -> None:
     flipped = bytearray(pack(np.arange(BLOCKS, dtype=np.uint64).astype(np.uint8)))
