@@ -3,8 +3,8 @@
 websockets parses (its Sans-I/O `ServerProtocol`; only plain messages are cut out here), asyncio moves bytes, and there
 is no task and no await per connection: what arrives is handed to the game in the call that brings it, what the game
 sends is written in the call that sends it. Nothing here waits for a client. asyncio's flow control (`pause_writing`)
-has no effect: the game looks at `outstanding()` before it sends, and what only a flood of pings could queue ends in
-an abort.
+has no effect: the game looks at `outstanding()` before it sends. What the game does not get, and so cannot count
+(pings, fragments, whatever comes after the end), is bounded here: who sends too much of it is aborted.
 
 The life of a connection: handshake (or an HTTP page) -> `game.open` -> `game.receive` ... -> `game.lost`, exactly
 once, as soon as the peer has closed, broken the protocol or gone. A stage that has a peer to wait for has a limit.
@@ -42,8 +42,10 @@ if sys.platform == "linux":
 
 CLOSE_S = 2.0
 """A peer that does not finish closing by then is aborted."""
-BACKLOG_BYTES_MAX = 1 << 20
-"""A peer that lets its answers to pings pile up to this is aborted."""
+EXTRAS_PER_S = 256
+"""So are one that sends more pings, pongs and fragments, of 6 us each,"""
+DEAF_BYTES_MAX = 64 * 1024
+"""and one that sends more than this after its connection has been closed."""
 OPCODES = frozenset(Opcode)
 FINAL_BINARY = 0x82
 MASKED = 0x80
@@ -164,6 +166,8 @@ class Connection(asyncio.Protocol):
         self._timer_is_last = False
         self._session: Any = None
         self._deaf = False  # set when this side closes: what still comes is not the game's business
+        self._unheard = 0  # bytes that have come since then
+        self._extras, self._extras_since = 0, 0.0  # frames that are no plain message, in a second that began then
         self._plain = True  # false from the first frame on that only websockets may judge
         self._tail = b""  # of a plain stream: the beginning of a frame
         self._fragments = bytearray()
@@ -217,6 +221,11 @@ class Connection(asyncio.Protocol):
         if protocol.state is CONNECTING and not protocol.eof_sent:
             data = self._shake_hands(data)
             if not data:
+                return
+        if self._deaf:
+            self._unheard += len(data)
+            if self._unheard > DEAF_BYTES_MAX:
+                self.abort()
                 return
         if self._plain:
             self._cut(data)
@@ -306,7 +315,7 @@ class Connection(asyncio.Protocol):
                 length, mask = data[at + 2] << 8 | data[at + 3], at + 4
             elif length == 127 and size - at >= 10:
                 length, mask = int.from_bytes(data[at + 2 : at + 10], "big"), at + 10
-            odd = second < MASKED or length > CLIENT_MESSAGE_MAX or self._deaf
+            odd = second < MASKED or length > CLIENT_MESSAGE_MAX
             if odd or (first != FINAL_BINARY and first & 15 not in OPCODES):
                 self._plain = False
                 self._parse(data[at:])
@@ -315,15 +324,27 @@ class Connection(asyncio.Protocol):
             if end > size:
                 break
             if first == FINAL_BINARY and not self._fragmented:
-                self._deliver(apply_mask(data[start:end], data[mask:start]))
+                if not self._deaf:
+                    self._deliver(apply_mask(data[start:end], data[mask:start]))
+            elif self._floods():
+                self.abort()
+                return
             else:
                 self._parse(data[at:end])
-                if self._protocol.state is not OPEN:
+                if self._protocol.eof_sent:  # from here on it throws away what comes
                     self._plain = False
                     self._parse(data[end:])
                     return
             at = end
         self._tail = data[at:]
+
+    def _floods(self) -> bool:
+        """Counts a frame that is no plain message; whether that is one too many."""
+        now = time.monotonic()
+        if now - self._extras_since >= 1:
+            self._extras, self._extras_since = 0, now
+        self._extras += 1
+        return self._extras > EXTRAS_PER_S
 
     def _parse(self, data: bytes) -> None:
         """Has websockets parse: it answers pings and closes where it must, and the game gets the messages."""
@@ -334,14 +355,16 @@ class Connection(asyncio.Protocol):
 
     def _take(self, frame: Frame) -> None:
         """One frame that websockets found in order; it has answered pings and the peer's closing by then."""
+        if frame.opcode not in (Opcode.TEXT, Opcode.BINARY, Opcode.CONT):
+            return
+        was, self._fragmented = self._fragmented, not frame.fin
         if self._deaf:
             return
-        if frame.opcode is Opcode.BINARY and frame.fin:
-            self._deliver(bytes(frame.data))
-        elif frame.opcode is Opcode.TEXT:
+        if frame.opcode is Opcode.TEXT:
             self.close(CloseCode.UNSUPPORTED_DATA, "text message: binary ones only")
-        elif frame.opcode is Opcode.BINARY or frame.opcode is Opcode.CONT:
-            self._fragmented = not frame.fin
+        elif frame.fin and not was:
+            self._deliver(bytes(frame.data))
+        else:
             self._fragments += frame.data
             if frame.fin:
                 message = bytes(self._fragments)
@@ -370,8 +393,6 @@ class Connection(asyncio.Protocol):
                 transport.close()
         if self._protocol.close_expected():
             self._last_limit()
-        if transport.get_write_buffer_size() > BACKLOG_BYTES_MAX:
-            transport.abort()
 
     def _lose(self) -> None:
         """Tells the game, once, that the session is over."""

@@ -446,16 +446,40 @@ async def test_outstanding_is_harmless_after_a_reset(bench: Bench) -> None:
     assert link.outstanding() == 0
 
 
-async def test_pings_whose_answers_are_not_read_do_not_pile_up(bench: Bench) -> None:
-    peer = await bench.client(limit=1024)
+EXTRAS = {
+    "pings": masked(Opcode.PING, b""),
+    "pongs": masked(Opcode.PONG, b""),
+    "fragments": masked(Opcode.BINARY, b"", fin=False) + masked(Opcode.CONT, b""),
+}
+
+
+@pytest.mark.parametrize("flood", EXTRAS)
+async def test_a_flood_of_what_is_no_message_ends_in_an_abort(bench: Bench, flood: str) -> None:
+    peer, other = await bench.client(), await bench.client()
+    peer.write(EXTRAS[flood] * 5000)
+    assert len(await peer.end()) <= 2 * module.EXTRAS_PER_S
+    await bench.until(lambda: bench.notes.lost_sessions == [1])
+    assert len(bench.notes.messages) < module.EXTRAS_PER_S
+    other.write(EXTRAS[flood] * 100, binary(b"echo"))
+    while (await other.frame())[1] != b"echo":
+        pass
+
+
+async def test_what_comes_after_the_end_is_not_parsed_and_too_much_of_it_ends_in_an_abort(bench: Bench) -> None:
+    peer = await bench.client()
     (connection,) = bench.gateway.connections
-    pings = masked(Opcode.PING, bytes(125)) * 1000
-    async with asyncio.timeout(30):
-        while connection in bench.gateway.connections:
-            if peer.writer.transport.get_write_buffer_size() < len(pings):
-                peer.write(pings)
-            await asyncio.sleep(0)
-    await bench.all_gone()
+    parsed: list[int] = []
+    receive_data = connection._protocol.receive_data
+    connection._protocol.receive_data = lambda data: (parsed.append(len(data)), receive_data(data))[1]  # type: ignore[method-assign]
+    peer.write(binary(b"leave"), binary(b"more") * 1000, masked(Opcode.PING, b"?"))
+    assert (await peer.frame())[0] == 0x88
+    assert await peer.frame() == (0x8A, b"?")
+    assert parsed == [len(masked(Opcode.PING, b"?"))]
+    while connection in bench.gateway.connections and not peer.writer.transport.is_closing():
+        peer.write(binary(b"more") * 1000)
+        await asyncio.sleep(0)
+    assert bench.notes.messages == [b"leave"]
+    assert len(parsed) == 1
 
 
 class Wire(asyncio.Transport):
@@ -468,6 +492,9 @@ class Wire(asyncio.Transport):
 
     def write(self, data: bytes | bytearray | memoryview) -> None:
         self.written += data
+
+    def abort(self) -> None:
+        raise AssertionError("no flood")
 
     def can_write_eof(self) -> bool:
         return True
