@@ -7,7 +7,6 @@ import pygame
 
 from _play_figures import INK, IT, WHITE, Actor, font
 from _play_iso import Colour
-from client_sdk.client import Client
 
 KEYS = (
     "WASD / arrows: walk    Space: jump    left / right mouse: dig / place    1-6: colour    "
@@ -16,11 +15,6 @@ KEYS = (
 FAINT: Colour = (168, 182, 206)
 TOAST_S = 4.0
 MARGIN = 14
-
-
-def network_lines(client: Client, lag_s: float) -> list[tuple[str, str]]:
-    """The figures of the connection, by name."""
-    return [("added latency", f"{lag_s * 1000:.0f} ms"), *client.stats.figures()]
 
 
 class Slider:
@@ -80,7 +74,7 @@ class Hud:
         clock = "" if left_s is None else f"{int(left_s) // 60}:{int(left_s) % 60:02}"
         top = _panel(title, clock, 30)
         target.blit(top, ((width - top.get_width()) // 2, MARGIN))
-        table = _table("The network", tuple(network), ())
+        table = _table("The network", (("added latency", f"{lag_s * 1000:.0f} ms"), *network), ())
         target.blit(table, (MARGIN, MARGIN))
         self.slider.draw(target, pygame.Rect(MARGIN, MARGIN + table.get_height() + 6, table.get_width(), 34), lag_s)
         scores = _scores(actors)

@@ -15,32 +15,34 @@ import numpy as np
 import numpy.typing as npt
 import pygame
 
+from scripts.examples.tag import LEAVES, TRUNK
 from shared.blocks import AIR, Blocks
 from shared.checks import Cell
+from shared.terrain import GRASS, SOIL, STONE, WALL
 from shared.units import SEGMENT
 
 HALF, QUARTER, RISE = 24, 12, 26
 """Half the width and half the height of a block's top, and the height of its sides, in pixels."""
 AROUND = 6
 """Blocks that far outside of a segment count for its shadows."""
-SUN = ((-0.75, -0.35, 1.0), range(1, 11))
-"""Where the sun is from a block, and the steps in which shadows are looked for."""
+SUN = [(round(-0.45 * step), round(-0.21 * step), round(0.6 * step)) for step in range(1, 11)]
+"""The ways from a block towards the sun on which there may be another that throws its shadow; within `AROUND`."""
 SKY = (1, 2, 3)
 """The colour of a picture that is not drawn."""
-GRASS_KIND, SOIL_KIND = 3, 2
 
 Colour = tuple[int, int, int]
 Point = tuple[float, float]
 Bytes = npt.NDArray[np.uint8]
 
 PALETTE: dict[int, Colour] = {
-    1: (132, 138, 150), SOIL_KIND: (156, 116, 80), GRASS_KIND: (128, 190, 92), 4: (206, 192, 168),
-    5: (124, 90, 62), 6: (78, 152, 88),
+    STONE: (132, 138, 150), SOIL: (156, 116, 80), GRASS: (128, 190, 92), WALL: (206, 192, 168),
+    TRUNK: (124, 90, 62), LEAVES: (78, 152, 88),
 }  # fmt: skip
 CHOICE: tuple[Colour, ...] = (
     (226, 122, 84), (240, 196, 96), (96, 172, 214), (154, 124, 206), (236, 236, 232), (84, 92, 110),
 )  # fmt: skip
-"""Colours of the kinds from 7 on, in turn: those that players place."""
+"""Colours of the kinds from `FIRST_KIND` on, in turn: those that players place."""
+FIRST_KIND = 7
 
 
 class Face(NamedTuple):
@@ -63,7 +65,7 @@ def unproject(px: float, py: float, z: float) -> Point:
 
 def colour_of(kind: int) -> Colour:
     """The colour of a kind of block in full light."""
-    return PALETTE.get(kind) or CHOICE[(kind - 7) % len(CHOICE)]
+    return PALETTE.get(kind) or CHOICE[(kind - FIRST_KIND) % len(CHOICE)]
 
 
 def mixed(colour: Sequence[int], share: float, other: Sequence[int] = (0, 0, 0)) -> Colour:
@@ -231,14 +233,9 @@ def _drawn(kinds: Bytes, segment: Cell, check: int) -> Picture:
 
 def _light(solid: npt.NDArray[np.bool_]) -> npt.NDArray[np.float64]:
     """How bright the top of each block of the segment is: shadows of the sun, and corners that see less of the sky."""
-    inner = slice(AROUND, AROUND + SEGMENT)
     deep, wide = solid.shape[0], SEGMENT + 2 * AROUND
-    (sx, sy, sz), steps = SUN
     dark = np.zeros((SEGMENT, SEGMENT, SEGMENT))
-    for step in steps:
-        i, j, k = round(sx * step * 0.6), round(sy * step * 0.6), max(1, round(sz * step * 0.6))
-        if abs(i) > AROUND or abs(j) > AROUND or k > AROUND:
-            break
+    for i, j, k in SUN:
         ahead = solid[k : SEGMENT + k, AROUND + j : AROUND + j + SEGMENT, AROUND + i : AROUND + i + SEGMENT]
         dark[: len(ahead)] = np.maximum(dark[: len(ahead)], ahead)
     above = np.zeros((SEGMENT, wide, wide))
@@ -249,7 +246,6 @@ def _light(solid: npt.NDArray[np.bool_]) -> npt.NDArray[np.float64]:
     )  # fmt: skip
     height = np.arange(SEGMENT)[:, None, None] / SEGMENT
     light: npt.NDArray[np.float64] = (0.86 + 0.34 * height) * (1 - 0.26 * dark) * (1 - 0.045 * near)
-    assert light.shape == solid[:SEGMENT, inner, inner].shape
     return light
 
 
@@ -258,18 +254,17 @@ def _faces(cell: Cell, kind: int, seen: Sequence[bool], light: float) -> list[Fa
     x, y, z = cell
     grain = 1 + ((x * 73 ^ y * 151 ^ z * 57) * 2654435761 >> 7) % 16 / 200 - 0.04
     base = mixed(colour_of(kind), grain)
-    side = mixed(colour_of(SOIL_KIND), grain) if kind == GRASS_KIND else base
+    side = mixed(colour_of(SOIL), grain) if kind == GRASS else base
+    corner = (x + 1, y)
     faces = []
-    if seen[1]:
-        a, b = (x, y), (x + 1, y)
-        faces.append(_upright(a, b, z, 1.0, mixed(side, 0.84)))
-        if kind == GRASS_KIND:
-            faces.append(_upright(a, b, z, 0.3, mixed(base, 0.8), 0.7))
-    if seen[2]:
-        a, b = (x + 1, y), (x + 1, y + 1)
-        faces.append(_upright(a, b, z, 1.0, mixed(side, 0.64)))
-        if kind == GRASS_KIND:
-            faces.append(_upright(a, b, z, 0.3, mixed(base, 0.64), 0.7))
+    for shows, a, b, shade, rim in (
+        (seen[1], (x, y), corner, 0.84, 0.8),
+        (seen[2], corner, (x + 1, y + 1), 0.64, 0.64),
+    ):
+        if shows:
+            faces.append(_upright(a, b, z, 1.0, mixed(side, shade)))
+            if kind == GRASS:
+                faces.append(_upright(a, b, z, 0.3, mixed(base, rim), 0.7))
     if seen[0]:
         faces.append(Face(top_of(cell), mixed(base, light) if light <= 1 else mixed(base, 2 - light, (255, 255, 220))))
     return faces

@@ -2,7 +2,8 @@
 
 import math
 
-from _play_window import FIRST_KIND, Window, Wish
+from _play_iso import FIRST_KIND
+from _play_window import Window, Wish
 from client_sdk.events import Answered, Happened
 from client_sdk.picture import View
 from scripts.examples.tag_brain import TagPlayer
@@ -64,7 +65,7 @@ class Script:
             self._placed_at = now
         if self._plan and now > self._placed_at:
             self._placed_at = now + 0.15
-            self._asked.add(window.edit(self._plan[0], FIRST_KIND + len(self._plan) % 3))
+            self._asked.add(window.client.edit(*self._plan[0], FIRST_KIND + len(self._plan) % 3))
             self._plan.pop(0)
         if self._plan:
             return 0.0, 0.0, False
@@ -89,9 +90,9 @@ class Script:
         assert ghost is not None
         behind = math.dist(ghost.confirmed.position(view.me.entity), me)
         room = min((math.dist(figure.position, me) for figure in view.others), default=9.0)
-        near = sum(window.shown(figure.position) for figure in (view.me, *view.others))
+        near = sum(window.shown(figure.position) for figure in view.figures)
         good = near >= TOGETHER and behind > 0.7 and room > 1.8 and 0.4 < now - self._tagged_at < 3
         if good or now - self._began > PATIENCE_S:
-            self.done["in sight"] = len(view.others) + 1
+            self.done["in sight"] = len(view.figures)
             window.save(self._path)
             window.over = "the script has ended"

@@ -1,5 +1,6 @@
 """The window: a client's picture of the world, and the keyboard and mouse of who plays."""
 
+import functools
 import math
 from collections.abc import Mapping
 from typing import Any, Protocol
@@ -7,8 +8,8 @@ from typing import Any, Protocol
 import pygame
 
 from _play_figures import INK, OWN, TONES, WHITE, Actor, draw_ghost, label, screen
-from _play_hud import Hud, network_lines
-from _play_iso import CHOICE, Colour, Ground, Point, colour_of, project, target_of, top_of
+from _play_hud import Hud
+from _play_iso import CHOICE, FIRST_KIND, Colour, Ground, Point, colour_of, project, target_of, top_of
 from client_sdk.client import Client
 from client_sdk.events import Answered, Disconnected, Diverged, Event, Happened, Left, Resumed
 from client_sdk.links import Path
@@ -17,7 +18,6 @@ from shared.checks import Cell, Vec
 
 SIZE = 1280, 800
 SKY = (122, 184, 232), (222, 240, 250)
-FIRST_KIND = 7
 LAG_STEP_S, LAG_MAX_S = 0.05, 1.0
 Wish = tuple[float, float, bool]
 """A direction (east, north), and whether to jump."""
@@ -33,7 +33,6 @@ class Pilot(Protocol):
 
     def __call__(self, window: "Window", view: View, now: float) -> Wish:
         """The wish from now on; called once per frame while playing."""
-        ...
 
 
 class Window:
@@ -73,18 +72,14 @@ class Window:
         view = self.client.view(now)
         for event in self.events:
             self._take(event, view, now)
-        for key in pygame.event.get():
-            self._handle(key, view)
+        for act in pygame.event.get():
+            self._handle(act, view)
         if self.client.playing:
             x, y, jump = self._pilot(self, view, now)
             self.client.set_input(x, y, jump=jump)
         self.client.update(now)
         self._draw(self.client.view(now), now)
         self._at = now
-
-    def edit(self, cell: Cell, kind: int) -> int:
-        """Places (kind 1 to 255) or removes (0) a block; the number of the answer."""
-        return self.client.edit(*cell, kind)
 
     def lag(self, seconds: float) -> None:
         """Adds so much to the round trip."""
@@ -137,7 +132,8 @@ class Window:
         elif event.type == pygame.MOUSEBUTTONDOWN and event.button in (1, 3):
             found = self._pointed(view)
             if found is not None and self.client.playing:
-                self.edit(found[0] if event.button == 1 else found[1], 0 if event.button == 1 else self.kind)
+                cell, kind = (found[0], 0) if event.button == 1 else (found[1], self.kind)
+                self.client.edit(*cell, kind)
 
     def _pointed(self, view: View) -> tuple[Cell, Cell] | None:
         """The block under the mouse that is within reach, and the free cell before it."""
@@ -186,7 +182,7 @@ class Window:
             title=self.title,
             left_s=left_s,
             actors=self.actors,
-            network=network_lines(self.client, self.lag_s),
+            network=self.client.stats.figures(),
             lag_s=self.lag_s,
             choice=colour_of(self.kind),
         )
@@ -195,7 +191,7 @@ class Window:
     def _cast(self, view: View) -> list[Actor]:
         """The figures in sight, with what the game says of them."""
         found = []
-        for figure in (*view.others, *([view.me] if view.me else [])):
+        for figure in view.figures:
             own = figure is view.me
             safe = figure.attributes.get("safe", 0)
             safe = isinstance(safe, int) and safe > view.tick
@@ -243,23 +239,18 @@ def keyboard(window: Window, view: View, now: float) -> Wish:
     return x / length, y / length, held[pygame.K_SPACE]
 
 
-_skies: dict[tuple[int, int], pygame.Surface] = {}
-
-
+@functools.lru_cache(1)
 def _sky(size: tuple[int, int]) -> pygame.Surface:
     """A gradient from above to below."""
-    if size not in _skies:
-        strip = pygame.Surface((1, 2))
-        strip.set_at((0, 0), SKY[0])
-        strip.set_at((0, 1), SKY[1])
-        _skies.clear()
-        _skies[size] = pygame.transform.smoothscale(strip.convert(), size)
-    return _skies[size]
+    strip = pygame.Surface((1, 2))
+    strip.set_at((0, 0), SKY[0])
+    strip.set_at((0, 1), SKY[1])
+    return pygame.transform.smoothscale(strip.convert(), size)
 
 
 def _sentence(name: str, data: Any, view: View) -> str:
     """What has happened, in words; other games than tag say it as it came."""
-    figures = {figure.entity: figure for figure in (*view.others, *([view.me] if view.me else []))}
+    figures = {figure.entity: figure for figure in view.figures}
 
     def called(entity: Any) -> str:
         figure = figures.get(entity)
