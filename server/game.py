@@ -45,6 +45,8 @@ from shared.scene import Scene
 
 RESYNC_S = 1.0
 """A client may ask for everything anew so often."""
+BURST_TICKS = 32
+"""A client may send so many ticks' worth of messages at once, and as many more as the server itself is behind."""
 AWAY_S = 1.0
 """A tick that begins so late says nothing about the clients."""
 
@@ -118,7 +120,7 @@ class Game:
             return
         session.heard = now
         session.allowance -= 1
-        if session.allowance < -32 * self.limits.messages_per_tick:
+        if session.allowance < -BURST_TICKS * self.limits.messages_per_tick and not self._owes(session, now):
             self._kick(session, messages.MALFORMED, "too many messages")
             return
         if len(data) > self.limits.message_bytes_max:
@@ -139,7 +141,8 @@ class Game:
         elif isinstance(message, Ping):
             tick = self.world.tick + 1 - self._ticks_left(now)
             session.send(encode(Pong(message.sent, tick)))
-            self.counters.corrections += max(message.corrections - session.corrections, 0)
+            if session.corrections >= 0:  # what it begins with has been told over the connection before
+                self.counters.corrections += max(message.corrections - session.corrections, 0)
             session.corrections = max(message.corrections, session.corrections)
         elif isinstance(message, Hello) and not session.entity and session.hello is None:
             self._hello(session, message, now)
@@ -207,10 +210,11 @@ class Game:
         self._check_clocks(now)
 
     def _excuse(self, deadline: float, now: float) -> None:
-        """Whoever was not heard of while the server itself had no turn (it was suspended) is not to blame."""
+        """The time in which the server itself had no turn (it was suspended) is counted against nobody."""
         if now - deadline > AWAY_S:
             for session in self.sessions:
                 session.opened = session.heard = session.sent_at = now
+            self.roster.excuse(now - deadline, now)
 
     def _join(self) -> None:
         joining = [session for session in self.sessions if session.hello is not None and not session.closed]
@@ -247,13 +251,16 @@ class Game:
     def _send(self, now: float) -> None:
         self.orders.answer()
         for session in tuple(self.sessions):
-            if session.allowance < 0:
-                session.allowance = min(session.allowance + self.limits.messages_per_tick, 0.0)
+            if session.allowance < 0:  # what exceeds the burst has been found excusable
+                most = self.limits.messages_per_tick
+                session.allowance = min(max(session.allowance, -BURST_TICKS * most) + most, 0.0)
             if session.entity and not session.closed:
                 try:
                     self.stage.tell(session)
                     if session.greeting is None or self._greeted(session, *session.greeting):
                         self.delivery.serve(session, now)
+                    else:
+                        session.sent_at = now  # it waits for the disk, and nobody for it
                 except Exception:
                     self._break(session, "serving a client")
         self.stage.told()
@@ -281,6 +288,11 @@ class Game:
                 self._kick(session, messages.TOO_SLOW, f"nothing read for {self.limits.stalled_s:g} s")
 
     # -- inside --------------------------------------------------------------------------------------------
+
+    def _owes(self, session: Session, now: float) -> bool:
+        """Whether ticks that are late explain how much a session has sent since the latest."""
+        behind = max(-self._ticks_left(now), 0.0)
+        return session.allowance >= -(BURST_TICKS + behind) * self.limits.messages_per_tick
 
     def _ticks_left(self, now: float) -> float:
         """Ticks until the next tick's deadline."""

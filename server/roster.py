@@ -79,6 +79,12 @@ class Roster:
             session.player.session = None
             session.player.away_until = -math.inf
 
+    def excuse(self, seconds: float, now: float) -> None:
+        """In that time nobody could come back: it is added to what is left of theirs."""
+        for player in self.players.values():
+            if player.session is None:
+                player.away_until = min(player.away_until + seconds, now + self._limits.resume_s)
+
     def leave(self, now: float) -> None:
         """Whose time to come back is over leaves."""
         away = [player for player in self.players.values() if player.session is None]

@@ -201,8 +201,8 @@ class Session:
         self.probe: tuple[int, float, int] | None = None
         """A snapshot before which nothing was on the way: its tick, when it was sent, its bytes."""
         self.skipped = 0
-        self.corrections = 0
-        """As the client has reported them."""
+        self.corrections = -1
+        """As the client has reported them; -1: not yet."""
 
     def seat(self, player: Player) -> None:
         """This connection is the player's from now on."""

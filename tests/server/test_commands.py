@@ -116,11 +116,12 @@ def test_a_verdict_is_told_when_its_tick_is_on_disk() -> None:
 
 def test_a_client_is_let_in_when_its_token_is_on_disk_or_nothing_can_be_saved() -> None:
     disk = Disk()
-    table = Table(saves=disk)
+    table = Table(Limits(stalled_s=0.1), saves=disk)
     disk.durable_tick = table.tick_number
     first = table.join()
-    table.tick(3)
+    table.tick(10)
     assert first.sent == []
+    assert first.closings == [], "it is not the client that has stalled"
     disk.durable_tick = 1
     table.tick()
     assert [type(message) for message in first.sent[:2]] == [Welcome, Snapshot]

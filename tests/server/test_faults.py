@@ -9,7 +9,7 @@ from server.faults import Faults
 from server.limits import Limits
 from shared import edits, messages
 from shared.checks import Cell
-from shared.messages import Bye, Ping, Pong, Snapshot
+from shared.messages import Bye, Inputs, Ping, Pong, Snapshot
 from tests.tables import HELLO, FakeLink, Table, order
 
 
@@ -162,6 +162,42 @@ def test_nobody_is_blamed_for_the_time_that_the_server_was_away() -> None:
     table.game.tick(table.now, table.now)
     assert link.refusal()[1] == "nothing heard for 5 s"
     assert late.refusal()[1] == "no hello within 5 s"
+
+
+def test_who_has_gone_on_while_the_server_was_away_is_not_taken_for_a_flood() -> None:
+    for ticks_first in (True, False):
+        table = Table()
+        link = table.join()
+        table.now += 20.0
+
+        def say_all(table: Table = table, link: FakeLink = link, tick: int = table.tick_number) -> None:
+            for n in range(20 * table.game.scene.tick_rate):  # what has waited in the kernel meanwhile
+                link.say(Inputs(tick + 1 + n, tick, bytes(3)))
+
+        if not ticks_first:
+            say_all()
+        table.game.tick(table.now - 20.0, table.now)
+        if ticks_first:
+            say_all()
+        for _ in range(64):
+            table.tick()
+            link.say(Inputs(table.tick_number, table.tick_number, b""))
+        assert link.closings == []
+
+
+def test_who_was_to_come_back_while_the_server_was_away_still_may() -> None:
+    table = Table(resume_s=15.0)
+    link = table.join()
+    link.say(Inputs(table.tick_number + 1, table.tick_number, bytes(3)))  # it has got its welcome
+    table.lose(link)
+    rate = table.game.scene.tick_rate
+    table.tick(5 * rate)
+    table.now += 60.0
+    table.game.tick(table.now - 60.0, table.now)
+    table.tick(9 * rate)
+    assert link.session.entity in table.game.players
+    table.tick(2 * rate)
+    assert not table.game.players
 
 
 def test_of_the_same_mistake_the_first_the_tenth_and_so_on_are_logged(caplog: pytest.LogCaptureFixture) -> None:

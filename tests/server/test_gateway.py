@@ -465,12 +465,19 @@ async def test_a_flood_of_what_is_no_message_ends_in_an_abort(bench: Bench, floo
         pass
 
 
-async def test_what_comes_after_the_end_is_not_parsed_and_too_much_of_it_ends_in_an_abort(bench: Bench) -> None:
+async def test_what_comes_after_the_end_is_not_parsed_and_too_much_of_it_ends_in_an_abort(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
     peer = await bench.client()
     (connection,) = bench.gateway.connections
     parsed: list[int] = []
     receive_data = connection._protocol.receive_data
-    connection._protocol.receive_data = lambda data: (parsed.append(len(data)), receive_data(data))[1]  # type: ignore[method-assign]
+
+    def counted(data: bytes) -> None:
+        parsed.append(len(data))
+        receive_data(data)
+
+    monkeypatch.setattr(connection._protocol, "receive_data", counted)
     peer.write(binary(b"leave"), binary(b"more") * 1000, masked(Opcode.PING, b"?"))
     assert (await peer.frame())[0] == 0x88
     assert await peer.frame() == (0x8A, b"?")

@@ -127,12 +127,12 @@ def test_a_ping_is_answered_with_the_time_before_and_after_joining(table: Table)
     assert link.sent == [Pong(0.5, 3.0), Pong(-7, 3.25)]
 
 
-def test_reported_corrections_are_summed_up_over_clients_and_never_fall(table: Table) -> None:
-    first, second = table.connect(), table.connect()
-    for link, counts in ((first, (2, 5, 5, 1)), (second, (0, 3))):
+def test_reported_corrections_are_summed_up_over_clients_and_connections_and_never_fall(table: Table) -> None:
+    first, second, first_again = table.connect(), table.connect(), table.connect()
+    for link, counts in ((first, (0, 2, 5, 5, 1)), (second, (0, 3)), (first_again, (5, 6))):
         for count in counts:
             link.say(Ping(0.0, count))
-    assert table.game.counters.corrections == 8
+    assert table.game.counters.corrections == 5 + 3 + 1
 
 
 # -- limits --------------------------------------------------------------------------------------------------
