@@ -4,6 +4,7 @@ It is noted as it happens (`RecordedWorld.note`), and whole with every checkpoin
 
     ["player", entity, name, subject, tokens]    has joined or come back; of tokens, the digests
     ["answered", entity, number, verdict]        a command of that player
+    ["settled", entity, verdicts]                the latest of them by number: with a checkpoint
     ["left", entity]
     ["said", entity, attributes]                 all of them
     ["shared", values]                           all of them
@@ -16,7 +17,7 @@ from typing import Any, NamedTuple
 
 from server.session import Player
 
-PLAYER, ANSWERED, LEFT, SAID, SHARED = "player", "answered", "left", "said", "shared"
+PLAYER, ANSWERED, SETTLED, LEFT, SAID, SHARED = "player", "answered", "settled", "left", "said", "shared"
 
 
 class Kept(NamedTuple):
@@ -35,8 +36,7 @@ def note_of(player: Player) -> list[Any]:
 def whole(kept: Kept) -> list[list[Any]]:
     """All of it, as the notes that would lead to it."""
     notes = [note_of(player) for player in kept.players.values()]
-    for entity, player in kept.players.items():
-        notes += [[ANSWERED, entity, number, verdict] for number, verdict in player.settled.items()]
+    notes += [[SETTLED, entity, player.settled] for entity, player in kept.players.items() if player.settled]
     notes += [[SAID, entity, attributes] for entity, attributes in kept.attributes.items()]
     return [*notes, [SHARED, kept.shared]]
 
@@ -52,7 +52,8 @@ def restored(notes: Iterable[list[Any]]) -> Kept:
                 player.tokens = list(tokens)
             case "answered", (entity, number, verdict):
                 kept.players[entity].settle(number, verdict)
-                kept.players[entity].command = max(kept.players[entity].command, number)
+            case "settled", (entity, verdicts):
+                kept.players[entity].settled.update(verdicts)
             case "left", (entity,):
                 kept.players.pop(entity, None)
                 kept.attributes.pop(entity, None)
@@ -64,5 +65,6 @@ def restored(notes: Iterable[list[Any]]) -> Kept:
                 raise ValueError(f"{kind!r}: no such note")
     for player in kept.players.values():
         player.verdicts.clear()  # who asks is told, from `settled`
+        player.command = max(player.settled, default=-1)
     kept.shared.update(shared)
     return kept
