@@ -50,3 +50,26 @@ def test_a_place_is_found_above_a_crowd_that_is_somewhere_below() -> None:
 def test_there_is_no_room_where_everything_is_solid() -> None:
     world = build([[-32, -32, -32, 32, 32, 32, 1]], player="person", spawns=((0.0, 0.0, 0.0),))
     assert Spawns(world).spawn() is None
+
+
+def test_where_a_block_is_nothing_is_tried_and_a_gap_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
+    tried: list[tuple[float, float, float]] = []
+    world = build([floor(), [-32, -32, 1, 32, 32, 2, 1]], player="person", spawns=((0.0, 0.0, 0.0),))
+    stray, spawns, real = world.spawn("person", (0.0, 0.0, 8.0)), Spawns(world), world.spawn
+
+    def counted(template: str, place: tuple[float, float, float]) -> int:
+        tried.append(place)
+        return real(template, place)
+
+    monkeypatch.setattr(world, "spawn", counted)
+    assert spawns.spawn() is None
+    assert not spawns.put_back(stray)
+    assert tried == [(0.0, 0.0, 0.0)]
+    assert spawns.spawn() is None, "it is known for this tick"
+    assert len(tried) == 1
+    world.fill((-9, 9, 1), (-7, 11, 2), 0)  # at head's height
+    world.step()
+    entity = spawns.spawn()
+    assert entity is not None
+    assert world.position(entity) == (-8.0, 10.0, 0.0)
+    assert len(tried) == 3
