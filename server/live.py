@@ -173,7 +173,7 @@ class Live:
             "names": {entity: name[:NAME_MAX] for entity, name in said if isinstance(name, str)},
             "players": shown,
             "away": [entity for entity in shown if game.players[entity].session is None],
-            "shared": dict(game.stage.shared),
+            "shared": {name: _shown(value) for name, value in game.stage.shared.items()},
             "figures": {name: figures[name] for name in FIGURES if name in figures},
             "durations": {name: histogram.counts() for name, histogram in self._durations().items()},
         }
@@ -184,6 +184,15 @@ class Live:
         rows: Int64s = matrix[:: max(-(-len(matrix) // SHOWN_MAX), 1)]
         there: Int64s = rows[rows[:, ID] != 0]
         return there
+
+
+def _shown(value: Any) -> Any:
+    """What the rules share, or, where JSON has no such thing (bytes, NaN), text for it."""
+    try:
+        json.dumps(value, allow_nan=False)
+    except (TypeError, ValueError):
+        return str(value)
+    return value
 
 
 @cache

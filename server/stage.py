@@ -9,6 +9,8 @@ from random import Random
 from types import MappingProxyType
 from typing import Any
 
+import msgpack
+
 from server.contacts import Contacts
 from server.counters import Counters
 from server.faults import Faults
@@ -127,11 +129,12 @@ class Stage:
             OverlapError: the place, and all near it, is taken.
             SceneError: there is no such template, or a value is out of range.
         """
+        said: Mapping[str, Any] = {}
         for name, value in attributes.items():
-            _checked(name, value)
+            said = _with(said, name, _checked(name, value), template)
         entity = self._world.spawn(template, position, velocity, push=True)
-        for name, value in attributes.items():
-            self.set(entity, name, value)
+        if said:
+            self._say(entity, said)
         return entity
 
     def remove(self, entity: int) -> None:
@@ -206,39 +209,38 @@ class Stage:
     def set(self, entity: int, name: str, value: Any) -> None:
         """Says something of an entity to all who see it: a small MessagePack value. None: nothing any more.
 
+        It is told as it is now: who changes a list later has to say so again.
+
         Raises:
             SceneError: more than 32 attributes, or more than 256 bytes.
         """
         if entity not in self._world:
             raise KeyError(entity)
-        _checked(name, value)
-        before = self._attributes.get(entity, {})
-        if value == before.get(name) and type(value) is type(before.get(name)):
-            return
-        after = _with(before, name, value, f"entity {entity}")
-        self._attributes[entity] = after
-        self.log.note_attributes(entity)
-        self._world.note([SAID, entity, after])
+        before, packed = self._attributes.get(entity, {}), _checked(name, value)
+        if packed != _packed(before.get(name)):
+            self._say(entity, _with(before, name, packed, f"entity {entity}"))
 
     def get(self, entity: int, name: str, default: Any = None) -> Any:
-        """What has been said of an entity."""
-        return self._attributes.get(entity, {}).get(name, default)
+        """What has been said of an entity; a list or a table is a copy."""
+        return _copied(self._attributes.get(entity, {}).get(name, default))
 
     @property
     def shared(self) -> Mapping[str, Any]:
-        """The values that all clients know."""
-        return MappingProxyType(self._shared)
+        """The values that all clients know, a copy."""
+        return MappingProxyType({name: _copied(value) for name, value in self._shared.items()})
 
     def share(self, name: str, value: Any) -> None:
         """Tells all clients, also those who join later, a value of the game: the time left, a score. None: no more.
 
+        It is told as it is now: who changes a list later has to say so again.
+
         Raises:
             SceneError: more than 32 values, or more than 256 bytes.
         """
-        _checked(name, value)
-        if value == self._shared.get(name) and type(value) is type(self._shared.get(name)):
+        packed = _checked(name, value)
+        if packed == _packed(self._shared.get(name)):
             return
-        after = _with(self._shared, name, value, "the game")
+        after = _with(self._shared, name, packed, "the game")
         self._shared.clear()
         self._shared.update(after)
         self._world.note([SHARED, after])
@@ -269,9 +271,10 @@ class Stage:
         self._call(self._rules.on_join, player)
 
     def left(self, player: Player) -> None:
-        """A player leaves, and the entity with it."""
+        """A player leaves, and the entity with it, if the rules have not removed that already."""
         self._call(self._rules.on_leave, player)
-        self._remove(player.entity)
+        if player.entity in self._world:
+            self._remove(player.entity)
 
     def fell_out(self, entity: int) -> bool:
         """Whether the rules have seen to an entity that is below the floor."""
@@ -323,6 +326,11 @@ class Stage:
         """Everybody has been told."""
         self._outgoing.clear()
 
+    def _say(self, entity: int, attributes: Mapping[str, Any]) -> None:
+        self._attributes[entity] = dict(attributes)
+        self.log.note_attributes(entity)
+        self._world.note([SAID, entity, attributes])
+
     def _remove(self, entity: int) -> None:
         self._world.remove(entity)
         self._world.note([LEFT, entity])
@@ -350,19 +358,32 @@ def _overrides(rules: Rules, name: str) -> bool:
     return getattr(type(rules), name) is not getattr(Rules, name)
 
 
-def _checked(name: str, value: Any) -> None:
+def _checked(name: str, value: Any) -> bytes:
+    """A value that may be told, packed."""
     if not 0 < len(name) <= messages.NAME_MAX:
         raise SceneError(f"name {name[:80]!r}: must be a text of 1 to {messages.NAME_MAX} characters")
     try:
-        size = len(pack_value(value))
+        packed = pack_value(value)
     except ValueError as error:
         raise SceneError(f"{name}: {error}") from error
-    if size > VALUE_BYTES_MAX:
-        raise SceneError(f"{name}: a value of {size} bytes; at most {VALUE_BYTES_MAX}")
+    if len(packed) > VALUE_BYTES_MAX:
+        raise SceneError(f"{name}: a value of {len(packed)} bytes; at most {VALUE_BYTES_MAX}")
+    return packed
 
 
-def _with(values: Mapping[str, Any], name: str, value: Any, whose: str) -> dict[str, Any]:
+def _packed(value: Any) -> bytes:
+    """A value that has been told: those that are equal in Python (1, True and 1.0) are not the same to a client."""
+    return msgpack.packb(value)  # type: ignore[no-any-return]
+
+
+def _copied(value: Any) -> Any:
+    """What nobody can change behind our back."""
+    return unpack_value(_packed(value)) if isinstance(value, list | dict) else value
+
+
+def _with(values: Mapping[str, Any], name: str, packed: bytes, whose: str) -> dict[str, Any]:
     """A new table with one value more, another one, or (None) one less."""
+    value = unpack_value(packed)
     after = {**values, name: value}
     if value is None:
         del after[name]

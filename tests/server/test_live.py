@@ -83,6 +83,21 @@ def test_who_is_where_and_what_they_are_called() -> None:
     assert ann.session.player.tokens[0].hex() not in text
 
 
+def test_what_is_shared_and_json_has_no_word_for_is_text() -> None:
+    table = Table()
+    table.join()
+    shares = {"time": 1.5, "seed": b"\x00", "odds": float("nan"), "of": [{"id": b"\x01"}], "teams": ["red"]}
+    for name, value in shares.items():
+        table.game.stage.share(name, value)
+    answer = live(table).pages()["/live"]()
+
+    def no_json(name: str) -> None:
+        raise AssertionError(name)
+
+    told = json.loads(answer.body, parse_constant=no_json)["shared"]
+    assert told == {"time": 1.5, "seed": "b'\\x00'", "odds": "nan", "of": "[{'id': b'\\x01'}]", "teams": ["red"]}
+
+
 def test_one_answer_serves_all_who_look_for_an_eighth_of_a_second() -> None:
     table = Table()
     table.join()

@@ -12,7 +12,7 @@ from server.stage import ATTRIBUTES_MAX
 from shared import messages
 from shared.checks import SceneError
 from shared.messages import Command, Happened, Hello, Shared, Snapshot
-from tests.tables import FakeLink, Table, order, whole
+from tests.tables import FakeLink, Table, gone, order, whole
 from tests.worlds import scene
 
 
@@ -245,6 +245,38 @@ def test_shared_values_reach_all_also_who_comes_later(table: Table) -> None:
     assert dict(game.shared) == {"left_s": 59}
 
 
+def test_a_list_that_is_changed_in_place_is_told_when_it_is_said_again(table: Table) -> None:
+    link, game = table.join(), table.game.stage
+    bag = ["key"]
+    game.set(1, "bag", bag)
+    game.share("teams", {"red": [1]})
+    table.tick()
+    bag.append("lamp")
+    game.shared["teams"]["red"].append(2)
+    assert (game.get(1, "bag"), game.shared["teams"]) == (["key"], {"red": [1]})
+    table.tick()
+    game.set(1, "bag", bag)
+    mine = game.get(1, "bag")
+    mine.append("rope")
+    game.set(1, "bag", mine)
+    teams = dict(game.shared)["teams"]
+    teams["red"].append(2)
+    game.share("teams", teams)
+    table.tick()
+    assert attributes(link)[1]["bag"] == ["key", "lamp", "rope"]
+    assert link.got(Shared)[-1] == Shared({"teams": {"red": [1, 2]}})
+    assert game.get(1, "bag") == ["key", "lamp", "rope"]
+
+
+def test_what_is_equal_in_python_alone_is_told(table: Table) -> None:
+    link, game = table.join(), table.game.stage
+    for value in ([1], [True], [1.0], (1.0,)):
+        game.share("value", value)
+        table.tick()
+    told = [shared.values["value"] for shared in link.got(Shared)]
+    assert [(value, type(value[0])) for value in told] == [([1], int), ([True], bool), ([1.0], float)]
+
+
 def test_what_is_too_much_is_refused_by_name(table: Table) -> None:
     game = table.game.stage
     npc = game.spawn("runner", (10.0, 16.0, 1.0))
@@ -264,6 +296,9 @@ def test_what_is_too_much_is_refused_by_name(table: Table) -> None:
     before = len(table.game.world)
     with pytest.raises(SceneError, match="mood"):
         game.spawn("runner", (20.0, 16.0, 1.0), mood=object())
+    too_many: dict[str, Any] = {f"a{n}": n for n in range(ATTRIBUTES_MAX + 1)}
+    with pytest.raises(SceneError, match="32 values"):
+        game.spawn("runner", (20.0, 16.0, 1.0), **too_many)
     assert len(table.game.world) == before
 
 
@@ -273,6 +308,21 @@ def test_players_are_not_the_rules_to_steer_or_remove(table: Table) -> None:
         table.game.stage.steer(1, 1, 0)
     with pytest.raises(SceneError, match="player"):
         table.game.stage.remove(1)
+
+
+class Tidy(Rules):
+    def on_leave(self, player: Player) -> None:
+        self.game.remove(player.entity)
+
+
+def test_rules_may_remove_who_leaves() -> None:
+    table = Table(rules=Tidy())
+    first, second = table.join(), table.join()
+    table.lose(first)
+    table.tick()
+    assert gone(second.got(Snapshot)[-1]) == [1]
+    assert list(table.game.players) == [2]
+    assert table.game.counters.rules_failed == 0
 
 
 class Broken(Rules):
