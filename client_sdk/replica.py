@@ -1,6 +1,7 @@
 """What a client knows of a server: the world around the player, from the welcome on, and the server's time."""
 
 from client_sdk.clock import ServerClock
+from client_sdk.confirmed import Confirmed
 from client_sdk.picture import Picture
 from client_sdk.prediction import Prediction
 from shared.blocks import unpack
@@ -17,7 +18,8 @@ class Replica:
 
     Args:
         clock: that of the server known before, which may be the same one.
-        neighbours, compiled: see `Prediction`.
+        neighbours: see `Prediction`.
+        compiled: see `World`.
 
     Raises:
         ProtocolError: the welcome is malformed.
@@ -27,7 +29,8 @@ class Replica:
         self, welcome: Welcome, clock: ServerClock, now: float, *, neighbours: bool, compiled: bool | None
     ) -> None:
         self.scene = check_scene(welcome.scene)
-        self.prediction = Prediction(self.scene, welcome.entity, neighbours=neighbours, compiled=compiled)
+        self.known = Confirmed(self.scene, welcome.entity, compiled=compiled)
+        self.prediction = Prediction(self.known, neighbours=neighbours)
         self.picture = Picture(self.scene, self.prediction)
         self.clock = clock
         if clock.rate == 0 or abs(clock.tick(now) - welcome.tick) > CLOCK_S * self.scene.tick_rate:
@@ -42,8 +45,8 @@ class Replica:
     @property
     def complete(self) -> bool:
         """Whether enough is known to play: the time, the own entity and the ground around it."""
-        prediction = self.prediction
-        return self.clock.ready and prediction.entity in prediction.confirmed and prediction.grounded()
+        known = self.known
+        return self.clock.ready and known.entity in known.world and known.grounded()
 
     def terrain(self, terrain: Terrain) -> Cell | None:
         """A piece of a segment; the segment, if it was the last. Edits that came in between are made up for.
@@ -54,7 +57,7 @@ class Replica:
         segment = (terrain.x, terrain.y, terrain.z)
         if terrain.offset == 0:
             self._pieces = (segment, bytearray())
-            self.prediction.expect_segment(segment)
+            self.known.expect_segment(segment)
         if self._pieces[0] != segment or len(self._pieces[1]) != terrain.offset:
             raise ProtocolError("Terrain: a piece is missing")
         self._pieces[1].extend(terrain.chunk)
@@ -64,7 +67,7 @@ class Replica:
             kinds = unpack(bytes(self._pieces[1]))
         except ValueError as error:
             raise ProtocolError(f"Terrain.chunk: {error}") from error
-        self.prediction.load_segment(segment, kinds)
+        self.known.load_segment(segment, kinds)
         return segment
 
     def skipped(self, snapshot: Snapshot) -> int:
@@ -73,10 +76,10 @@ class Replica:
         Raises:
             ProtocolError: it is not newer.
         """
-        confirmed = self.prediction.confirmed
-        if snapshot.tick <= confirmed.tick:
+        world = self.known.world
+        if snapshot.tick <= world.tick:
             raise ProtocolError(f"Snapshot.tick = {snapshot.tick}: not newer than the one before")
-        return snapshot.tick - confirmed.tick - 1 if len(confirmed) else 0
+        return snapshot.tick - world.tick - 1 if len(world) else 0
 
     def apply(self, snapshot: Snapshot) -> None:
         """The confirmed world becomes that of the snapshot.
@@ -85,8 +88,8 @@ class Replica:
             ProtocolError: a part of it is malformed.
         """
         self.heard = max(self.heard, snapshot.newest)
-        self.wrong = self.prediction.apply(snapshot) or self.wrong
-        self.picture.interpolation.push(snapshot.tick, self.prediction.truth)
+        self.wrong = self.known.apply(snapshot) or self.wrong
+        self.picture.interpolation.push(snapshot.tick, self.known.states)
 
     def take_over(self, old: "Replica") -> bool:
         """Takes the place of an earlier copy; whether the own entity is the same, so that what it does goes on."""

@@ -136,7 +136,7 @@ def run(motion: str, entities: int, ticks: int, seed: int, *, compiled: bool | N
         world, prediction = scenery.game.world, scenery.core.prediction
         assert prediction is not None
         truth = scenery.seen(world.states())
-        differing += prediction.truth.tobytes() != truth[:, :CELL].tobytes()
+        differing += prediction.known.states.tobytes() != truth[:, :CELL].tobytes()
         in_view += len(truth)
         moving += len(scenery.seen(world.changed))
     return {

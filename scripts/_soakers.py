@@ -14,7 +14,7 @@ import msgpack
 import numpy as np
 
 from _generator import REQUEST, frame
-from client_sdk.prediction import Prediction
+from client_sdk.confirmed import Confirmed
 from client_sdk.replica import check_scene
 from shared import edits, messages
 from shared.messages import Bye, Command, Hello, Inputs, Ping, Snapshot, Welcome, decode_from_server, encode
@@ -137,7 +137,7 @@ class Honest:
         """Snapshots that came, and that the server made, between the first and the last of each connection."""
         self.playing = False
         self._waiting: dict[int, tuple[Cell, int, Command]] = {}
-        self._copy: Prediction | None = None
+        self._copy: Confirmed | None = None
         """What it knows of the world, but for the terrain."""
         self._asked = 0
         self._tick = self._sent = -1
@@ -211,7 +211,7 @@ class Honest:
             self.counts["joined"] += 1
             self._waiting = {}
         self.entity, self.resume, self._sent = welcome.entity, welcome.resume, -1
-        self._copy = Prediction(check_scene(welcome.scene), welcome.entity)
+        self._copy = Confirmed(check_scene(welcome.scene), welcome.entity)
         self.playing = True
 
     def _snapshot(self, link: Link, snapshot: Snapshot) -> None:
@@ -240,9 +240,9 @@ class Honest:
 
     def _edit(self, link: Link, snapshot: Snapshot) -> None:
         """A block next to where the player is."""
-        if self._copy is None or self.entity not in self._copy.confirmed:
+        if self._copy is None or self.entity not in self._copy.world:
             return
-        x, y, z = (int(part // 1) + self.rng.randint(-3, 3) for part in self._copy.confirmed.position(self.entity))
+        x, y, z = (int(part // 1) + self.rng.randint(-3, 3) for part in self._copy.world.position(self.entity))
         cell = (x, y, z + 2)
         kind = self.cells.ask(self.number, cell, self.rng)
         if kind is not None:

@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from client_sdk.confirmed import Confirmed
 from client_sdk.prediction import NONDETERMINISM, Prediction
 from client_sdk.replica import check_scene
 from shared.checks import Cell
@@ -38,9 +39,10 @@ class Pair:
         self.server.spawn("box", (16, 16, 1))
         for place in others:
             self.server.spawn("box", place)
-        self.client = Prediction(ground(), ME, compiled=False, **options)
+        self.known = Confirmed(ground(), ME, compiled=False)
+        self.client = Prediction(self.known, **options)
         for segment in (HERE, BESIDE):
-            self.client.load_segment(segment, self.server.blocks.segment(segment).reshape(-1))
+            self.known.load_segment(segment, self.server.blocks.segment(segment).reshape(-1))
         self.settle()
         self.tell(since=-1)
         self.client.begin(self.server.tick)
@@ -66,7 +68,7 @@ class Pair:
             msgpack.unpackb(encode_part(segment, since, self.server.in_segment(segment), **fields))
             for segment in segments
         ]
-        return self.client.apply(snapshot(self.server.tick, parts))
+        return self.known.apply(snapshot(self.server.tick, parts))
 
     def reconcile(self, *, late: bool = False) -> Any:
         done = self.client.reconcile(late)
@@ -241,10 +243,10 @@ def test_who_left_for_a_segment_that_is_not_seen_is_gone_and_one_that_came_is_no
 def test_a_dropped_segment_is_forgotten_with_all_that_is_in_it() -> None:
     pair = Pair((20, 20, 1), (40, 20, 1))
     pair.act(NEUTRAL)
-    pair.client.apply(snapshot(pair.server.tick, [], drops=[BESIDE]))
+    pair.known.apply(snapshot(pair.server.tick, [], drops=[BESIDE]))
     assert pair.client.confirmed.entities["id"].tolist() == [1, 2]
     assert list(pair.client.confirmed.blocks) == [HERE]
-    assert not pair.client.grounded()
+    assert not pair.known.grounded()
 
 
 def test_who_walks_out_of_a_dropped_segment_into_a_seen_one_stays() -> None:
@@ -252,7 +254,7 @@ def test_who_walks_out_of_a_dropped_segment_into_a_seen_one_stays() -> None:
     pair.server.place(OTHER, (20, 20, 1))
     pair.act(NEUTRAL)
     part = msgpack.unpackb(encode_part(HERE, 3, pair.server.in_segment(HERE)))
-    pair.client.apply(snapshot(pair.server.tick, [part], drops=[BESIDE]))
+    pair.known.apply(snapshot(pair.server.tick, [part], drops=[BESIDE]))
     assert pair.client.confirmed.states().tolist() == pair.server.states().tolist()
 
 
@@ -260,7 +262,7 @@ def test_terrain_that_comes_is_a_reason_to_replay() -> None:
     pair = Pair()
     pair.ahead(EAST, EAST)
     pair.act(EAST)
-    pair.client.load_segment(BESIDE, np.zeros(32768, np.uint8))
+    pair.known.load_segment(BESIDE, np.zeros(32768, np.uint8))
     pair.tell()
     done = pair.reconcile()
     assert (done.correction, done.repredicted, done.replayed) == (None, True, 1)
@@ -323,7 +325,7 @@ def test_a_malformed_part_changes_nothing() -> None:
     pair.act(EAST)
     good = msgpack.unpackb(encode_part(HERE, 0, pair.server.in_segment(HERE)))
     with pytest.raises(ProtocolError):
-        pair.client.apply(snapshot(pair.server.tick, [good, [*good[:6], bytes(33), *good[7:]]], drops=[BESIDE]))
+        pair.known.apply(snapshot(pair.server.tick, [good, [*good[:6], bytes(33), *good[7:]]], drops=[BESIDE]))
     assert pair.client.confirmed.state_hash() == before
 
 

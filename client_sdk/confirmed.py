@@ -1,0 +1,136 @@
+"""The server's world as of the newest snapshot, as far as this client sees it.
+
+It is never stepped: what happens in it is told, and what goes on as it did goes on (`shared.snapshot`).
+"""
+
+from typing import Any
+
+import numpy as np
+
+from shared.checks import Cell
+from shared.layout import FALLING, FLAGS, ID, Int64s, X
+from shared.messages import ProtocolError, Snapshot
+from shared.scene import Scene
+from shared.snapshot import ACTED, KEYFRAME, SegmentPart, checksum, decode_parts
+from shared.units import BLOCK_SHIFT, SEGMENT, SEGMENT_SHIFT
+from shared.world import World
+
+FOLLOW_MAX = 64
+"""After more ticks without a snapshot, everything is sent anew."""
+NEAR_BLOCKS = 5.0
+"""An edit this near may explain a correction."""
+
+
+class Confirmed:
+    """Is written by snapshots and terrain, for the client whose entity is `entity`."""
+
+    def __init__(self, scene: Scene, entity: int, *, compiled: bool | None = None) -> None:
+        self.entity = entity
+        self.world = World(scene, compiled=compiled)
+        self.states = self.world.states()
+        """Those of the world, [n, 12], ascending by id. Not to be written to."""
+        self.attributes: dict[int, dict[str, Any]] = {}
+        """What the game's rules say of the entities that are seen."""
+        self.terrain_changed = self.edited_near = False
+        """Whether blocks have changed, and whether any near the own entity; whoever has seen to that takes it back."""
+        self._templates = len(scene.templates)
+        self._exist = frozenset(scene.segments())
+        self._acted: set[int] = set()
+        self._early: dict[Cell, list[tuple[list[int], list[int]]]] = {}
+
+    def expect_segment(self, segment: Cell) -> None:
+        """The first piece of a segment has come: it was packed before any edit that comes from here on."""
+        self._early[segment] = []
+
+    def load_segment(self, segment: Cell, kinds: np.ndarray[tuple[int, ...], np.dtype[np.uint8]]) -> None:
+        """The blocks of a segment have come."""
+        self.world.load_segment(segment, kinds)
+        for offsets, changed in self._early.pop(segment, ()):
+            self.world.write_blocks(segment, offsets, changed)
+        self.terrain_changed = True
+
+    def apply(self, snapshot: Snapshot) -> str:
+        """Writes a snapshot into the confirmed world; what is wrong with the result, or nothing.
+
+        Raises:
+            ProtocolError: a part of it is malformed.
+        """
+        world = self.world
+        parts, states, turns = decode_parts(snapshot.segments, self._templates, compiled=world.compiled)
+        ticks = snapshot.tick - world.tick
+        wrong = ""
+        if len(turns):
+            if ticks != 1:
+                raise ProtocolError("segment.heads: the tick before was not told")
+            known = [entity in world for entity in turns[:, 0].tolist()]
+            if not all(known):
+                turns, wrong = turns[known], "entities are missing"
+        here = set(states[:, ID].tolist())
+        if max(states[:, FLAGS].tolist(), default=0) >= ACTED:
+            self._acted.update(states[states[:, FLAGS] & ACTED != 0, ID].tolist())
+            states[:, FLAGS] &= FALLING
+        drops: set[Cell] = set()
+        if snapshot.drops:
+            drops = {(x, y, z) for x, y, z in np.frombuffer(snapshot.drops, "<i4").reshape(-1, 3).tolist()}
+        world.follow(turns, min(ticks, FOLLOW_MAX))
+        if drops or any(part.gone or part.ago == KEYFRAME for part in parts):
+            self._take_away(parts, drops, here)
+        for part in parts:
+            if len(part.edits):
+                changes = part.edits["block"].tolist(), part.edits["kind"].tolist()
+                if part.segment in world.blocks:
+                    world.write_blocks(part.segment, *changes)
+                    self.terrain_changed = True
+                    self.edited_near |= self._near(part.segment, part.edits["block"].astype(np.int64))
+                if part.segment in self._early:
+                    self._early[part.segment].append(changes)
+        if here:
+            world.put(states)
+        for part in parts:
+            if part.attributes:
+                self.attributes.update((entity, said) for entity, said in part.attributes if entity in world)
+        for segment in drops:
+            self._early.pop(segment, None)
+            if segment in world.blocks and not len(world.in_segment(segment)):
+                world.unload_segment(segment)
+                self.terrain_changed = True
+        world.rebase(snapshot.tick)
+        self.states = world.states()
+        for part in parts:
+            if part.check and part.segment in world.blocks and checksum(world, part.segment) != part.check:
+                return f"segment {part.segment} is not the server's"
+        return wrong
+
+    def grounded(self) -> bool:
+        """Whether the blocks of every segment that exists around the own entity are there."""
+        place = self.world.state(self.entity)[X : X + 3]
+        x, y, z = (part >> (BLOCK_SHIFT + SEGMENT_SHIFT) for part in place)
+        around = {(x + i, y + j, z + k) for i in (-1, 0, 1) for j in (-1, 0, 1) for k in (-1, 0, 1)}
+        return all(segment in self.world.blocks for segment in around & self._exist)
+
+    def take_acted(self) -> frozenset[int]:
+        """The entities that the server's rules have moved since the last call."""
+        acted, self._acted = frozenset(self._acted), set()
+        return acted
+
+    def _near(self, segment: Cell, offsets: Int64s) -> bool:
+        """Whether one of these blocks is so near to the own entity that it may have met it."""
+        if self.entity not in self.world:
+            return False
+        inside = SEGMENT - 1
+        blocks = (
+            np.stack((offsets & inside, offsets >> 5 & inside, offsets >> 10), axis=1) + np.array(segment) * SEGMENT
+        )
+        ways = np.abs(blocks - np.array(self.world.position(self.entity)))
+        return bool((ways.max(axis=1) < NEAR_BLOCKS).any())
+
+    def _take_away(self, parts: list[SegmentPart], drops: set[Cell], here: set[int]) -> None:
+        """Removes who is gone, or was in a segment that is not seen any more or sent whole, and is not `here`."""
+        segments = (self.states[:, X : X + 3] >> (BLOCK_SHIFT + SEGMENT_SHIFT)).tolist()
+        whole = drops | {part.segment for part in parts if part.ago == KEYFRAME}
+        gone = {(part.segment, entity) for part in parts for entity in part.gone}
+        for entity, (x, y, z) in zip(self.states[:, ID].tolist(), segments, strict=True):
+            home = (x, y, z)
+            if entity not in here and (home in whole or (home, entity) in gone):
+                self.world.remove(entity)
+                self.attributes.pop(entity, None)
