@@ -113,7 +113,7 @@ class Recording:
             raise JournalError("a recording that broke off before its start was written")
         try:
             self.world = self._start(start, compiled)
-        except (LookupError, TypeError, ValueError) as error:
+        except (LookupError, TypeError, ValueError, OverflowError) as error:
             raise JournalError(f"its start state cannot be used ({error})") from error
         self.scene = self.world.scene
         """The rules under which it was recorded."""
@@ -128,7 +128,7 @@ class Recording:
         while (record := self._read()) is not None:
             try:
                 moment = redo(self.world, record)
-            except (LookupError, TypeError, ValueError) as error:
+            except (LookupError, TypeError, ValueError, OverflowError) as error:
                 if isinstance(error, JournalError):
                     raise
                 raise DivergedError(self.world.tick + 1, f"what was recorded cannot be done ({error})") from error
@@ -189,7 +189,7 @@ def redo(world: World, record: list[Any]) -> Moment:
 
     Raises:
         DivergedError: the tick came out otherwise.
-        LookupError, TypeError, ValueError: this is not what a record says.
+        LookupError, TypeError, ValueError, OverflowError: this is not what a record says.
     """
     inputs, calls, marked, *hashes = record
     for call in calls:

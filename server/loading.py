@@ -71,7 +71,7 @@ def load(path: Path, scene: Scene, game: str = "", *, compiled: bool | None = No
             f"{path}: replayed otherwise than it was played ({error}). Start it with the version of this program that "
             "wrote it and stop it once: then there is nothing to replay"
         ) from error
-    except (LookupError, TypeError, ValueError) as error:
+    except (LookupError, TypeError, ValueError, OverflowError) as error:
         raise database.damaged(path, error) from error
 
 

@@ -7,6 +7,7 @@ and Python itself is quicker the second time. So a scratch client does everythin
 from server.game import Game
 from server.limits import Limits
 from shared import edits, messages
+from shared.checks import SceneError
 from shared.messages import Bye, Command, Hello, Inputs, Message, Ping, Resync, encode
 from shared.scene import Scene
 from shared.units import SEGMENT
@@ -27,7 +28,11 @@ class _Void:
 
 
 def warm_up(scene: Scene) -> None:
-    """Joins, walks, jumps, builds, digs, falls out, shoots into the past and leaves, in a world of its own."""
+    """Joins, walks, jumps, builds, digs, falls out, shoots into the past and leaves, in a world of its own.
+
+    Raises:
+        SceneError: nobody could ever join.
+    """
     game, now = Game(scene, limits=Limits(edits_per_s=10_000)), 0.0
 
     def tick() -> None:
@@ -36,7 +41,6 @@ def warm_up(scene: Scene) -> None:
         game.tick(now, now)
 
     sessions = [game.open(_Void(), now) for _ in range(2)]
-    shooter, other = sessions
 
     def say(*said: Message) -> None:
         for session in sessions:
@@ -45,7 +49,10 @@ def warm_up(scene: Scene) -> None:
 
     say(Ping(now), Hello(messages.VERSION, scene.digests, "warm-up"))
     tick()  # inputs count from here on
-    assert all(session.entity for session in sessions), "nobody could join"
+    joined = [session for session in sessions if session.entity]
+    if not joined:
+        raise SceneError(f"spawns = {scene.spawns}: no room for a {scene.player!r} at any of them, or near")
+    shooter, other = joined[0], joined[-1]
     x, y, z = (int(part // 1) for part in game.world.position(shooter.entity))
     for n in range(TICKS):
         at = game.world.tick

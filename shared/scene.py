@@ -137,6 +137,8 @@ class Scene:
         object.__setattr__(self, "size", cell(self.size, "size", 1, SEGMENTS_MAX))
         limit = RANGE_BLOCKS // SEGMENT
         object.__setattr__(self, "origin", cell(self.origin, "origin", -limit, limit - 1))
+        if max(low + side for low, side in zip(self.origin, self.size, strict=True)) > limit:
+            raise SceneError(f"origin = {self.origin}, size = {self.size}: reaches further than {RANGE_BLOCKS} blocks")
         if self.size[0] * self.size[1] * self.size[2] > SEGMENTS_MAX:
             raise SceneError(f"size = {self.size}: more than {SEGMENTS_MAX} segments")
         terrain: object = self.terrain

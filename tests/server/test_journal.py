@@ -2,6 +2,7 @@
 
 import io
 import struct
+import zlib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -278,6 +279,17 @@ def test_a_flipped_bit_is_found_wherever_it_is(at: int) -> None:
     data[at // 8] ^= 1 << at % 8
     with pytest.raises(JournalError):
         read(bytes(data))
+
+
+@pytest.mark.parametrize(("x", "buttons"), [(1 << 63, 0), (0, 1 << 63)])
+def test_a_number_that_no_world_can_hold_is_no_recording(x: int, buttons: int) -> None:
+    record = [[1, 0, 0, buttons], [[PUT, 1, 0, 0, x, *[0] * 8]], None]
+    start = DATA[: 22 + struct.unpack_from("<I", DATA, 10)[0]]
+    payload, chain = msgpack.packb(record), zlib.crc32(start[22:])
+    length = struct.pack("<I", len(payload))
+    checks = struct.pack("<II", zlib.crc32(length, chain), zlib.crc32(payload, chain))
+    with pytest.raises(JournalError, match=r"what was recorded cannot be done .*too large"):
+        read(start + length + checks + payload)
 
 
 @settings(max_examples=50)

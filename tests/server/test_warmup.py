@@ -2,6 +2,7 @@
 
 import random
 from collections.abc import Iterator
+from dataclasses import replace
 
 import pytest
 
@@ -11,6 +12,7 @@ from server.replication import HISTORY
 from server.session import Session
 from server.warmup import warm_up
 from shared import edits, kernels, messages
+from shared.checks import SceneError
 from shared.messages import Bye, Command, Hello, Inputs, Resync, encode
 from shared.scene import load_scene
 
@@ -84,6 +86,14 @@ def test_that_something_is_compiled_is_told_once_and_only_then() -> None:
         assert (one(), other()) == (1, 2)
     assert numba.njit(lambda: 3)() == 3
     assert told == ["compiling"]
+
+
+def test_a_scene_with_room_for_one_is_enough_and_one_without_is_refused_by_name() -> None:
+    pit = replace(load_scene("flat"), size=(1, 1, 1), spawns=((16.5, 16.5, 4.0),))
+    full, hole = [0, 0, 0, 32, 32, 32, 1], [16, 16, 4, 17, 17, 6, 0]
+    warm_up(replace(pit, terrain={"generator": "boxes", "fill": [full, hole]}))
+    with pytest.raises(SceneError, match=r"^spawns = .*no room for a 'player'"):
+        warm_up(replace(pit, terrain={"generator": "boxes", "fill": [full]}))
 
 
 @pytest.mark.parametrize("scene", ["arena", "topdown"])

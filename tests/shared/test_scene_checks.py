@@ -27,7 +27,7 @@ NO_NUMBERS = (math.nan, math.inf, -math.inf, 10**400, "3", None, True)
         ("entity_collision", (1, "yes", None)),
         ("reach", (-0.1, 1025.0, float("nan"), "6", None, True)),
         ("size", ((0, 1, 1), (1, 1), (1.0, 1, 1), "abc", (1, 1, 1 << 17), (1 << 9, 1 << 9, 1))),
-        ("origin", ((1 << 24, 0, 0), (0, -(1 << 24), 0), (0.5, 0, 0), None)),
+        ("origin", ((1 << 24, 0, 0), (0, -(1 << 24), 0), ((1 << 23) - 1, 0, 0), (0.5, 0, 0), None)),
         ("terrain", ({}, {"generator": 3}, "flat", None)),
         ("spawns", ((), "ab", None, ((0, 0),), ((0, 0, math.nan),), ((0, 1e300, 0),), ((10**400, 0, 0),))),
         ("templates", ((), TEMPLATES * 2, tuple(Template(f"t{i}") for i in range(256)))),
