@@ -21,8 +21,8 @@ def announce_compiling(terminal: TextIO) -> None:
 def freeze() -> None:
     """Takes everything that exists by now out of the garbage collector's rounds: it stays until the end anyway.
 
-    Measured with 150 clients on `hills`: a full collection took 29 ms before, and does not come up any more; what is
-    left are the young ones, 0.7 ms at most and 5 ms in all in 8 s, for which other thresholds gained nothing.
+    With 200 clients a full collection takes 3 to 4 ms then instead of 53 to 61; the young ones are 1.2 ms at most and
+    0.03 % of a core either way (`scripts/bench.py jitter`), for which other thresholds gained nothing.
     """
     gc.collect()
     gc.freeze()

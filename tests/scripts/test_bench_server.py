@@ -121,8 +121,8 @@ def test_churn_over_sockets_leaves_nothing_behind(monkeypatch: pytest.MonkeyPatc
     assert last["segments_loaded"] > 10
     for level, slack in (("clients", 5), ("players", 10), ("entities", 12), ("segments", 1)):
         assert abs(last[level] - first[level]) <= slack, (level, first, last)
-    # A connection in process takes 8.5 KB, and over its socket 15.
-    assert (last["rss_mb"] - first["rss_mb"]) * 1e6 < 8_500 * last["joined"], (first, last)
+    # A connection takes 15 KB; where the server kept hold of those that are lost, it grew by 10 KB for each that came.
+    assert (last["rss_mb"] - first["rss_mb"]) * 1e6 < 5_000 * last["joined"], (first, last)
 
 
 def test_the_slope_is_that_of_the_line() -> None:
