@@ -164,6 +164,7 @@ class DigAndPlace:
         return self._wander(world, me)
 
     def edit(self, world: World, me: int) -> Edit | None:
+        """See `Builder`."""
         if world.tick < self._next:
             return None
         self._next = world.tick + _ticks(world, 0.2 + 0.6 * self._random.random())

@@ -133,7 +133,10 @@ class Blocks:
         return moved
 
     def unload(self, index: Cell) -> None:
-        """Forgets a segment, which is solid from then on; its entities must have left or been removed."""
+        """Forgets a segment, which is solid from then on; its entities must have left or been removed.
+
+        Raises as `segment` does.
+        """
         row = self.rows.pop(index)
         self._free.append(row)
         self.digests[row] = 0
@@ -145,7 +148,7 @@ class Blocks:
         return None if row is None else int(self.kinds[row, offset_of(x, y, z)])
 
     def set(self, x: int, y: int, z: int, kind: int) -> None:
-        """Changes one block of a loaded segment."""
+        """Changes one block of a loaded segment. Raises as `segment` does."""
         row, at = self.rows[segment_of(x, y, z)], offset_of(x, y, z)
         change = _mix_one(at, int(self.kinds[row, at])) ^ _mix_one(at, kind)
         self.kinds[row, at] = kind
@@ -154,13 +157,17 @@ class Blocks:
         self.digests[row] ^= np.uint64(change)
 
     def segment(self, index: Cell) -> Kinds:
-        """The blocks of a loaded segment, [z, y, x], read-only."""
+        """The blocks of a loaded segment, [z, y, x], read-only.
+
+        Raises:
+            KeyError: it is not loaded.
+        """
         view: Kinds = self.kinds[self.rows[index]].reshape(SEGMENT, SEGMENT, SEGMENT)
         view.flags.writeable = False
         return view
 
     def digest(self, index: Cell) -> int:
-        """The digest of a loaded segment."""
+        """The digest of a loaded segment. Raises as `segment` does."""
         return int(self.digests[self.rows[index]])
 
     def restore(self, other: "Blocks") -> bool:

@@ -19,7 +19,3 @@ class Ring(Generic[T]):
         """The value of a tick, or None if there is none (any more)."""
         slot = self._slots[tick % len(self._slots)]
         return slot[1] if slot is not None and slot[0] == tick else None
-
-    def clear(self) -> None:
-        """Forgets everything."""
-        self._slots = [None] * len(self._slots)

@@ -49,7 +49,12 @@ def hills(segment: Cell, seed: int = 1, base: int = 12, relief: int = 10, scale:
 
 
 def boxes(segment: Cell, fill: list[list[int]]) -> Kinds:
-    """Boxes of one kind, later ones over earlier ones: `fill` lists [x0, y0, z0, x1, y1, z1, kind]."""
+    """Boxes of one kind, later ones over earlier ones: `fill` lists [x0, y0, z0, x1, y1, z1, kind], upper corners
+    excluded.
+
+    Raises:
+        SceneError: an entry is something else.
+    """
     kinds = np.zeros((SEGMENT, SEGMENT, SEGMENT), np.uint8)
     for number, entry in enumerate(fill):
         if len(entry) != 7 or not all(type(part) is int for part in entry) or not 0 <= entry[6] <= 255:

@@ -118,21 +118,21 @@ class World:
         return tuple(state.tolist())
 
     def position(self, entity: int) -> tuple[float, float, float]:
-        """Where an entity is, in blocks."""
+        """Where an entity is, in blocks. Raises as `state` does."""
         x, y, z = self._entities[self._row_of[entity], X : X + 3].tolist()
         return x / BLOCK, y / BLOCK, z / BLOCK
 
     def velocity(self, entity: int) -> tuple[float, float, float]:
-        """How fast an entity is, in blocks/s."""
+        """How fast an entity is, in blocks/s. Raises as `state` does."""
         x, y, z = self._entities[self._row_of[entity], VX : VX + 3].tolist()
         return x / SPEED, y / SPEED, z / SPEED
 
     def falling(self, entity: int) -> bool:
-        """Whether the gravity flag of an entity is up."""
+        """Whether the gravity flag of an entity is up: it falls, or rises. Raises as `state` does."""
         return bool(self._entities[self._row_of[entity], FLAGS] & FALLING)
 
     def awake(self, entity: int) -> bool:
-        """Whether an entity will have a turn in the next tick without an input."""
+        """Whether an entity will have a turn in the next tick without an input. Raises as `state` does."""
         return bool(self._entities[self._row_of[entity], FLAGS] & layout.AWAKE)
 
     @property
@@ -162,7 +162,11 @@ class World:
 
     @property
     def next_id(self) -> int:
-        """The id of the next entity to be spawned. It may be raised, never lowered."""
+        """The id of the next entity to be spawned.
+
+        Raises:
+            SceneError: it was set to a lower one than it is.
+        """
         return self._next_id
 
     @next_id.setter
@@ -177,7 +181,11 @@ class World:
         return [int(entity) for entity in self._fell[: self._lengths[layout.N_FELL]]]
 
     def in_segment(self, index: Cell) -> layout.Int64s:
-        """The entities whose position lies in a loaded segment, [n, 16], ascending by id. A copy."""
+        """The entities whose position lies in a loaded segment, [n, 16], ascending by id. A copy.
+
+        Raises:
+            KeyError: the segment is not loaded.
+        """
         row = self.blocks.rows[index]
         found: list[int] = []
         heads = self.blocks.heads[row * layout.CELLS : (row + 1) * layout.CELLS]
@@ -217,6 +225,7 @@ class World:
         """Forgets a segment; it is solid from then on.
 
         Raises:
+            KeyError: it is not loaded.
             OverlapError: entities are still in it.
         """
         if len(self.in_segment(index)):
@@ -376,7 +385,11 @@ class World:
         self._store(self._arrays, self._lent(rows), self._lent(new), len(rows), self._tick + 1)
 
     def write_blocks(self, segment: Cell, offsets: Iterable[int], kinds: Iterable[int]) -> None:
-        """Changes blocks of a loaded segment (by index z << 10 | y << 5 | x): what a snapshot says, verbatim."""
+        """Changes blocks of a loaded segment (by index z << 10 | y << 5 | x): what a snapshot says, verbatim.
+
+        Raises:
+            KeyError: the segment is not loaded.
+        """
         for at, kind in zip(offsets, kinds, strict=True):
             x, y, z = (
                 part * SEGMENT + ((at >> shift) & (SEGMENT - 1))

@@ -40,15 +40,6 @@ def test_a_false_value_is_a_value() -> None:
     assert ring.get(0) == 0
 
 
-def test_cleared_it_has_nothing_and_goes_on() -> None:
-    ring: Ring[int] = Ring(2)
-    ring.put(3, 3)
-    ring.clear()
-    assert ring.get(3) is None
-    ring.put(4, 4)
-    assert ring.get(4) == 4
-
-
 @given(st.integers(1, 9), st.lists(st.integers(-30, 30)))
 def test_it_holds_what_was_put_last_in_each_place(size: int, ticks: list[int]) -> None:
     ring: Ring[int] = Ring(size)
