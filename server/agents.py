@@ -144,7 +144,7 @@ class Arena(ParallelEnv):  # type: ignore[misc]  # it says nothing of its types
         game = self._game = Game(self.scene, limits=Limits(resume_s=0.0), world=world, rules=rules, seed=self._seed)
         game.tick(0.0, 0.0)  # the rules set their scene before anybody comes
         self.agents = list(self.possible_agents)
-        self._seats = {agent: Session(0, _Nobody(), 0.0) for agent in self.agents}
+        self._seats = {agent: Session(_Nobody(), 0.0) for agent in self.agents}
         self._wheels: dict[str, _Wheel] = {}
         for agent, seat in self._seats.items():
             player = game.roster.enter(seat, agent)

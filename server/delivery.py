@@ -7,6 +7,7 @@ snapshot, as far as there is room: terrain never makes a snapshot late.
 """
 
 from collections import deque
+from collections.abc import Iterable
 
 import numpy as np
 
@@ -39,7 +40,6 @@ class Delivery:
         if session.acked < 0:
             window = max(window, self._limits.first_bytes)
         if outstanding > window:
-            session.skipped += 1
             self._counters.snapshots_skipped += 1
             return
         session.sent_at = now
@@ -66,7 +66,7 @@ class Delivery:
         """Begins anew with what a client sees: keyframes and terrain."""
         session.sight.forget()
         session.terrain_now = None
-        session.terrain_due = deque(sorted(s for s in session.sight.sees if s in self._world.blocks))
+        session.terrain_due = self._nearest(session, sorted(s for s in session.sight.sees if s in self._world.blocks))
 
     def _look_around(self, session: Session, centre: Cell) -> None:
         """The entity is in another segment."""
@@ -74,9 +74,14 @@ class Delivery:
         exists = self._world.blocks.__contains__
         added, dropped = sight.move(centre, self._limits.see_radius, self._limits.keep_radius, exists)
         due = [segment for segment in session.terrain_due if segment in sight.sees] + [s for s in added if exists(s)]
-        session.terrain_due = deque(sorted(due, key=lambda segment: interest.distance(segment, centre)))
+        session.terrain_due = self._nearest(session, due)
         if session.terrain_now and session.terrain_now[0] in dropped:
             session.terrain_now = None
+
+    def _nearest(self, session: Session, segments: Iterable[Cell]) -> deque[Cell]:
+        """Segments in the order in which their blocks are sent."""
+        centre = session.sight.centre or (0, 0, 0)
+        return deque(sorted(segments, key=lambda segment: interest.distance(segment, centre)))
 
     def _send_snapshot(self, session: Session, room: int) -> None:
         tick, inputs, sight = self._world.tick, session.inputs, session.sight

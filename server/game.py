@@ -10,7 +10,6 @@ through.
 
 import dataclasses
 from collections.abc import Callable
-from itertools import count
 from typing import Any
 
 from server import keeping
@@ -20,7 +19,7 @@ from server.faults import Faults
 from server.limits import Limits
 from server.orders import Orders
 from server.recorder import RecordedWorld, Saves
-from server.rewind import Past, Rewind
+from server.rewind import Rewind
 from server.roster import Roster
 from server.rules import Rules
 from server.session import Link, Session
@@ -100,7 +99,6 @@ class Game:
         self.players = self.roster.players
         self._authenticate = authenticate
         self.orders = Orders(self.world, self.stage, self.limits, self.faults, saves)
-        self._numbers = count(1)
         self._deadline: float | None = None
         self._rules = scene.to_table()
 
@@ -108,7 +106,7 @@ class Game:
 
     def open(self, link: Link, now: float) -> Session:
         """A connection is there; its client has to say hello."""
-        session = Session(next(self._numbers), link, now)
+        session = Session(link, now)
         self.sessions.append(session)
         if sum(not each.closed for each in self.sessions) > self.limits.clients_max:
             self._refuse(session, messages.FULL, f"the server is full ({self.limits.clients_max} clients)")
@@ -176,18 +174,6 @@ class Game:
     def keep(self) -> list[list[Any]]:
         """What belongs to the game and is not in its world, for a checkpoint."""
         return [*keeping.whole(self.stage.kept), *self.orders.notes()]
-
-    def rewound(self, session: Session, seen: float) -> Past:
-        """The world as a client saw it; ask between two ticks, or for a command within one.
-
-        Args:
-            session: who asks; its own entity is left out of what is found.
-            seen: the tick at which that client drew the others, as its commands say; clamped to the last 250 ms.
-
-        Raises:
-            SceneError: `seen` is not a finite number.
-        """
-        return self.rewind.at(seen, session.entity)
 
     # -- the tick acts -------------------------------------------------------------------------------------
 

@@ -168,8 +168,7 @@ class Player:
 class Session:
     """One connection, from the handshake to its end."""
 
-    def __init__(self, number: int, link: Link, now: float) -> None:
-        self.number = number
+    def __init__(self, link: Link, now: float) -> None:
         self.link = link
         self.player: Player | None = None
         self.entity = 0
@@ -200,7 +199,6 @@ class Session:
         self.pacing = Pacing()
         self.probe: tuple[int, float, int] | None = None
         """A snapshot before which nothing was on the way: its tick, when it was sent, its bytes."""
-        self.skipped = 0
         self.corrections = -1
         """As the client has reported them; -1: not yet."""
 

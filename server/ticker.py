@@ -191,11 +191,6 @@ class Ticker:
             self._stopped = True
             self._alarm.close()
 
-    def reset(self) -> None:
-        """Forgets the times measured so far; counters go on."""
-        self.lateness.reset()
-        self.work.reset()
-
     def stats(self) -> dict[str, Any]:
         """What it has counted. Times are since the start; for those of a window, see `histogram.between`."""
         return {

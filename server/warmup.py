@@ -62,7 +62,7 @@ def warm_up(scene: Scene) -> None:
         for kind in (1, 0):
             say(Command(2 * n + 1 - kind, at + 1, at - 1.5, edits.NAME, edits.pack(edits.Edit(*cell, kind))))
         tick()
-        past = game.rewound(shooter, game.world.tick - 2.5)
+        past = game.rewind.at(game.world.tick - 2.5, shooter.entity)
         past.ray((x, y, z + 1.0), (1.0, 0.25, -0.125), 32.0)
         past.box((x - 2.0, y - 2.0, z - 2.0), (x + 2.0, y + 2.0, z + 2.0))
     game.world.place(other.entity, (x, y, scene.origin[2] * SEGMENT - 64.0))  # comes back at a spawn

@@ -124,7 +124,7 @@ def test_a_link_that_is_full_is_skipped_and_catches_up_in_one_snapshot(table: Ta
     other.say(Inputs(table.tick_number + 1, -1, bytes(EAST)))
     seen = len(link.sent)
     table.tick(5)
-    assert (len(link.sent), link.session.skipped, len(other.got(Snapshot))) == (seen, 5, 11)
+    assert (len(link.sent), table.game.counters.snapshots_skipped, len(other.got(Snapshot))) == (seen, 5, 11)
     link.waiting = 0
     table.tick()
     snapshot = link.got(Snapshot)[-1]
@@ -179,6 +179,18 @@ def test_an_endless_plea_for_everything_anew_is_granted_rarely(table: Table) -> 
     packed = table.game.log.packed((0, 0, 0))
     assert packed is not None
     assert table.game.counters.terrain_bytes - before < 3 * len(packed)
+
+
+def test_after_a_plea_for_everything_anew_the_own_segment_comes_first() -> None:
+    table = Table(size=(3, 3, 1), fill=[[0, 0, 0, 96, 96, 1, 1]], spawns=((48.0, 48.0, 1.0),))
+    link = table.join()
+    table.tick(80)
+    link.sent.clear()
+    link.say(Resync())
+    table.tick(80)
+    terrain = [(message.x, message.y, message.z) for message in link.got(Terrain)]
+    assert terrain[0] == (1, 1, 0)
+    assert len(set(terrain)) == 9
 
 
 # -- any client ----------------------------------------------------------------------------------------------

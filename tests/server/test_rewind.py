@@ -327,11 +327,11 @@ class Range:
     def _arrive(self, eye: Vec, way: Vec, seen: float) -> None:
         game = self.match.game
         assert self.shooter.session is not None
-        past = game.rewound(self.shooter.session, seen)
+        past = game.rewind.at(seen, self.shooter.session.entity)
         self.lags.append((game.world.tick - past.seen) / game.scene.tick_rate)
         self.shots += 1
         self.rewound += self._hits(past, eye, way)
-        self.plain += self._hits(game.rewound(self.shooter.session, game.world.tick), eye, way)
+        self.plain += self._hits(game.rewind.at(game.world.tick, self.shooter.session.entity), eye, way)
 
     def _hits(self, past: Past, eye: Vec, way: Vec) -> bool:
         return self.target.core.entity in [hit.entity for hit in past.ray(eye, way, 64)]
@@ -357,7 +357,7 @@ def test_a_shooter_does_not_find_itself() -> None:
     run.run_until(lambda: player.core.state == "playing", 20)
     game: Game = run.game
     assert player.session is not None
-    past = game.rewound(player.session, game.world.tick)
+    past = game.rewind.at(game.world.tick, player.session.entity)
     x, y, z = past.position(player.core.entity)
     assert [hit.block is None for hit in past.ray((x, y, z + 1), (0, 0, -1), 9)] == [False]
     assert past.box((x - 1, y - 1, z), (x + 1, y + 1, z + 1)) == []

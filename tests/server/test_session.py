@@ -238,7 +238,7 @@ class Closings:
 
 def test_a_session_closes_its_link_once() -> None:
     link = Closings()
-    session = Session(1, link, 0.0)
+    session = Session(link, 0.0)
     session.close(4003, "first")
     session.close(4005, "second")
     assert (session.closed, link.closings) == (True, [(4003, "first")])

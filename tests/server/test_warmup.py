@@ -68,7 +68,7 @@ def play(game: Game, seed: int, ticks: int) -> None:
         now += 1 / game.scene.tick_rate
         game.tick(now, now)
         asker = players[0][0]
-        game.rewound(asker, at - 1.5).ray((1.0, 2.0, 3.0), (1.0, 0.0, 0.0), 10.0)
+        game.rewind.at(at - 1.5, asker.entity).ray((1.0, 2.0, 3.0), (1.0, 0.0, 0.0), 10.0)
         if number % 90 == 0:
             game.world.place(asker.entity, (5.0, 5.0, -200.0))
             game.receive(asker, encode(Resync()), now)
