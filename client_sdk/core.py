@@ -314,7 +314,7 @@ class Core:
         """The connection is gone, and there may be another one."""
         self._open, self._filled = False, None
         self._out.clear()
-        wait = max(left.wait, 0.0)
+        wait = max(left.wait_s, 0.0)
         if not self._resume or not self.comeback.lost(now, wait):
             self._end(left)
             return

@@ -40,11 +40,11 @@ class Resumed:
 
 @dataclass(frozen=True)
 class Left:
-    """It is over. `wait`: come back in so many seconds; negative: do not."""
+    """It is over. `wait_s`: come back in so many seconds; negative: do not."""
 
     code: int
     reason: str
-    wait: float = -1.0
+    wait_s: float = -1.0
 
 
 @dataclass(frozen=True)
@@ -93,10 +93,11 @@ class Diverged:
 
 @dataclass(frozen=True)
 class Resynchronised:
-    """Prediction was given up for a while (a long silence, a suspended program) and has begun anew."""
+    """Prediction was given up for a while (a long silence, a suspended program), and has begun anew at `tick`: no input
+    was sent for the ticks that it skipped."""
 
     tick: int
-    skipped: int
+    ticks_skipped: int
 
 
 @dataclass(frozen=True)

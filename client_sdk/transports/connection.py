@@ -35,12 +35,12 @@ REASON_BYTES_MAX = 123
 class ConnectError(ConnectionError):
     """There is no connection; the text says why, and what to do about it.
 
-    `wait`: the server asks to try again in so many seconds; negative: it does not.
+    `wait_s`: the server asks to try again in so many seconds; negative: it does not.
     """
 
-    def __init__(self, text: str, wait: float = -1.0) -> None:
+    def __init__(self, text: str, wait_s: float = -1.0) -> None:
         super().__init__(text)
-        self.wait = wait
+        self.wait_s = wait_s
 
 
 class Connection:

@@ -92,7 +92,7 @@ def test_the_server_is_about_to_start_again() -> None:
     with scripted_server(page) as url, pytest.raises(ConnectError) as error:
         Client.connect(url)
     assert str(error.value) == f"{url}: the server is going down; try again in 3 s"
-    assert error.value.wait == 3
+    assert error.value.wait_s == 3
 
 
 async def test_tls_on_one_side_only(plain: str, secure: str) -> None:

@@ -162,7 +162,7 @@ def test_who_is_beyond_a_limit_is_told_so_before_the_websocket_opens() -> None:
                 ConnectError, match=r"too many connections from your address \(1 are allowed\)"
             ) as error:
                 Client.connect(url, name="Bob")
-            assert error.value.wait == 2.0
+            assert error.value.wait_s == 2.0
             until(lambda: stats(address)["refused_at_door"] == {"address": 1})
             client.poll()
             assert not client.closed
