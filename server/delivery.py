@@ -22,6 +22,9 @@ from shared.messages import Terrain, encode
 from shared.snapshot import VERDICT
 from shared.world import World
 
+SNAPSHOT_BYTES = messages.MESSAGE_MAX // 2
+"""What more there is waits for the next snapshot, however wide the path; the own segment and one more never do."""
+
 
 class Delivery:
     """Sends to sessions what there is for them."""
@@ -46,7 +49,7 @@ class Delivery:
         for message in session.outbox:
             session.send(message)
         session.outbox.clear()
-        self._send_snapshot(session, session.pacing.room(window, outstanding))
+        self._send_snapshot(session, min(session.pacing.room(window, outstanding), SNAPSHOT_BYTES))
         if outstanding == 0 and session.probe is None:
             session.probe = (self._world.tick, now, session.snapshot_bytes)
         if session.terrain_now or session.terrain_due:

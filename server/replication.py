@@ -8,8 +8,10 @@ or has just begun to see the segment, gets a keyframe. Nothing is computed per e
 
 from collections import defaultdict
 from collections.abc import Mapping
+from itertools import accumulate
 from typing import Any, NamedTuple
 
+import msgpack
 import numpy as np
 
 from server.faults import Faults
@@ -26,6 +28,10 @@ HISTORY = 64
 PACKS_PER_TICK = 8
 """So many segments are packed anew in a tick, 0.25 to 0.7 ms each: who joins where nobody was waits for terrain, not
 everybody for the tick."""
+SAID_BYTES = 32 * 1024
+"""So much of what the rules say of entities goes with a part: no message is too long. The rest follows a tick later."""
+SAID_FEW, SAID_ID_BYTES = 3, 9
+"""So few entities fit anyhow. An id counts as so many bytes, more than it has: no list gets too long, either."""
 CHECK_TICKS = 32
 """How often a segment in which something changes is sent with its checksum; a power of two."""
 
@@ -228,11 +234,13 @@ class ChangeLog:
 
     def _of(self, entities: list[int]) -> list[Any]:
         """The attributes of these entities, for the wire."""
-        if not self._attributes:
-            return []
-        return [
-            part for entity in entities if (all_ := self._attributes.get(entity)) is not None for part in (entity, all_)
-        ]
+        said = [(entity, self._attributes[entity]) for entity in entities if entity in self._attributes]
+        if len(said) > SAID_FEW:
+            ends = accumulate(len(msgpack.packb(values)) + SAID_ID_BYTES for _, values in said)
+            fits = max(sum(end <= SAID_BYTES for end in ends), 1)
+            self._said.update(entity for entity, _ in said[fits:])
+            del said[fits:]
+        return [part for pair in said for part in pair]
 
     def _share(self, segment: Cell, since: int, ticks: list[_Tick]) -> tuple[bytes, bytes, bytes]:
         """Of those to which something happened and which are still there: heads, tails and rows, packed."""

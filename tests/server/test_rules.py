@@ -6,6 +6,7 @@ import msgpack
 import pytest
 
 from server.limits import Limits
+from server.pacing import Pacing
 from server.rules import Rules, RulesError, load_rules
 from server.session import Player
 from server.stage import ATTRIBUTES_MAX
@@ -193,6 +194,30 @@ def test_who_comes_into_sight_brings_along_what_is_said_of_it() -> None:
     game.place(far, (63.0, 16.0, 1.0))
     table.tick()
     assert attributes(link)[far] == {"team": "red"}
+
+
+@pytest.mark.parametrize("wide", [False, True])
+def test_what_is_said_of_a_crowd_is_spread_over_messages_and_all_of_it_arrives(
+    wide: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if wide:
+        monkeypatch.setattr(Pacing, "room", lambda *_: 1 << 30)
+    table = Table(size=(3, 3, 1), fill=[[0, 0, 0, 96, 96, 1, 1]], spawns=((48.0, 48.0, 1.0),))
+    game = table.game.stage
+    rich: dict[str, Any] = {f"a{n}": "x" * 90 for n in range(ATTRIBUTES_MAX)}
+    for segment in range(9):
+        x, y = 32 * (segment % 3), 32 * (segment // 3)
+        for place in range(70):
+            game.spawn("runner", (x + 3.0 + 2 * (place % 10), y + 3.0 + 2 * (place // 10), 1.0), **rich)
+    early = table.join()  # its link knows how long a message may be
+    table.tick(60)
+    game.set(1, "a0", "news")
+    late = table.join()
+    table.tick(60)
+    for link in (early, late):
+        assert {entity: len(values) for entity, values in attributes(link).items()} == dict.fromkeys(range(1, 631), 32)
+        assert attributes(link)[1]["a0"] == "news"
+    assert table.game.faults.total == 0
 
 
 def test_events_go_to_whom_they_are_for_once(table: Table) -> None:
