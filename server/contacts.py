@@ -13,14 +13,19 @@ Pair = tuple[int, int]
 
 
 class Contacts:
-    """The pairs of a world that touch."""
+    """The pairs of a world that touch.
 
-    def __init__(self, world: World) -> None:
+    Args:
+        goes_on: who touches already has been told so, before a restart.
+    """
+
+    def __init__(self, world: World, *, goes_on: bool = False) -> None:
         self._world = world
         boxes = np.array([template.row()[:6] for template in world.scene.templates], np.int64)
         self._low, self._high = boxes[:, :3], boxes[:, :3] + boxes[:, 3:]
         self._widest = int(boxes[:, 3].max())
-        self._touching: set[Pair] = set()
+        states = world.states()
+        self._touching: set[Pair] = self._touched(states, states[:, ID]) if goes_on else set()
         self._stepped = np.zeros(0, np.int64)
 
     def stepped(self) -> None:

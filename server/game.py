@@ -181,6 +181,7 @@ class Game:
         """One tick. `deadline`: the time it was due, by the same clock as `now`; it ends tick T at `deadline`."""
         self._deadline = deadline
         self._excuse(deadline, now)
+        self.stage.start()
         self.roster.leave(now)
         self._join()
         self.roster.revive()

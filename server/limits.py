@@ -49,7 +49,7 @@ class Limits:
     commands_waiting_max: int = setting(64, Kind(int, "commands of a player that wait for their tick", "N", 1, 10_000))
     name_max: int = setting(NAME_MAX, Kind(int, "longest name of a player, in characters", "N", 1, NAME_MAX))
     joins_per_tick: int = 8
-    """More wait for the next tick: a spawn costs up to a millisecond."""
+    """More wait for the next tick: a spawn costs a millisecond or two."""
     outbox_max: int = 1024
     """A client that is so many of the rules' messages behind is closed."""
     first_bytes: int = 4 * 1024

@@ -6,7 +6,7 @@
 
     python -m server --game my_game:Tag
 
-All hooks are called within a tick, ahead of its step, in this order: `on_leave`, `on_join`, `on_fell_out`,
+All hooks are called within a tick, ahead of its step, in this order: `on_start`, `on_leave`, `on_join`, `on_fell_out`,
 `on_command` and `can_edit`, `on_contact`, `on_tick`. One that raises is reported and counted, and the game goes on.
 What they may do is `self.game`, a `server.stage.Stage`. Whatever decides what happens in the world must come from
 there: its `random` is the same again in a game that is computed anew; a clock's time or the order of a set is not.

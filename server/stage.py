@@ -65,7 +65,7 @@ class Stage:
         self._random = (-1, Random())
         self._seen = 0.0
         self._outgoing: list[tuple[frozenset[int] | None, bytes]] = []
-        self._contacts = Contacts(world)
+        self._contacts = Contacts(world, goes_on=kept is not None)
         self._told_contacts = _overrides(rules, "on_contact")
         self._started = kept is not None
         self._faults = Faults("the rules have failed")
@@ -298,11 +298,14 @@ class Stage:
         """Whether the rules allow an edit; not, if they fail."""
         return self._call(self._rules.can_edit, player, *edit, failed=False) is not False
 
-    def act(self) -> None:
-        """The part of the rules in a tick that nobody asks for."""
+    def start(self) -> None:
+        """Tells the rules, once in a game's life, that the world is there."""
         if not self._started:
             self._started = True
             self._call(self._rules.on_start)
+
+    def act(self) -> None:
+        """The part of the rules in a tick that nobody asks for."""
         for a, b in self._contacts.begun() if self._told_contacts else ():
             if a in self._world and b in self._world:
                 self._call(self._rules.on_contact, a, b)

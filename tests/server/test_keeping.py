@@ -76,6 +76,20 @@ def goes_on(table: Stored, before: FakeLink, token: bytes, rules: Told) -> None:
     assert table.game.world.blocks.get(18, 16, 1) == 5
 
 
+def test_who_touched_before_a_stop_is_not_told_to_have_begun_after_it(tmp_path: Path) -> None:
+    first, told = Stored(tmp_path, Told()), Told()
+    a, b = (first.game.stage.spawn("runner", (x, 16.0, 1.0)) for x in (10.0, 10.0 - 0.625))
+    first.tick(2)
+    first.stop()
+    second = Stored(tmp_path, told)
+    second.game.stage.steer(a, 0, 1)
+    second.tick(8)
+    assert second.game.world.position(a)[1] > 16.0
+    assert second.game.stage.touching(a) == [b]
+    assert told.told == []
+    second.stop()
+
+
 def test_after_a_stop_the_game_goes_on(tmp_path: Path) -> None:
     first = Stored(tmp_path)
     link, token = played(first)

@@ -82,7 +82,7 @@ def test_joining_and_leaving_are_told_while_the_entity_is_there(table: Table, ru
     table.tick()
     table.lose(link)
     table.tick()
-    assert rules.told == [("join", 1, "Ann", True), ("start",), ("leave", 1, True)]
+    assert rules.told == [("start",), ("join", 1, "Ann", True), ("leave", 1, True)]
 
 
 def test_commands_come_with_their_data_and_are_answered(table: Table, rules: Told) -> None:
