@@ -108,8 +108,6 @@ class Game:
         """A connection is there; its client has to say hello."""
         session = Session(link, now)
         self.sessions.append(session)
-        if sum(not each.closed for each in self.sessions) > self.limits.clients_max:
-            self._refuse(session, messages.FULL, f"the server is full ({self.limits.clients_max} clients)")
         return session
 
     def receive(self, session: Session, data: bytes, now: float) -> None:
@@ -219,6 +217,9 @@ class Game:
             if player.session is not None and not player.session.closed:
                 self._end(player.session, messages.TAKEN_OVER, "the player goes on over another connection")
             session.seat(player)
+        elif self.roster.connected >= self.limits.clients_max:
+            self._refuse(session, messages.FULL, f"the server is full ({self.limits.clients_max} clients)")
+            return
         else:
             player = self.roster.enter(session, session.hello.name)
             if player is None:

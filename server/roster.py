@@ -31,6 +31,11 @@ class Roster:
         self._spawns = Spawns(world)
         self._fallen: list[int] = []
 
+    @property
+    def connected(self) -> int:
+        """How many have a connection, if only one whose loss has not been noticed yet."""
+        return sum(player.session is not None for player in self.players.values())
+
     def enter(self, session: Session, name: str) -> Player | None:
         """A new player at a spawn, with that connection; ask between two ticks. None: there is no room."""
         self._make_room()

@@ -140,10 +140,12 @@ def test_reported_corrections_are_summed_up_over_clients_and_connections_and_nev
 
 def test_a_full_server_refuses_and_is_not_full_any_more_when_someone_leaves() -> None:
     table = Table(Limits(clients_max=2))
-    first, _ = table.connect(), table.connect()
-    assert table.connect().refusal() == (messages.FULL, "the server is full (2 clients)")
-    table.lose(first)
-    assert table.connect().closings == []  # who was refused and has not hung up yet takes no place
+    links = [table.connect(HELLO) for _ in range(3)]
+    table.tick()
+    assert links[2].refusal() == (messages.FULL, "the server is full (2 clients)")
+    table.lose(links[0])
+    table.join()  # who was refused and has not hung up yet takes no place
+    assert len(table.game.players) == 2
 
 
 def test_with_no_room_to_spawn_one_is_refused() -> None:

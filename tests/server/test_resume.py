@@ -180,6 +180,16 @@ def test_who_was_never_heard_of_is_kept_for_a_moment_only() -> None:
     assert list(table.game.players) == [known.session.entity]
 
 
+def test_who_comes_back_to_a_full_server_takes_over_the_own_place() -> None:
+    table = Table(Limits(clients_max=1), resume_s=10.0)
+    link = table.join()
+    heard(table, link)
+    again = back(table, token(link))  # ahead of the loss
+    assert again.session.entity == link.session.entity
+    assert link.refusal()[0] == messages.TAKEN_OVER
+    assert back(table, b"").refusal()[0] == messages.FULL
+
+
 def test_those_away_make_room_where_there_are_as_many_players_as_there_may_be() -> None:
     table = Table(Limits(clients_max=3), resume_s=10.0)
     links = [table.join() for _ in range(3)]
