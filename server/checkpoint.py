@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from server.journal import checked_states
 from server.recorder import RecordedWorld
 from shared import terrain
 from shared.blocks import Kinds, digest_of, pack, unpack
@@ -117,7 +118,7 @@ def restored(scene: Scene, checkpoint: Checkpoint, *, compiled: bool | None = No
         (x, y, z): terrain.generate(scene.terrain, (x, y, z)) if packed is None else unpack(packed)
         for x, y, z, packed, _ in checkpoint.segments
     }
-    states = np.frombuffer(checkpoint.states, "<i8").astype(np.int64).reshape(-1, STATES)
+    states = checked_states(scene, np.frombuffer(checkpoint.states, "<i8").astype(np.int64))
     digests = np.array([digest_of(kinds) for kinds in loaded.values()], np.uint64)
     cells = np.array(list(loaded), np.int64).reshape(-1, 3)
     if hash_of(checkpoint.tick, cells, digests, states) != checkpoint.hash:  # ahead of the kernel: it trusts its rows

@@ -281,14 +281,24 @@ def test_a_flipped_bit_is_found_wherever_it_is(at: int) -> None:
         read(bytes(data))
 
 
-@pytest.mark.parametrize(("x", "buttons"), [(1 << 63, 0), (0, 1 << 63)])
-def test_a_number_that_no_world_can_hold_is_no_recording(x: int, buttons: int) -> None:
-    record = [[1, 0, 0, buttons], [[PUT, 1, 0, 0, x, *[0] * 8]], None]
+@pytest.mark.parametrize(
+    ("record", "why"),
+    [
+        ([[], [[PUT, 1, 0, 0, 1 << 63, *[0] * 8]], None], "too large"),
+        ([[1, 0, 0, 1 << 63], [[PUT, 1, *[0] * 11]], None], "too large"),
+        ([[], [[PUT, 0, *[0] * 11]], None], "a state is out of range"),
+        ([[], [[PUT, 1, 99, *[0] * 10]], None], "a state is out of range"),
+        ([[], [[PUT, 1, 0, 0, 1 << 60, *[0] * 8]], None], "a state is out of range"),
+        ([[], [[PUT, 1, *[0] * 7, 1 << 40, 0, 0, 0]], None], "a state is out of range"),
+        ([[], [[PUT, 1, *[0] * 8, 5000, 0, 0]], None], "a state is out of range"),
+    ],
+)
+def test_a_number_that_no_world_can_hold_is_no_recording(record: list[Any], why: str) -> None:
     start = DATA[: 22 + struct.unpack_from("<I", DATA, 10)[0]]
     payload, chain = msgpack.packb(record), zlib.crc32(start[22:])
     length = struct.pack("<I", len(payload))
     checks = struct.pack("<II", zlib.crc32(length, chain), zlib.crc32(payload, chain))
-    with pytest.raises(JournalError, match=r"what was recorded cannot be done .*too large"):
+    with pytest.raises(JournalError, match=rf"what was recorded cannot be done .*{why}"):
         read(start + length + checks + payload)
 
 
