@@ -9,6 +9,7 @@ websockets does the framing (its Sans-I/O `ClientProtocol`); this is all that bo
 they are left with a socket each. Nothing is compressed: no extension is offered.
 """
 
+import math
 import ssl
 from urllib.parse import urlsplit
 
@@ -24,6 +25,10 @@ from shared.messages import MESSAGE_MAX, REASON_MAX, TEXT, TOO_SLOW
 
 UNSENT_MAX = 64 * 1024
 """Bytes that may wait for a server that does not read, some 20 s of a player's inputs; more end the connection."""
+SILENCE_S = 10.0
+"""A server that is not heard for so long is gone, or the way to it is: TCP alone may take 15 minutes to say so."""
+LOOK_S = 1.0
+"""No more than this counts between two looks: a program that was busy or asleep has heard nothing, which is no sign."""
 CLOSE_S = 2.0
 """A server that does not finish closing by then is left without its goodbye."""
 REFUSALS = (403, 429, 503)
@@ -64,6 +69,8 @@ class Connection:
         self._began = b""  # how the answer begins
         self._fragments = bytearray()
         self._ending_since: float | None = None
+        self._looked = math.inf
+        self._silent_s = 0.0
 
     @property
     def opened(self) -> bool:
@@ -79,6 +86,7 @@ class Connection:
     def receive(self, data: bytes | bytearray | memoryview, now: float) -> None:
         """What has come from the stream. Call `data_to_send` after it."""
         protocol = self._protocol
+        self._silent_s = 0.0
         if protocol.reader.eof:
             return
         self._began = self._began or bytes(data[:2])
@@ -89,6 +97,16 @@ class Connection:
             elif protocol.handshake_exc is None:
                 self.core.open(now)
         self._check(now)
+
+    def look(self, now: float) -> None:
+        """Gives the connection up where the server has been silent for long. Call it every second or more often, when
+        all that has come has been taken in."""
+        self._silent_s += min(max(now - self._looked, 0.0), LOOK_S)
+        self._looked = now
+        if self.core.appetite == 0 or not self.opened or self._ending_since is not None:
+            self._silent_s = 0.0
+        elif self._silent_s > SILENCE_S:
+            self.broke(f"nothing heard for {SILENCE_S:g} s", now)
 
     def receive_eof(self, now: float) -> None:
         """The stream has come to its end."""

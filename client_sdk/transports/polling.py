@@ -1,6 +1,7 @@
 """One non-blocking socket, looked at when the game says so: no thread, no event loop."""
 
 import contextlib
+import errno
 import math
 import os
 import select
@@ -13,6 +14,8 @@ from client_sdk.transports.connection import UNSENT_MAX, Connection, insecure, s
 
 READS_MAX = 32
 """Reads per poll, 2 MiB: a game that was away for long does not hang in one poll."""
+UNDER_WAY = (0, errno.EINPROGRESS, errno.EWOULDBLOCK)
+"""What a non-blocking connect says that goes on; the last is Windows'."""
 NOT_NOW = (BlockingIOError, InterruptedError, ssl.SSLWantReadError, ssl.SSLWantWriteError)
 
 
@@ -58,6 +61,7 @@ class PollingTransport:
         if now > self._dial_until and not self._connection.opened:
             self._connection.broke("no answer in time", now)
         self._read(self._socket, now)
+        self._connection.look(now)
         self.send(now)
 
     def send(self, now: float) -> None:
@@ -88,9 +92,14 @@ class PollingTransport:
         self._connection = Connection(self._connection.url, self._connection.core)
         self._connection.core.comeback.trying()
         self._dial_until = now + self._timeout
-        self._dialing = socket.socket(self._family, socket.SOCK_STREAM)
-        self._dialing.setblocking(False)
-        self._dialing.connect_ex(self._address)
+        try:
+            self._dialing = socket.socket(self._family, socket.SOCK_STREAM)
+            self._dialing.setblocking(False)
+            said = self._dialing.connect_ex(self._address)
+            if said not in UNDER_WAY:
+                raise OSError(said, os.strerror(said))
+        except OSError as error:  # no network, no descriptor left
+            self._give_up(error.strerror or str(error), now)
 
     def _dial_on(self, sock: socket.socket, now: float) -> None:
         """Looks how far that has come."""
@@ -98,7 +107,7 @@ class PollingTransport:
             if isinstance(sock, ssl.SSLSocket):
                 sock.do_handshake()
             else:
-                if not select.select([], [sock], [sock], 0)[1]:
+                if not any(select.select([], [sock], [sock], 0)):  # Windows tells of a failure apart
                     if now > self._dial_until:
                         raise TimeoutError("no answer in time")
                     return

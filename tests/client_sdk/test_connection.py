@@ -5,7 +5,7 @@ from websockets.frames import Close, CloseCode, Frame, Opcode
 
 from client_sdk.core import Core
 from client_sdk.events import Left
-from client_sdk.transports.connection import CLOSE_S, ConnectError, Connection
+from client_sdk.transports.connection import CLOSE_S, LOOK_S, SILENCE_S, ConnectError, Connection
 from shared import messages
 from shared.messages import Bye, Hello, decode_from_client, encode
 from tests.client_sdk.servers import Peer
@@ -153,6 +153,38 @@ def test_a_server_that_never_closes_is_not_waited_for() -> None:
     pair.to_peer()
     assert not pair.connection.done(NOW + CLOSE_S)
     assert pair.connection.done(NOW + CLOSE_S + 0.1)
+
+
+def test_a_server_that_is_silent_for_long_is_left() -> None:
+    pair = Pair().open()
+    for k in range(round(SILENCE_S / LOOK_S)):
+        pair.connection.look(NOW + k * LOOK_S)
+    pair.peer.protocol.send_binary(encode(messages.Pong(1.0, 2.0)))  # at the last moment
+    pair.to_client()
+    later = NOW + 100
+    for k in range(round(SILENCE_S / LOOK_S)):
+        pair.connection.look(later + k * LOOK_S)
+    assert not pair.core.events()
+    pair.connection.look(later + SILENCE_S + LOOK_S)
+    assert pair.left() == Left(CloseCode.ABNORMAL_CLOSURE, "nothing heard for 10 s")
+    assert pair.connection.done(later)
+
+
+def test_a_goodbye_without_an_end_is_not_waited_for() -> None:
+    pair = Pair().open()
+    pair.peer.protocol.send_binary(encode(Bye(messages.FULL, "full", -1.0)))
+    pair.to_client()
+    for k in range(12):
+        pair.connection.look(NOW + k)
+    assert pair.left().reason == "full"
+    assert pair.connection.done(NOW + 12)
+
+
+def test_a_program_that_slept_has_heard_nothing_and_that_is_no_sign() -> None:
+    pair = Pair().open()
+    for k in range(8):
+        pair.connection.look(NOW + 60 * k)
+    assert not pair.core.events()
 
 
 def test_what_comes_after_the_end_is_ignored() -> None:

@@ -10,6 +10,7 @@ import pytest
 from client_sdk.client import Client
 from client_sdk.events import Answered, Event, Joined, Left
 from client_sdk.linked import LinkedCore
+from client_sdk.transports import connection
 from client_sdk.transports.connection import UNSENT_MAX, ConnectError, Connection
 from client_sdk.transports.polling import PollingTransport
 from shared import messages
@@ -231,3 +232,20 @@ def test_close_waits_no_longer_than_told() -> None:
         client.close(timeout=0.2)
         assert time.monotonic() - begun < 2
         over.set()
+
+
+def test_a_way_that_has_become_silent_ends(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(connection, "SILENCE_S", 0.3)
+    over = threading.Event()
+
+    def script(sock: socket.socket) -> None:
+        accept(sock)
+        over.wait(20)
+
+    with scripted_server(script) as address:
+        client = Client.connect(address)
+        (left,) = play(client, lambda: client.closed)
+        over.set()
+    assert isinstance(left, Left)
+    assert left.reason == "nothing heard for 0.3 s"
+    assert client._transport._socket is None  # type: ignore[attr-defined]
