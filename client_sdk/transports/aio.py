@@ -36,7 +36,8 @@ from shared.scene import Scene
 TIMEOUT_S = 5.0
 WAIT_S_MIN = 0.001
 """Timers are that coarse: an update is never asked for earlier."""
-WAIT_S_MAX = 3600.0
+WAIT_S_MAX = 1.0
+"""And never later: a connection wants to be looked at (`Connection.look`)."""
 
 
 class AsyncClient(BaseClient):
@@ -67,7 +68,7 @@ class AsyncClient(BaseClient):
         self._due = 0.0
         self._state = self.core.state
         self._events: deque[Event] = deque(maxlen=EVENTS_MAX)
-        self._waiting: asyncio.Future[None] | None = None
+        self._news = asyncio.Event()
         self._answered: asyncio.Future[None] = self._loop.create_future()
         self._gone: asyncio.Future[None] = self._loop.create_future()
 
@@ -96,22 +97,21 @@ class AsyncClient(BaseClient):
         connection = client._connection
         try:
             await client._dial(timeout)
-        except ConnectError:
+        except BaseException as error:
+            client._drop()
+            if isinstance(error, ssl.SSLError):
+                raise insecure(connection, error) from error
+            if isinstance(error, OSError) and not isinstance(error, ConnectError):  # a TimeoutError is one
+                raise unreachable(connection, error) from error
             raise
-        except ssl.SSLError as error:
-            raise insecure(connection, error) from error
-        except OSError as error:  # a TimeoutError is one
-            raise unreachable(connection, error) from error
-        finally:
-            if not connection.opened:
-                client._drop()
         return client
 
     def edit(self, x: int, y: int, z: int, kind: int) -> int:
         """Places (`kind` 1 to 255) or removes (0) a block, as `Client.edit`; the number by which it is `Answered`.
 
         Raises:
-            RuntimeError: the client is not playing.
+            RuntimeError: the client has not joined.
+            TypeError: something is not a whole number.
         """
         number = self.core.edit(x, y, z, kind)
         self._pump(time.monotonic())
@@ -121,7 +121,7 @@ class AsyncClient(BaseClient):
         """Asks the game's rules for something, as `Client.command`; the number by which it is `Answered`.
 
         Raises:
-            RuntimeError: the client is not playing.
+            RuntimeError: the client has not joined.
             ValueError: the name or the data are too long, or no MessagePack.
         """
         number = self.core.command(name, data)
@@ -149,8 +149,8 @@ class AsyncClient(BaseClient):
         while not self._events:
             if self.core.state == "closed":
                 raise StopAsyncIteration
-            self._waiting = self._loop.create_future()
-            await self._waiting
+            self._news.clear()
+            await self._news.wait()
         return self._events.popleft()
 
     async def __aenter__(self) -> "AsyncClient":
@@ -230,8 +230,16 @@ class AsyncClient(BaseClient):
     def _update(self) -> None:
         now = time.monotonic()
         core = self.core
-        if self._before_update is not None and core.state == "playing":
-            self._before_update(core)
+        try:
+            if self._before_update is not None and core.state == "playing":
+                self._before_update(core)
+        finally:  # an error in there is the loop's to tell; the player goes on
+            self._advance(now)
+
+    def _advance(self, now: float) -> None:
+        core = self.core
+        if self._transport is not None:
+            self._connection.look(now)
         core.update(now)
         self._read_on()
         if core.state == "away" and self._transport is None and now >= core.comeback.retry_at:
@@ -255,8 +263,7 @@ class AsyncClient(BaseClient):
         events = core.events()
         if events:
             self._events.extend(events)
-            if self._waiting is not None and not self._waiting.done():
-                self._waiting.set_result(None)
+            self._news.set()
         if not self._answered.done():
             if connection.refused is not None:
                 self._answered.set_exception(connection.refused)

@@ -11,7 +11,9 @@ from typing import Any
 import pytest
 
 from client_sdk.bots import Bot, Wander
+from client_sdk.core import Core
 from client_sdk.events import Answered, Event, Joined, Left
+from client_sdk.transports import connection
 from client_sdk.transports.aio import AsyncClient
 from client_sdk.transports.connection import ConnectError
 from shared import messages
@@ -202,3 +204,56 @@ def test_whoever_stops_waiting_may_ask_again(url: str, run: Run) -> None:
             assert isinstance(await first(client, Left), Left)
 
     run(scene())
+
+
+def test_an_error_in_before_update_is_told_and_the_player_goes_on(url: str, run: Run) -> None:
+    calls = 0
+
+    def wrong(core: Core) -> None:
+        nonlocal calls
+        calls += 1
+        raise LookupError("mine")
+
+    async def scene() -> None:
+        told: list[dict[str, Any]] = []
+        asyncio.get_running_loop().set_exception_handler(lambda _, context: told.append(context))
+        async with await AsyncClient.connect(url, before_update=wrong) as client:
+            await until(lambda: calls >= 3)
+            assert client.playing
+            assert client.stats.inputs_sent >= 2
+        assert {type(context["exception"]) for context in told} == {LookupError}
+
+    run(scene())
+
+
+def test_two_who_wait_both_hear_of_the_end(url: str, run: Run) -> None:
+    async def scene() -> None:
+        async def all_of(client: AsyncClient) -> int:
+            return len([event async for event in client])
+
+        client = await AsyncClient.connect(url)
+        both = asyncio.gather(all_of(client), all_of(client))
+        await until(lambda: client.playing)
+        await client.close()
+        assert sum(await both) >= 2
+
+    run(scene())
+
+
+def test_a_way_that_has_become_silent_ends(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(connection, "SILENCE_S", 0.3)
+    over = threading.Event()
+
+    def script(sock: socket.socket) -> None:
+        accept(sock)
+        over.wait(20)
+
+    async def scene() -> None:
+        client = await AsyncClient.connect(address)
+        (left,) = [event async for event in client]
+        assert isinstance(left, Left)
+        assert left.reason == "nothing heard for 0.3 s"
+        over.set()
+
+    with scripted_server(script) as address:
+        run(scene())
