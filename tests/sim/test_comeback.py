@@ -1,6 +1,7 @@
 """A lost connection, in simulated time: the client comes back by itself and goes on."""
 
 import itertools
+import math
 
 import pytest
 
@@ -148,3 +149,23 @@ def test_waits_grow_spread_and_end() -> None:
         firsts.add(round(other.retry_at, 3))
     assert len(firsts) == 50
     assert (min(firsts) >= 2.0, max(firsts) <= 2.5) == (True, True)
+
+
+def test_patience_without_end_has_none() -> None:
+    comeback = Comeback(math.inf)
+    now = 0.0
+    for _ in range(2000):
+        assert comeback.lost(now)
+        assert 0 < comeback.retry_at - now <= 5.0
+        now = comeback.retry_at
+
+
+@pytest.mark.parametrize("spread", range(12))
+def test_a_long_wait_that_was_asked_for_is_waited_and_not_taken_from_the_patience(spread: int) -> None:
+    comeback = Comeback(30.0, spread)
+    assert comeback.lost(0.0, 300.0)
+    assert 300 <= comeback.retry_at <= 375
+    back, now = comeback.retry_at, comeback.retry_at
+    while comeback.lost(now):
+        now = comeback.retry_at
+    assert 20 < now - back <= 30
