@@ -182,7 +182,8 @@ class PricedLead:
         if self._cover is None:
             self._cover = phase - self._base - safety
         level = self._level
-        self._cover = max(level, level + (self._cover - level) * (1 - elapsed / (SLOWER_S * self._rate)))
+        kept = max(1 - elapsed / (SLOWER_S * self._rate), 0.0)
+        self._cover = max(level, level + (self._cover - level) * kept)
         now_needed = min(self._needs[-LATELY:])
         surprise = max(now_needed - self._base - self._cover, 0.0)
         target = self._base + self._cover + safety + surprise + min(surprise, SURPRISE)

@@ -232,6 +232,16 @@ def test_it_rises_at_once_and_falls_slowly() -> None:
     assert min(rough.speeds()) > -0.04
 
 
+def test_what_is_learnt_while_nothing_was_steered_is_covered_and_no_more() -> None:
+    """A frame that took ten seconds, in which every eighth input was stalled."""
+    loop = Loop(lambda i: 101.0).run(1000)
+    phase = loop.timeline.phase
+    for i in range(1000, 1320):
+        loop.lead.observe(i, phase - (101.0 + 5 * (i % 8 == 0)), phase, 1320 / RATE)
+    loop.timeline.steer(loop.lead, loop.clock, 1320 / RATE)
+    assert loop.timeline.phase == pytest.approx(106, abs=0.5)
+
+
 def test_beyond_ten_ticks_it_jumps_both_ways() -> None:
     loop = Loop(lambda i: 101.0 + 40 * (3000 <= i < 4000)).run(5000)
     assert loop.jumps == 2
