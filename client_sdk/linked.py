@@ -15,7 +15,7 @@ from client_sdk.core import Core
 from client_sdk.links import Agenda, Path, Weather, Wire, named
 
 LOST = b""
-"""Stands for the loss of the connection among the messages; none of them is empty."""
+"""Stands for the loss of the connection among the messages; an empty one is not taken."""
 CLEAR = Path()
 SLOW_READ_BYTES = 1152
 """A slow line is given so much at once."""
@@ -71,7 +71,7 @@ class LinkedCore(Core):
     def receive(self, data: bytes, now: float) -> None:
         """See `Core.receive`."""
         line = self._on(now)
-        if line is None:
+        if line is None or data == LOST:  # an empty message is malformed, whenever it comes
             super().receive(data, now)
         else:
             line.down.send(data)

@@ -110,14 +110,17 @@ class _Seat:
         self._loopback, self._game, self._core = loopback, loopback.game, core
         self._wire = _Wire(core)
         self._session: Any = None
+        self._opened = False
         self._now = 0.0
 
     def poll(self, now: float) -> None:
         self._advance(now)
         core = self._core
+        # Only once to join: that this was refused is heard later, where there is a `link`.
         if self._session is None and (
-            core.state == "joining" or (core.state == "away" and now >= core.comeback.retry_at)
+            not self._opened if core.state == "joining" else core.state == "away" and now >= core.comeback.retry_at
         ):
+            self._opened = True
             core.comeback.trying()
             self._wire = _Wire(core)
             self._session = self._game.open(self._wire, now)

@@ -180,6 +180,15 @@ def test_a_match_over_it_is_as_one_over_a_real_path(link: str) -> None:
     assert set(core.stats.corrections_by_cause) <= {"late input"}
 
 
+def test_an_empty_message_is_malformed_as_without_a_link() -> None:
+    core = linked(FAR)
+    core.receive(b"", 16.0)
+    core.update(17.0)
+    (left,) = core.events()
+    assert isinstance(left, Left)
+    assert left.code == messages.MALFORMED
+
+
 @pytest.mark.e2e
 def test_over_real_sockets() -> None:
     def until(client: Client, so: Callable[[], bool]) -> None:

@@ -11,6 +11,7 @@ from scripts.examples.tag import Tag
 from server.auth import AuthError
 from server.game import Game
 from server.limits import Limits
+from shared import messages
 from shared.scene import load_scene
 
 FRAMES_PER_S = 64
@@ -182,6 +183,17 @@ def test_a_game_that_begins_anew_is_waited_for() -> None:
     assert lost.reason == "new rules"
     assert lost.wait_s >= 2
     assert isinstance(back, Resumed)
+
+
+def test_who_is_refused_hears_of_it_over_a_link_too() -> None:
+    game = Game(load_scene("flat"), limits=Limits(clients_max=1))
+    program = Program(game)
+    program.join("Ann")
+    second = program.join("Bob", link="typical")
+    program.run(3)
+    (left,) = program.told(second, Left)
+    assert isinstance(left, Left)
+    assert left.code == messages.FULL
 
 
 def _nobody() -> str:
