@@ -100,7 +100,8 @@ class Client(BaseClient):
         reach, somebody is in the way, too many), the picture goes back by itself.
 
         Raises:
-            RuntimeError: the client is not playing.
+            RuntimeError: the client has not joined.
+            TypeError: something is not a whole number.
         """
         return self.core.edit(x, y, z, kind)
 
@@ -110,7 +111,7 @@ class Client(BaseClient):
         Their word comes as an `Answered` event with the number that is returned here.
 
         Raises:
-            RuntimeError: the client is not playing.
+            RuntimeError: the client has not joined.
             ValueError: the name or the data are too long (32 characters, 1,024 bytes), or no MessagePack.
         """
         return self.core.command(name, data)

@@ -36,17 +36,25 @@ class Confirmed:
         self._templates = len(scene.templates)
         self._exist = frozenset(scene.segments())
         self._acted: set[int] = set()
-        self._early: dict[Cell, list[tuple[list[int], list[int]]]] = {}
+        self._coming: Cell | None = None
+        self._early: dict[int, int] = {}  # blocks of that one which changed since it was packed
 
     def expect_segment(self, segment: Cell) -> None:
-        """The first piece of a segment has come: it was packed before any edit that comes from here on."""
-        self._early[segment] = []
+        """The first piece of a segment has come: it was packed before any edit that comes from here on.
+
+        Raises:
+            ProtocolError: the scene has no such segment.
+        """
+        if segment not in self._exist:
+            raise ProtocolError(f"Terrain: the scene has no segment {segment}")
+        self._coming, self._early = segment, {}
 
     def load_segment(self, segment: Cell, kinds: np.ndarray[tuple[int, ...], np.dtype[np.uint8]]) -> None:
         """The blocks of a segment have come."""
         self.world.load_segment(segment, kinds)
-        for offsets, changed in self._early.pop(segment, ()):
-            self.world.write_blocks(segment, offsets, changed)
+        if segment == self._coming:
+            self.world.write_blocks(segment, self._early.keys(), self._early.values())
+            self._coming = None
         self.terrain_changed = True
 
     def apply(self, snapshot: Snapshot) -> str:
@@ -82,15 +90,16 @@ class Confirmed:
                     world.write_blocks(part.segment, *changes)
                     self.terrain_changed = True
                     self.edited_near |= self._near(part.segment, part.edits["block"].astype(np.int64))
-                if part.segment in self._early:
-                    self._early[part.segment].append(changes)
+                if part.segment == self._coming:
+                    self._early.update(zip(*changes, strict=True))
         if here:
             world.put(states)
         for part in parts:
             if part.attributes:
                 self.attributes.update((entity, said) for entity, said in part.attributes if entity in world)
         for segment in drops:
-            self._early.pop(segment, None)
+            if segment == self._coming:
+                self._coming = None
             if segment in world.blocks and not len(world.in_segment(segment)):
                 world.unload_segment(segment)
                 self.terrain_changed = True

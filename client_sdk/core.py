@@ -10,6 +10,7 @@
 """
 
 import math
+import operator
 from collections import deque
 from typing import Any
 
@@ -119,6 +120,8 @@ class Core:
 
     def open(self, now: float) -> None:
         """The connection is there: says hello."""
+        if self.state == "closed":
+            return
         self._open = True
         self._out.clear()
         digests = self.scene.digests if self.scene else {}
@@ -157,11 +160,13 @@ class Core:
 
         Raises:
             RuntimeError: the client has not joined.
+            TypeError: something is not a whole number.
         """
-        play, edit = self._joined("edit"), edits.Edit(x, y, z, kind)
+        play, edit = self._joined("edit"), edits.Edit(*map(operator.index, (x, y, z, kind)))
+        payload = edits.pack(edit)  # first: what cannot be sent is not predicted
         number = self._orders.number()
         tick = play.world.prediction.edit(number, edit)
-        return self._order(messages.Command(number, tick, play.seen, edits.NAME, edits.pack(edit)))
+        return self._order(messages.Command(number, tick, play.seen, edits.NAME, payload))
 
     def close(self) -> None:
         """Says goodbye."""
@@ -204,7 +209,7 @@ class Core:
         """The local time at which `update` has something to do."""
         due = self._told_clock.next_ping if self._open else self.comeback.retry_at
         if self._play:
-            due = min(due, self._play.next_tick())
+            due = min(due, self._play.next_tick(now))
         return max(due, now)  # inf: only once something has come in
 
     # -- what goes out -------------------------------------------------------------------------------------
@@ -343,4 +348,5 @@ class Core:
     def _end(self, left: Left) -> None:
         if self.state != "closed":
             self.state = "closed"
+            self._open = False
             self._events.append(left)

@@ -61,12 +61,14 @@ class Play:
     def restart(self, now: float) -> None:
         """Begins the prediction at the timeline's tick."""
         prediction = self.world.prediction
-        tick = max(math.floor(self.timeline.tick(now)), prediction.confirmed.tick, self.newest)
+        confirmed = prediction.confirmed.tick
+        # Bounded, whatever the server says of its time: all ticks since the confirmed one are replayed here.
+        tick = min(max(math.floor(self.timeline.tick(now)), confirmed, self.newest), confirmed + UNCONFIRMED_MAX)
         if prediction.begun:
             self._stats.resyncs += 1
             self._events.append(Resynchronised(tick, tick - self.newest))
         self.newest = tick
-        prediction.begin(max(tick - prediction.ahead, prediction.confirmed.tick))
+        prediction.begin(max(tick - prediction.ahead, confirmed))
 
     def update(self, now: float, wish: Input, *, online: bool) -> list[Message]:
         """Predicts every tick whose time has come, with `wish`; what to send.
@@ -90,9 +92,10 @@ class Play:
             self.restart(now)
         return ([Resync()] if alarm else []) + inputs
 
-    def next_tick(self) -> float:
+    def next_tick(self, now: float) -> float:
         """The local time at which there is one to predict; inf: not before something has come in."""
-        waits = self.newest >= self.world.prediction.confirmed.tick + UNCONFIRMED_MAX
+        end, to = self.world.prediction.confirmed.tick + UNCONFIRMED_MAX, math.floor(self.timeline.tick(now))
+        waits = self.newest >= end or (to - self.newest > TICKS_PER_UPDATE_MAX and to > end)
         return math.inf if waits else self.timeline.when(self.newest + 1)
 
     def view(self, now: float) -> View:

@@ -199,6 +199,7 @@ class Window:
             found.append(Actor(figure, tone, it=figure.template == "it", own=own, safe=safe))
         seen = {actor.figure.entity for actor in found}
         self._tones = {entity: tone for entity, tone in self._tones.items() if entity in seen}
+        self._looks = {entity: look for entity, look in self._looks.items() if entity in seen}
         return found
 
     def _tone(self, entity: int) -> Colour:
