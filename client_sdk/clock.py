@@ -124,6 +124,8 @@ FIRST_S = 20.0
 FIRST_INPUTS = 16
 SPREAD_S_MAX = 0.5
 """A pong that took longer than that waited for a program that was busy (loading, compiling), not for the path."""
+NEEDS_MAX = 1024
+"""So many needs are kept, and at least half of them; what is left must hold two stalls."""
 REVIEW = 8
 """The cover is thought over after so many inputs."""
 
@@ -169,8 +171,8 @@ class PricedLead:
         if len(needs) >= 2 * stall:  # all stalls that could contain the input of `stall` ago are known
             base = max(self._least[-stall:])
             self._remember(needs[-stall] - (base if base > calm + SHIFT else calm))
-        if len(needs) > 1024:
-            del needs[:512], self._least[:512]
+        if len(needs) > NEEDS_MAX:
+            del needs[: NEEDS_MAX // 2], self._least[: NEEDS_MAX // 2]
 
     def steer(self, phase: float, elapsed: float, clock: ServerClock, now: float) -> float:
         """See `LeadController`."""
@@ -194,7 +196,7 @@ class PricedLead:
         return phase + max(-FASTER * elapsed, min(way, fastest * elapsed))
 
     def _measure(self, clock: ServerClock) -> None:
-        self._stall = math.ceil((self._stall_s + 2 * clock.rtt_s) * clock.rate)
+        self._stall = min(math.ceil((self._stall_s + 2 * clock.rtt_s) * clock.rate), NEEDS_MAX // 4)
 
     def _remember(self, excess: float) -> None:
         self._excess.append(excess)

@@ -287,3 +287,18 @@ def test_a_change_of_the_path_for_good_is_the_path_after_a_while() -> None:
     loop = Loop(lambda i: 101.0 + 2.0 * (i >= 3000)).run(3000 + int(3 * CALM_S * RATE))
     assert loop.phases[-1] == pytest.approx(103 + SAFETY, abs=0.02)
     assert len(loop.late) <= 12
+
+
+def test_a_long_way_at_a_high_rate_is_learnt_like_any() -> None:
+    """Two seconds of round trip at 240 ticks a second: a stall may take 1,020 inputs."""
+    clock = ServerClock()
+    clock.rate = 240.0
+    for i in range(PINGS):
+        clock.answered(float(i), clock.rate * (i + 1), i + 2.0)
+    lead = PricedLead()
+    timeline = Timeline(clock.rate, lead.start(clock, 2.0), 2.0)
+    need = timeline.phase - 5.0
+    for i in range(4000):
+        timeline.steer(lead, clock, 2.0 + i / clock.rate)
+        lead.observe(i, timeline.phase - need, timeline.phase, 2.0 + i / clock.rate)
+    assert timeline.phase == pytest.approx(need + SAFETY, abs=0.1)
