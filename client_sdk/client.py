@@ -1,7 +1,7 @@
 """What a game developer holds: one object in the game's own loop, without a thread and without an event loop.
 
 with Client.connect("ws://localhost:8765", name="Ann") as client:
-    while client.playing or client.joining:
+    while not client.closed:
         for event in client.poll():
             print(event)
         client.set_input(1, 0, jump=pressed("space"))

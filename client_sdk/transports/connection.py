@@ -24,7 +24,7 @@ from client_sdk.core import Core
 from shared.messages import MESSAGE_MAX, REASON_MAX, TEXT, TOO_SLOW
 
 UNSENT_MAX = 64 * 1024
-"""Bytes that may wait for a server that does not read, some 20 s of a player's inputs; more end the connection."""
+"""Bytes that may wait for a server that does not read, some 90 s of 32 inputs each; more end the connection."""
 SILENCE_S = 10.0
 """A server that is not heard for so long is gone, or the way to it is: TCP alone may take 15 minutes to say so."""
 LOOK_S = 1.0
