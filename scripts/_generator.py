@@ -100,7 +100,7 @@ class Swarm:
 
     def receive(self, player: Player, now: float) -> None:
         try:
-            data = player.sock.recv(1 << 18)
+            data = player.sock.recv(1 << 16)
         except BlockingIOError:
             return
         except OSError:
