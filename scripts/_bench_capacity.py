@@ -1,7 +1,6 @@
 """`bench.py server`: the searches of `_bench_server.py`, one after the other, and their table."""
 
 import argparse
-import json
 import os
 import statistics
 from typing import Any
@@ -12,7 +11,7 @@ from rich.table import Table
 import _bench_server as server
 
 
-def run(args: argparse.Namespace, console: Console) -> int:
+def run(args: argparse.Namespace, console: Console) -> tuple[dict[str, Any], int]:
     seconds, resolution, steps, searches = (1.5, 0.2, 3, 1) if args.quick else (5.0, 0.04, 9, 3)
     cores = os.cpu_count() or 1
     runs: list[dict[str, Any]] = []
@@ -70,10 +69,7 @@ def run(args: argparse.Namespace, console: Console) -> int:
     console.print(capacity_table(runs, bounds))
     if max(run["load_before"] for run in runs) > cores / 2:
         console.print("other processes were at work: the numbers of clients are too low, go by the CPU time")
-    if args.json:
-        report_ = {"quick": args.quick, "rate": server.RATE, "cores": cores, "runs": runs + bounds}
-        args.json.write_text(json.dumps(report_, indent=1) + "\n", encoding="utf-8")
-    return 0
+    return {"quick": args.quick, "rate": server.RATE, "cores": cores, "runs": runs + bounds}, 0
 
 
 def bound(stages: list[dict[str, Any]]) -> dict[str, Any]:
@@ -87,7 +83,7 @@ def bound(stages: list[dict[str, Any]]) -> dict[str, Any]:
     }
 
 
-def run_crowd(args: argparse.Namespace, console: Console, seconds: float) -> int:
+def run_crowd(args: argparse.Namespace, console: Console, seconds: float) -> tuple[dict[str, Any], int]:
     """So many players in one segment, each seeing all."""
     with server.rig("game", capacity=args.crowd, per_segment=args.crowd) as running:
         stage = server.packed(running.hold(args.crowd, seconds))
@@ -106,11 +102,7 @@ def run_crowd(args: argparse.Namespace, console: Console, seconds: float) -> int
     ):
         made.add_row(name, "" if stage[name] is None else form.format(stage[name]))
     console.print(made)
-    if args.json:
-        args.json.write_text(
-            json.dumps({"quick": args.quick, "rate": server.RATE, "crowd": stage}, indent=1) + "\n", "utf-8"
-        )
-    return 0
+    return {"quick": args.quick, "rate": server.RATE, "crowd": stage}, 0
 
 
 def capacity_table(runs: list[dict[str, Any]], bounds: list[dict[str, Any]]) -> Table:

@@ -8,7 +8,6 @@ CPU time of the server's thread. Quantiles are of the samples of all rounds put 
 """
 
 import argparse
-import json
 import statistics
 from collections import Counter
 from typing import Any
@@ -69,7 +68,7 @@ def summary(rounds: list[Figures]) -> Figures:
     return found
 
 
-def run(args: argparse.Namespace, console: Console) -> int:
+def run(args: argparse.Namespace, console: Console) -> tuple[dict[str, Any], int]:
     rounds, seconds = (1, 3.0) if args.quick else (args.rounds, 10.0)
     stages: dict[str, list[Figures]] = {kind: [] for kind in VARIANTS}
     for number in range(rounds):
@@ -79,10 +78,8 @@ def run(args: argparse.Namespace, console: Console) -> int:
             console.print(f"round {number + 1} of {rounds}: {VARIANTS[kind]}", highlight=False)
     report = {kind: summary(found) for kind, found in stages.items()}
     console.print(table(report, args.clients, rounds, seconds))
-    if args.json:
-        told = {"clients": args.clients, "rate": server.RATE, "seconds": seconds, "variants": report, "rounds": stages}
-        args.json.write_text(json.dumps(told, indent=1) + "\n", encoding="utf-8")
-    return 0
+    told = {"clients": args.clients, "rate": server.RATE, "seconds": seconds, "variants": report, "rounds": stages}
+    return told, 0
 
 
 def table(report: dict[str, Figures], clients: int, rounds: int, seconds: float) -> Table:

@@ -45,6 +45,9 @@ import _step_c
 from _crowds import Samples
 from shared import kernels
 
+Report = dict[str, Any]
+"""What `--json` writes; empty: nothing. A command gives it, and the exit code."""
+
 
 class Row(NamedTuple):
     """A line of the table: the samples in `unit`, and the most that they should be in the middle."""
@@ -68,10 +71,10 @@ def ratios(samples: Samples) -> list[float]:
     return [ours / theirs for ours, theirs in zip(samples["ours"], samples["c"], strict=True)]
 
 
-def run_physics(args: argparse.Namespace, console: Console) -> int:
+def run_physics(args: argparse.Namespace, console: Console) -> tuple[Report, int]:
     if not kernels.available():
         console.print("error: Numba is not installed; the benchmark times the compiled step")
-        return 2
+        return {}, 2
     rounds = 10 if args.quick else 60
     rows: list[Row] = []
     report: dict[str, Any] = {"quick": args.quick, "rounds": rounds}
@@ -136,12 +139,10 @@ def run_physics(args: argparse.Namespace, console: Console) -> int:
         console.print("gcc is not installed: the rows of the step in C are left out")
     console.print(f"slabs and cells give the same answers: {'yes' if report['obstacles_agree'] else 'NO'}")
     console.print(f"a million entities were spawned in {report['million_spawn_s']:.1f} s, terrain of 2 x 2 km included")
-    if args.json:
-        args.json.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
-    return 0 if report["hash_equal_to_c"] is not False and report["obstacles_agree"] else 1
+    return report, 0 if report["hash_equal_to_c"] is not False and report["obstacles_agree"] else 1
 
 
-def run_bytes(args: argparse.Namespace, console: Console) -> int:
+def run_bytes(args: argparse.Namespace, console: Console) -> tuple[Report, int]:
     """What a client is sent, by how the others move; some of them pause, so there are more in view than move."""
     ticks, seeds = (200, 1) if args.quick else (600, 3)
     runs = [
@@ -157,12 +158,10 @@ def run_bytes(args: argparse.Namespace, console: Console) -> int:
     for run in runs:
         made.add_row(run["motion"], str(run["seed"]), *(form.format(run[name]) for name, form in forms.items()))
     console.print(made)
-    if args.json:
-        args.json.write_text(json.dumps({"rate": wire.RATE, "runs": runs}, indent=1) + "\n", encoding="utf-8")
-    return int(any(run["differing"] for run in runs))
+    return {"rate": wire.RATE, "runs": runs}, int(any(run["differing"] for run in runs))
 
 
-def run_memory(args: argparse.Namespace, console: Console) -> int:
+def run_memory(args: argparse.Namespace, console: Console) -> tuple[Report, int]:
     """What things take, and whether anything stays of what is gone."""
     report = memory.run(args.cycles)
     for name in ("segment", "entity", "connection"):
@@ -178,12 +177,10 @@ def run_memory(args: argparse.Namespace, console: Console) -> int:
         report["churn"] = churn = rss.churn(args.minutes, lambda minute: console.print(f"  {minute}", soft_wrap=True))
         console.print(f"{churn['slope_kb_per_minute']:+10,.1f} KB of RSS per minute of churn over sockets,", end=" ")
         console.print(f"{churn['slope_kb_per_minute_second_half']:+,.1f} in the second half")
-    if args.json:
-        args.json.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
-    return 0
+    return report, 0
 
 
-def run_entities(args: argparse.Namespace, console: Console) -> int:
+def run_entities(args: argparse.Namespace, console: Console) -> tuple[Report, int]:
     """A large world, once for each seed."""
     runs = [entities.run(args.entities, args.clients, seed) for seed in range(1, args.seeds + 1)]
     made = Table("figure", title=f"entities: one in {entities.WALKS} walks, {entities.RATE} Hz, CPU time per tick")
@@ -192,9 +189,7 @@ def run_entities(args: argparse.Namespace, console: Console) -> int:
     for name in runs[0]:
         made.add_row(name, *(f"{run[name]:,.{1 if name.endswith('_ms') else 0}f}" for run in runs))
     console.print(made)
-    if args.json:
-        args.json.write_text(json.dumps({"rate": entities.RATE, "runs": runs}, indent=1) + "\n", encoding="utf-8")
-    return 0
+    return {"rate": entities.RATE, "runs": runs}, 0
 
 
 def table(rows: list[Row]) -> Table:
@@ -212,42 +207,45 @@ def table(rows: list[Row]) -> Table:
 def main(argv: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     commands = parser.add_subparsers(dest="command", required=True)
-    command = commands.add_parser("physics", help="the step of the shared world")
-    command.add_argument("--json", type=Path, metavar="OUT", help="write all figures to this file")
+    each = argparse.ArgumentParser(add_help=False)
+    each.add_argument("--json", type=Path, metavar="OUT", help="write all figures to this file")
+    command = commands.add_parser("physics", parents=[each], help="the step of the shared world")
     command.add_argument("--quick", action="store_true", help="fewer rounds")
     command.set_defaults(run=run_physics)
-    command = commands.add_parser("server", help="clients per server process (Linux)")
-    command.add_argument("--json", type=Path, metavar="OUT", help="write all figures to this file")
+    command = commands.add_parser("server", parents=[each], help="clients per server process (Linux)")
     command.add_argument("--quick", action="store_true", help="one coarse search, within 45 s")
     command.add_argument(
         "--crowd", type=int, nargs="?", const=300, metavar="N", help="N players in one segment instead (300)"
     )
     command.set_defaults(run=capacity.run)
-    command = commands.add_parser("bytes", help="what a client is sent")
+    command = commands.add_parser("bytes", parents=[each], help="what a client is sent")
     command.add_argument("--entities", type=int, default=100, metavar="N", help="how many of them move (100)")
-    command.add_argument("--json", type=Path, metavar="OUT", help="write all figures to this file")
     command.add_argument("--quick", action="store_true", help="ten seconds of one seed each")
     command.set_defaults(run=run_bytes)
-    command = commands.add_parser("memory", help="bytes per connection, entity and segment, and under churn")
+    command = commands.add_parser(
+        "memory", parents=[each], help="bytes per connection, entity and segment, and under churn"
+    )
     command.add_argument("--cycles", type=int, default=10, metavar="N", help="of churn in process, 2 s each (10)")
     command.add_argument("--rounds", type=int, default=3, metavar="N", help="of connections over sockets (3; Linux)")
     command.add_argument("--minutes", type=float, default=0.0, metavar="M", help="of churn over sockets (none; Linux)")
-    command.add_argument("--json", type=Path, metavar="OUT", help="write all figures to this file")
     command.set_defaults(run=run_memory)
-    command = commands.add_parser("entities", help="a tick of a large world")
+    command = commands.add_parser("entities", parents=[each], help="a tick of a large world")
     command.add_argument("--entities", type=int, default=100_000, metavar="N", help="a tenth of them walk (100,000)")
     command.add_argument("--clients", type=int, default=200, metavar="N", help="that join (200)")
     command.add_argument("--seeds", type=int, default=2, metavar="N", help="runs (2)")
-    command.add_argument("--json", type=Path, metavar="OUT", help="write all figures to this file")
     command.set_defaults(run=run_entities)
-    command = commands.add_parser("jitter", help="how late ticks are, by garbage collection and event loop (Linux)")
+    command = commands.add_parser(
+        "jitter", parents=[each], help="how late ticks are, by garbage collection and event loop (Linux)"
+    )
     command.add_argument("--clients", type=int, default=200, metavar="N", help="that play (200)")
     command.add_argument("--rounds", type=int, default=4, metavar="N", help="of 10 s for each variant (4)")
-    command.add_argument("--json", type=Path, metavar="OUT", help="write all figures to this file")
     command.add_argument("--quick", action="store_true", help="one round of 3 s each, within a minute")
     command.set_defaults(run=jitter.run)
     args = parser.parse_args(argv)
-    return int(args.run(args, Console()))
+    report, status = args.run(args, Console())
+    if args.json and report:
+        args.json.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
+    return int(status)
 
 
 if __name__ == "__main__":
