@@ -85,6 +85,22 @@ def accept(sock: socket.socket) -> Peer:
     return peer
 
 
+@contextlib.contextmanager
+def silent_server() -> Iterator[str]:
+    """The URL of a server that accepts its first client and says nothing more, while it lasts."""
+    over = threading.Event()
+
+    def script(sock: socket.socket) -> None:
+        accept(sock)
+        over.wait(20)
+
+    with scripted_server(script) as url:
+        try:
+            yield url
+        finally:
+            over.set()
+
+
 def until_closed(sock: socket.socket, peer: Peer) -> list[Frame]:
     """Everything that the client still sends, with the closing handshake carried out."""
     frames: list[Frame] = []

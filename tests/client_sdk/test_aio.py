@@ -17,7 +17,7 @@ from client_sdk.transports import connection
 from client_sdk.transports.aio import AsyncClient
 from client_sdk.transports.connection import ConnectError
 from shared import messages
-from tests.client_sdk.servers import accept, real_server, scripted_server
+from tests.client_sdk.servers import accept, real_server, scripted_server, silent_server
 
 pytestmark = pytest.mark.e2e
 
@@ -241,18 +241,12 @@ def test_two_who_wait_both_hear_of_the_end(url: str, run: Run) -> None:
 
 def test_a_way_that_has_become_silent_ends(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(connection, "SILENCE_S", 0.3)
-    over = threading.Event()
-
-    def script(sock: socket.socket) -> None:
-        accept(sock)
-        over.wait(20)
 
     async def scene() -> None:
         client = await AsyncClient.connect(address)
         (left,) = [event async for event in client]
         assert isinstance(left, Left)
         assert left.reason == "nothing heard for 0.3 s"
-        over.set()
 
-    with scripted_server(script) as address:
+    with silent_server() as address:
         run(scene())

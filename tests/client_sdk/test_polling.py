@@ -16,7 +16,7 @@ from client_sdk.transports.polling import PollingTransport
 from shared import messages
 from shared.messages import Bye, encode
 from shared.scene import load_scene
-from tests.client_sdk.servers import accept, real_server, scripted_server, until_closed
+from tests.client_sdk.servers import accept, real_server, scripted_server, silent_server, until_closed
 
 pytestmark = pytest.mark.e2e
 
@@ -101,20 +101,14 @@ def test_small_messages_are_not_held_back(url: str) -> None:
 
 
 def test_an_idle_poll_costs_microseconds() -> None:
-    over = threading.Event()
-
-    def script(sock: socket.socket) -> None:
-        accept(sock)
-        over.wait(20)
-
-    with scripted_server(script) as url, Client.connect(url) as client:
+    with silent_server() as url, Client.connect(url) as client:
         best = float("inf")
         for _ in range(50):
             begun = time.perf_counter()
             for _ in range(200):
                 client.poll()
             best = min(best, (time.perf_counter() - begun) / 200)
-        over.set()
+        client.close(timeout=0)
     assert best < 10e-6  # 2 us on an idle machine
 
 
@@ -220,32 +214,18 @@ def test_silence_ends_in_time() -> None:
 
 
 def test_close_waits_no_longer_than_told() -> None:
-    over = threading.Event()
-
-    def script(sock: socket.socket) -> None:
-        accept(sock)
-        over.wait(20)
-
-    with scripted_server(script) as url:
+    with silent_server() as url:
         client = Client.connect(url)
         begun = time.monotonic()
         client.close(timeout=0.2)
         assert time.monotonic() - begun < 2
-        over.set()
 
 
 def test_a_way_that_has_become_silent_ends(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(connection, "SILENCE_S", 0.3)
-    over = threading.Event()
-
-    def script(sock: socket.socket) -> None:
-        accept(sock)
-        over.wait(20)
-
-    with scripted_server(script) as address:
+    with silent_server() as address:
         client = Client.connect(address)
         (left,) = play(client, lambda: client.closed)
-        over.set()
     assert isinstance(left, Left)
     assert left.reason == "nothing heard for 0.3 s"
     assert client._transport._socket is None  # type: ignore[attr-defined]
