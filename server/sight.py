@@ -27,7 +27,6 @@ class Sight:
         self._fresh: set[Cell] = set()  # no keyframe sent yet
         self._behind: dict[Cell, int] = {}  # sent last with this tick, which is before `_tick`
         self._tick = -1
-        self._row: tuple[Cell, ...] = ()
 
     def move(self, centre: Cell, see: int, keep: int, exists: Callable[[Cell], bool]) -> tuple[list[Cell], list[Cell]]:
         """The entity is in another segment: what is seen from now on, nearest first, and what is let go."""
@@ -39,7 +38,6 @@ class Sight:
             self._behind.pop(segment, None)
         self.sees.update(added)
         self._fresh.update(added)
-        self._row = tuple(self.sees)
         self.drops = sorted(self._knows - self.sees)
         return added, dropped
 
@@ -70,7 +68,7 @@ class Sight:
         """The encoded parts of a snapshot for `tick`, of about `room` bytes; they count as sent, as do `drops`."""
         known = log.since(self._tick)
         if not (self._behind or self._fresh or self.drops):  # as nearly always
-            plain = [part for segment in self._row if (part := known[segment])]
+            plain = [part for segment in self.sees if (part := known[segment])]
             if sum(map(len, plain)) <= room:
                 self._tick = tick
                 return plain
