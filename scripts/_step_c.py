@@ -32,5 +32,5 @@ def run(world: World, ticks: int) -> None:
     addresses = [array.ctypes.data for array in arrays]
     struct = (ctypes.c_int64 * (len(addresses) + 1))(*addresses, len(arrays.table))
     for _ in range(ticks):
-        world._tick += 1
-        step(struct, ctypes.c_int64(world._tick))
+        world.tick += 1
+        step(struct, ctypes.c_int64(world.tick))

@@ -45,7 +45,8 @@ class World:
 
     def __init__(self, scene: Scene, *, compiled: bool | None = None) -> None:
         self.scene = scene
-        self._tick = 0
+        self.tick = 0
+        """How many ticks have passed; see `rebase`."""
         self.blocks = blocks.Blocks()
         self.compiled = kernels.available() if compiled is None else compiled
         self._kernel: Any = kernels.compiled() if self.compiled else kernels.PLAIN
@@ -71,11 +72,6 @@ class World:
         self._store = kernels.direct(self._kernel.store, self._arrays, told, told, 0, 0)
 
     # -- reading -------------------------------------------------------------------------------------------
-
-    @property
-    def tick(self) -> int:
-        """How many ticks have passed; see `rebase`."""
-        return self._tick
 
     def __len__(self) -> int:
         return len(self._row_of)
@@ -200,11 +196,11 @@ class World:
         """16 bytes over the tick, all blocks and all entities (or just some, and then no blocks)."""
         if entities is None:
             rows = list(self.blocks.rows.values())
-            return hash_of(self._tick, self.blocks.segments[rows], self.blocks.digests[rows], self.states())
+            return hash_of(self.tick, self.blocks.segments[rows], self.blocks.digests[rows], self.states())
         nothing = np.zeros((0, 3), np.int64)
         states = self.rows(sorted(entities))[:, :STATES]
         states[:, FLAGS] &= FALLING
-        return hash_of(self._tick, nothing, nothing[:, 0].astype(np.uint64), states)
+        return hash_of(self.tick, nothing, nothing[:, 0].astype(np.uint64), states)
 
     # -- blocks --------------------------------------------------------------------------------------------
 
@@ -329,7 +325,7 @@ class World:
         states[:, TEMPLATE] = kind
         states[:, X : X + 3] = at
         rows = np.array([self._row(entity) for entity in ids], np.int64)
-        settled = self._kernel.settle(self._arrays, self._lent(rows), self._lent(states), n, self._tick + 1)
+        settled = self._kernel.settle(self._arrays, self._lent(rows), self._lent(states), n, self.tick + 1)
         if settled < n:
             for entity in ids[settled:]:
                 self._free.append(self._row_of.pop(entity))
@@ -382,7 +378,7 @@ class World:
         ids = new[:, ID].tolist()
         known = list(map(self._row_of.get, ids))
         rows = np.array([self._row(entity) for entity in ids] if None in known else known, np.int64)
-        self._store(self._arrays, self._lent(rows), self._lent(new), len(rows), self._tick + 1)
+        self._store(self._arrays, self._lent(rows), self._lent(new), len(rows), self.tick + 1)
 
     def write_blocks(self, segment: Cell, offsets: Iterable[int], kinds: Iterable[int]) -> None:
         """Changes blocks of a loaded segment (by index z << 10 | y << 5 | x): what a snapshot says, verbatim.
@@ -413,11 +409,11 @@ class World:
             KeyError: a turn of an entity that does not exist.
         """
         turns[:, 0] = [self._row_of[entity] for entity in turns[:, 0].tolist()]
-        self._kernel.follow(self._arrays, self._lent(turns), len(turns), self._rows, ticks, self._tick + 1)
+        self._kernel.follow(self._arrays, self._lent(turns), len(turns), self._rows, ticks, self.tick + 1)
 
     def rebase(self, tick: int) -> None:
         """Declares what has been written to be the world at the end of `tick`, without a step."""
-        self._tick = tick
+        self.tick = tick
         self.editing, self.edited = {}, {}
         self._entities[: self._rows, layout.CHANGED] = -1  # it may be a tick that has been before
         self._lengths[layout.N_CHANGED] = self._lengths[layout.N_FELL] = 0
@@ -447,9 +443,9 @@ class World:
                 self._inputs = np.zeros(2 * len(told), np.int64)
                 self._told = self._lent(self._inputs)
             self._inputs[: len(told)] = told
-        self._tick += 1
+        self.tick += 1
         self.edited, self.editing = self.editing, {}
-        self._step(self._arrays, self._told, n, self._tick)
+        self._step(self._arrays, self._told, n, self.tick)
         if self._limbo:
             self._free += self._limbo
             self._limbo.clear()
@@ -468,7 +464,7 @@ class World:
         if moved:
             self._allocate(len(other._entities))
         self.editing, self.edited = dict(other.editing), dict(other.edited)
-        self._tick, self._next_id, self._rows = other._tick, other._next_id, other._rows
+        self.tick, self._next_id, self._rows = other.tick, other._next_id, other._rows
         self._row_of, self._free, self._limbo = dict(other._row_of), list(other._free), list(other._limbo)
         n = self._rows
         self._entities[:n] = other._entities[:n]
