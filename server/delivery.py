@@ -38,27 +38,29 @@ class Delivery:
         centre = self._log.segment(session.entity)
         if centre is not session.sight.centre:
             self._look_around(session, centre)
-        outstanding = session.link.outstanding()
-        window = session.pacing.window(outstanding, session.snapshot_bytes, self._tick_s, now)
+        pacing = session.pacing
+        window = pacing.window(session.snapshot_bytes, self._tick_s, now)
         if session.acked < 0:
             window = max(window, self._limits.first_bytes)
-        if outstanding > window:
+        if (outstanding := pacing.outstanding) > window:
             self._counters.snapshots_skipped += 1
             return
         session.sent_at = now
         for message in session.outbox:
             session.send(message)
         session.outbox.clear()
-        self._send_snapshot(session, min(session.pacing.room(window, outstanding), SNAPSHOT_BYTES))
+        self._send_snapshot(session, min(pacing.room(window), SNAPSHOT_BYTES))
         if outstanding == 0 and session.probe is None:
             session.probe = (self._world.tick, now, session.snapshot_bytes)
         if session.terrain_now or session.terrain_due:
-            self._send_terrain(session, window - session.link.outstanding())
+            pacing.look()
+            self._send_terrain(session, window - pacing.outstanding)
 
     def acked(self, session: Session, tick: int, now: float) -> None:
         """The client has applied the snapshot of a tick."""
         if session.acked < tick <= session.tick:
             session.acked = tick
+            session.pacing.acked(tick)
             if session.probe is not None and tick >= session.probe[0]:
                 probe, sent_at, size = session.probe
                 session.probe = None
@@ -101,6 +103,7 @@ class Delivery:
         header = (tick, inputs.newest, inputs.margins.tobytes(), first, bytes(inputs.fates), verdicts, drops)
         message = messages.join_snapshot(header, parts)
         session.send(message)
+        session.pacing.sent(tick)
         session.tick = tick
         session.snapshot_bytes = len(message)
         inputs.told()

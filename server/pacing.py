@@ -18,9 +18,15 @@ The round trip is measured of snapshots before which nothing was on the way. Whe
 path is full, sending pauses once a minute until it is empty, or a queue of one's own would pass for distance, and grow
 for ever.
 A client that lost some ticks that way gets their union in its next snapshot: latest wins.
+
+The link is asked what is on the way only where that decides something: from one time to the next, what has been sent
+since is counted on top (2.3 us less of 31.7 for each client's tick). Where the system cannot tell (Linux can), what the
+client has not acknowledged counts.
 """
 
 import math
+from collections import deque
+from collections.abc import Callable
 
 RATE_WINDOW_S = 1.0
 """The rate is the best of the last second,"""
@@ -46,11 +52,22 @@ NARROW_BYTES = 96
 
 
 class Pacing:
-    """The path to one client, from what was sent and what is still on the way."""
+    """The path to one client, from what was sent and what is still on the way.
 
-    def __init__(self) -> None:
+    Args:
+        ask: as `server.session.Link.outstanding`.
+    """
+
+    def __init__(self, ask: Callable[[], int | None]) -> None:
         self.sent_bytes = 0
         """All that has been handed to the transport."""
+        self._ask = ask
+        self._taken = 0  # so much of it at least is not on the way any more
+        # Where the link cannot tell: snapshots that have not been acknowledged, and what had been sent with each. They
+        # count from the first acknowledgement on: a client that waits for terrain sends none.
+        self._blind = False
+        self._unheard: deque[tuple[int, int]] = deque()
+        self._heard = -1
         self._measure_at = -math.inf
         self._acked: list[tuple[float, int]] = []  # time, bytes acknowledged by then
         # Time and value; whatever a later one beats is dropped, so the best is in front.
@@ -72,6 +89,30 @@ class Pacing:
         """The shortest time lately from sending a snapshot to hearing that it was applied."""
         return self._rtts[0][1] if self._rtts else 0.0
 
+    @property
+    def outstanding(self) -> int:
+        """Bytes that are on the way, at most."""
+        return self.sent_bytes - self._taken
+
+    def look(self) -> None:
+        """Asks the link: `outstanding` is exact now."""
+        told = self._ask()
+        self._blind = self._blind or told is None
+        unheard = self._unheard[-1][1] - self._heard if self._unheard else 0
+        self._taken = self.sent_bytes - max(told or 0, unheard)
+
+    def sent(self, tick: int) -> None:
+        """The snapshot of a tick has been handed over."""
+        if self._blind and self._heard >= 0:
+            self._unheard.append((tick, self.sent_bytes))
+
+    def acked(self, tick: int) -> None:
+        """The client has applied the snapshot of a tick."""
+        if self._heard < 0:
+            self._heard = self.sent_bytes
+        while self._unheard and self._unheard[0][0] <= tick:
+            self._heard = self._unheard.popleft()[1]
+
     def answered(self, rtt_s: float, size: int, now: float) -> None:
         """The client has acknowledged, `rtt_s` after it was sent, `size` bytes before which nothing was on the way."""
         if now - self._full_at < RATE_WINDOW_S + rtt_s and self.rate > 0:
@@ -85,27 +126,30 @@ class Pacing:
         self._rtts.append((now, rtt_s))
         self._pauses = False
 
-    def window(self, outstanding: int, snapshot_bytes: int, tick_s: float, now: float) -> int:
-        """How many bytes may be on the way now, given how many are; call once a tick."""
+    def window(self, snapshot_bytes: int, tick_s: float, now: float) -> int:
+        """How many bytes may be on the way now, if the latest snapshot had so many; call once a tick."""
         if now >= self._measure_at:
             self._measure_at = now + SAMPLE_S
-            self._measure(outstanding, tick_s, now)
+            self.look()
+            self._measure(tick_s, now)
+        window = self._carries if self._narrow else max(2 * snapshot_bytes, self._carries)
+        if self.sent_bytes - self._taken + snapshot_bytes > window:
+            self.look()
         if self._pauses:
             return 0
-        window = self._carries if self._narrow else max(2 * snapshot_bytes, self._carries)
-        held = outstanding > window
+        held = self.sent_bytes - self._taken > window
         if held:
             self._full_at = now
         if held or self._held:
             self._held += (held - self._held) / HELD_TICKS
         return window
 
-    def room(self, window: int, outstanding: int) -> int:
+    def room(self, window: int) -> int:
         """How large about a snapshot may be that is sent now."""
-        return self._portion if self._narrow else max(window - outstanding, LEAST_BYTES)
+        return self._portion if self._narrow else max(window - self.outstanding, LEAST_BYTES)
 
-    def _measure(self, outstanding: int, tick_s: float, now: float) -> None:
-        acked = self.sent_bytes - outstanding
+    def _measure(self, tick_s: float, now: float) -> None:
+        acked = self._taken
         self._acked.append((now, acked))
         while len(self._acked) > 1 and self._acked[1][0] <= now - RATE_SPAN_S:
             self._acked.pop(0)

@@ -39,8 +39,8 @@ class Link(Protocol):
     def send(self, message: bytes) -> None:
         """Queues one message; never blocks."""
 
-    def outstanding(self) -> int:
-        """Bytes handed over that the peer has not yet acknowledged."""
+    def outstanding(self) -> int | None:
+        """Bytes handed over that the peer's system has not yet acknowledged; None: nobody can tell."""
         ...
 
     def close(self, code: int, reason: str) -> None:
@@ -196,7 +196,7 @@ class Session:
         self.shared = 0
         """The version of the game's shared values that it has been sent."""
         self.resynced_at = now
-        self.pacing = Pacing()
+        self.pacing = Pacing(link.outstanding)
         self.probe: tuple[int, float, int] | None = None
         """A snapshot before which nothing was on the way: its tick, when it was sent, its bytes."""
         self.corrections = -1

@@ -36,15 +36,25 @@ class FakeLink:
         self.calls_back = calls_back
         self.sent: list[Message] = []
         self.closings: list[tuple[int, str]] = []
-        self.waiting = 0
+        self._waiting = 0
         self.session: Session
 
     def send(self, message: bytes) -> None:
         assert len(message) <= messages.MESSAGE_MAX
         self.sent.append(decode_from_server(message))
 
-    def outstanding(self) -> int:
-        return self.waiting
+    @property
+    def waiting(self) -> int:
+        """Bytes on the way; who sets it need not wait for the game to look, which it does where it has sent some."""
+        return self._waiting
+
+    @waiting.setter
+    def waiting(self, n: int) -> None:
+        self._waiting = n
+        self.session.pacing.look()
+
+    def outstanding(self) -> int | None:
+        return self._waiting
 
     def close(self, code: int, reason: str) -> None:
         self.closings.append((code, reason))

@@ -1,92 +1,153 @@
 """How much may be on the way: by hand-made paths."""
 
-from server.pacing import HOLD_S_MAX, LEAST_BYTES, NARROW_TICKS, RTT_WINDOW_S, Pacing
+from server.pacing import HOLD_S_MAX, LEAST_BYTES, NARROW_TICKS, RTT_WINDOW_S, SAMPLE_S, Pacing
 
 TICK_S = 1 / 32
 
 
-def stream(pacing: Pacing, seconds: float, bytes_per_tick: int, outstanding: int, start: float = 0.0) -> float:
-    """Sends evenly while so much is on the way; the time afterwards."""
-    now = start
-    for _ in range(int(seconds / TICK_S)):
-        pacing.sent_bytes += bytes_per_tick
-        now += TICK_S
-        pacing.window(outstanding, bytes_per_tick, TICK_S, now)
-    return now
+class Path:
+    """So much is on the way; None: it cannot tell."""
+
+    def __init__(self, outstanding: int | None = 0) -> None:
+        self.outstanding = outstanding
+        self.asked = 0
+        self.pacing = Pacing(self._ask)
+
+    def _ask(self) -> int | None:
+        self.asked += 1
+        return self.outstanding
+
+    def window(self, snapshot_bytes: int, now: float) -> int:
+        return self.pacing.window(snapshot_bytes, TICK_S, now)
+
+    def stream(self, seconds: float, bytes_per_tick: int, start: float = 0.0) -> float:
+        """Sends evenly while so much is on the way; the time afterwards."""
+        now = start
+        for _ in range(int(seconds / TICK_S)):
+            self.pacing.sent_bytes += bytes_per_tick
+            now += TICK_S
+            self.window(bytes_per_tick, now)
+        return now
 
 
 def test_of_an_unknown_path_two_snapshots_may_be_on_the_way() -> None:
-    assert Pacing().window(0, 100, TICK_S, 0.0) == LEAST_BYTES
-    assert Pacing().window(0, 4000, TICK_S, 0.0) == 8000
+    assert Path().window(100, 0.0) == LEAST_BYTES
+    assert Path().window(4000, 0.0) == 8000
 
 
 def test_the_rate_is_what_has_been_acknowledged() -> None:
-    pacing = Pacing()
-    stream(pacing, 2.0, 320, 0)
-    assert pacing.rate == 320 / TICK_S
+    path = Path()
+    path.stream(2.0, 320)
+    assert path.pacing.rate == 320 / TICK_S
 
 
 def test_three_round_trips_of_the_rate_may_be_on_the_way_and_of_a_long_path_one_and_a_half() -> None:
     for rtt_s, hold_s in ((0.1, 0.3), (0.2, 0.6), (0.3, HOLD_S_MAX), (1.0, 1.5)):
-        pacing = Pacing()
-        pacing.answered(rtt_s, 0, 0.0)
-        now = stream(pacing, 2.0, 3200, 0)
-        assert pacing.window(0, 10, TICK_S, now) == int(pacing.rate * (hold_s + TICK_S))
+        path = Path()
+        path.pacing.answered(rtt_s, 0, 0.0)
+        now = path.stream(2.0, 3200)
+        assert path.window(10, now) == int(path.pacing.rate * (hold_s + TICK_S))
 
 
 def test_a_fall_of_the_rate_is_known_after_a_second() -> None:
-    pacing = Pacing()
-    now = stream(pacing, 2.0, 3200, 0)
-    fast = pacing.rate
-    stream(pacing, 2.0, 320, 0, now)
-    assert pacing.rate == fast / 10
+    path = Path()
+    now = path.stream(2.0, 3200)
+    fast = path.pacing.rate
+    path.stream(2.0, 320, now)
+    assert path.pacing.rate == fast / 10
 
 
 def test_the_shortest_round_trip_counts() -> None:
-    pacing = Pacing()
+    pacing = Path().pacing
     for now, rtt_s in enumerate((0.09, 0.05, 0.2, 0.07)):
         pacing.answered(rtt_s, 0, float(now))
     assert pacing.least_rtt_s == 0.05
 
 
 def test_of_a_full_path_the_width_is_no_distance() -> None:
-    pacing = Pacing()
-    now = stream(pacing, 2.0, 320, 0)
-    assert pacing.window(10**6, 320, TICK_S, now) < 10**6  # full
-    pacing.answered(0.1, 512, now)
-    assert pacing.least_rtt_s == 0.1 - 512 / pacing.rate
+    path = Path()
+    now = path.stream(2.0, 320) + SAMPLE_S
+    path.outstanding = 10**6
+    assert path.window(320, now) < path.pacing.outstanding == 10**6  # full
+    path.pacing.answered(0.1, 512, now)
+    assert path.pacing.least_rtt_s == 0.1 - 512 / path.pacing.rate
 
 
 def test_a_path_that_is_always_full_is_emptied_once_a_minute() -> None:
-    pacing = Pacing()
-    pacing.answered(0.05, 0, 0.0)
-    now = stream(pacing, RTT_WINDOW_S, 320, 10**6)
-    assert pacing.window(10**6, 320, TICK_S, now) > 0
-    now = stream(pacing, 1.0, 320, 10**6, now)
-    assert pacing.window(10**6, 320, TICK_S, now) == 0
-    pacing.answered(0.05, 0, now)
-    assert pacing.window(10**6, 320, TICK_S, now) > 0
+    path = Path(10**6)
+    path.pacing.answered(0.05, 0, 0.0)
+    now = path.stream(RTT_WINDOW_S, 320)
+    assert path.window(320, now) > 0
+    now = path.stream(1.0, 320, now)
+    assert path.window(320, now) == 0
+    path.pacing.answered(0.05, 0, now)
+    assert path.window(320, now) > 0
 
 
 def test_a_path_that_is_never_full_is_never_emptied() -> None:
-    pacing = Pacing()
-    pacing.answered(0.05, 0, 0.0)
-    now = stream(pacing, 3 * RTT_WINDOW_S, 320, 0)
-    assert pacing.window(0, 320, TICK_S, now) > 0
+    path = Path()
+    path.pacing.answered(0.05, 0, 0.0)
+    now = path.stream(3 * RTT_WINDOW_S, 320)
+    assert path.window(320, now) > 0
 
 
 def test_a_path_that_mostly_holds_snapshots_back_is_narrow_and_gets_small_ones_until_it_does_not() -> None:
-    pacing = Pacing()
-    pacing.answered(0.05, 0, 0.0)
-    now = stream(pacing, 2.0, 320, 0)
-    wide = pacing.window(0, 1000, TICK_S, now)
+    path = Path()
+    path.pacing.answered(0.05, 0, 0.0)
+    now = path.stream(2.0, 320) + SAMPLE_S
+    path.outstanding = 500
+    wide = path.window(1000, now)
     assert wide == 2000
-    assert pacing.room(wide, 500) == 1500
-    now = stream(pacing, 0.5, 320, 10**6, now)  # a stall
-    assert pacing.room(wide, 500) == 1500
-    now = stream(pacing, 1.5, 320, 10**6, now)
-    window = pacing.window(10**6, 1000, TICK_S, now)
-    assert window == int(pacing.rate * (0.05 + 2 * TICK_S)) < wide
-    assert pacing.room(window, 0) == int(pacing.rate * NARROW_TICKS * TICK_S)
-    now = stream(pacing, 2.0, 320, 0, now)
-    assert pacing.window(0, 1000, TICK_S, now) == wide
+    assert path.pacing.room(wide) == 1500
+    path.outstanding = 10**6
+    now = path.stream(0.5, 320, now)  # a stall
+    assert path.window(1000, now) == wide
+    now = path.stream(1.5, 320, now)
+    window = path.window(1000, now)
+    assert window == int(path.pacing.rate * (0.05 + 2 * TICK_S)) < wide
+    path.outstanding = 0
+    assert path.pacing.room(window) == int(path.pacing.rate * NARROW_TICKS * TICK_S)
+    now = path.stream(2.0, 320, now)
+    assert path.window(1000, now) == wide
+
+
+def test_what_is_on_the_way_is_asked_only_where_that_decides_and_never_taken_for_less() -> None:
+    path = Path()
+    path.window(100, 0.0)
+    assert (path.asked, path.pacing.outstanding) == (1, 0)
+    for sent in range(1, 5):  # 512 bytes may be on the way
+        path.pacing.sent_bytes += 100
+        path.outstanding = 60 * sent
+        path.window(100, 0.01 * sent)
+        assert (path.asked, path.pacing.outstanding) == (1, 100 * sent)
+    path.pacing.sent_bytes += 100
+    path.outstanding = 300
+    path.window(100, 0.05)  # another snapshot might not fit
+    assert (path.asked, path.pacing.outstanding) == (2, 300)
+    path.outstanding = 60
+    path.window(100, SAMPLE_S)
+    assert (path.asked, path.pacing.outstanding) == (3, 60)
+
+
+def test_where_the_system_cannot_tell_what_the_client_has_not_acknowledged_is_on_the_way() -> None:
+    path = Path(None)
+    path.window(100, 0.0)
+    for tick in range(100):  # a client that waits for terrain acknowledges nothing
+        path.pacing.sent_bytes += 100
+        path.pacing.sent(tick)
+    path.pacing.look()
+    assert path.pacing.outstanding == 0
+    path.pacing.acked(99)
+    for tick in (101, 102, 103):
+        path.pacing.sent_bytes += 100
+        path.pacing.sent(tick)
+    path.pacing.look()
+    assert path.pacing.outstanding == 300
+    path.pacing.acked(102)
+    path.pacing.sent_bytes += 1000  # terrain: it counts with the next snapshot, or nothing would go any more
+    path.pacing.look()
+    assert path.pacing.outstanding == 100
+    path.outstanding = 700  # our own buffers are full, whatever it says
+    path.pacing.acked(103)
+    path.pacing.look()
+    assert path.pacing.outstanding == 700

@@ -72,6 +72,17 @@ def test_snapshots_are_as_fresh_as_the_link_delivers(preset: str, monkeypatch: p
         assert held[p99] <= PRESETS[preset].rtt_s * 500 + 2 * TICK_MS
 
 
+@pytest.mark.parametrize("preset", ["lan", "typical", "dip", "thin"])
+def test_where_the_system_cannot_tell_what_is_on_the_way_the_acknowledgements_do(
+    preset: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    told = sorted(ages(preset, 60))
+    monkeypatch.setattr(Player, "outstanding", lambda player: None)
+    acknowledged = sorted(ages(preset, 60))
+    p99 = int(0.99 * len(told))
+    assert acknowledged[p99] <= told[p99] + 3.5 * TICK_MS
+
+
 def test_in_a_dip_snapshots_stay_fresh_and_are_normal_again_at_once() -> None:
     found = ages("dip", 80)
     assert max(found) <= 500
