@@ -80,7 +80,7 @@ class Echo:
         self.ticks += 1
         self._deadline = deadline
         segment = msgpack.packb([0, 0, 0, -1, bytes(self.size), b"", b"", 0])
-        snapshot = join_snapshot((self.ticks, -1, b"", 0, b"", b"", b""), [segment])
+        snapshot = join_snapshot((self.ticks, -1, b"", 0, b"", b"", b""), 1, segment)
         for link, playing in tuple(self.links.values()):
             if playing:
                 link.send(snapshot)

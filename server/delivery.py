@@ -32,11 +32,14 @@ class Delivery:
     def __init__(self, world: World, log: ChangeLog, limits: Limits, counters: Counters) -> None:
         self._world, self._log, self._limits, self._counters = world, log, limits, counters
         self._tick_s = 1 / world.scene.tick_rate
+        self._around: dict[Cell, tuple[Cell, ...]] = {}
+        """What was seen from a segment by the latest who came into it."""
 
     def serve(self, session: Session, now: float) -> None:
         """Sends a session the tick that has been recorded, if its path has room."""
         centre = self._log.segment(session.entity)
-        if centre is not session.sight.centre:
+        near = session.sight.near
+        if not near or near[0] != centre:
             self._look_around(session, centre)
         pacing = session.pacing
         window = pacing.window(session.snapshot_bytes, self._tick_s, now)
@@ -77,7 +80,10 @@ class Delivery:
         """The entity is in another segment."""
         sight = session.sight
         exists = self._world.blocks.__contains__
-        added, dropped = sight.move(centre, self._limits.see_radius, self._limits.keep_radius, exists)
+        near = interest.around(centre, self._limits.see_radius, exists)
+        if self._around.get(centre) != near:
+            self._around[centre] = near
+        added, dropped = sight.move(self._around[centre], self._limits.keep_radius)
         due = [segment for segment in session.terrain_due if segment in sight.sees] + [s for s in added if exists(s)]
         session.terrain_due = self._nearest(session, due)
         if session.terrain_now and session.terrain_now[0] in dropped:
@@ -85,23 +91,23 @@ class Delivery:
 
     def _nearest(self, session: Session, segments: Iterable[Cell]) -> deque[Cell]:
         """Segments in the order in which their blocks are sent."""
-        centre = session.sight.centre or (0, 0, 0)
-        return deque(sorted(segments, key=lambda segment: interest.distance(segment, centre)))
+        own = session.sight.near[0] if session.sight.near else (0, 0, 0)
+        return deque(sorted(segments, key=lambda segment: interest.distance(segment, own)))
 
     def _send_snapshot(self, session: Session, room: int) -> None:
         tick, inputs, sight = self._world.tick, session.inputs, session.sight
         if sight.lost_track(tick):
             self.forget(session)
         drops = np.array(sight.drops, "<i4").tobytes() if sight.drops else b""
-        parts = sight.take(self._log, tick, room)
+        n, parts = sight.take(self._log, tick, room)
         verdicts, player = b"", session.player
         assert player is not None
         if player.verdicts:
             verdicts = np.array(player.verdicts[: messages.VERDICTS_MAX], VERDICT).tobytes()
             del player.verdicts[: messages.VERDICTS_MAX]
         first = tick - len(inputs.fates) + 1
-        header = (tick, inputs.newest, inputs.margins.tobytes(), first, bytes(inputs.fates), verdicts, drops)
-        message = messages.join_snapshot(header, parts)
+        header = (tick, inputs.newest, inputs.margins.tobytes(), first, inputs.fates, verdicts, drops)
+        message = messages.join_snapshot(header, n, parts)
         session.send(message)
         session.pacing.sent(tick)
         session.tick = tick

@@ -7,8 +7,6 @@ the client is sent whole (a keyframe) and waits its turn in the same order, so t
 a wall of bytes in front of the own position.
 """
 
-from collections.abc import Callable
-
 from server import interest
 from server.replication import HISTORY, ChangeLog
 from shared.checks import Cell
@@ -20,24 +18,27 @@ class Sight:
 
     def __init__(self) -> None:
         self.sees: set[Cell] = set()
-        self.centre: Cell | None = None
+        self.near: tuple[Cell, ...] = ()
+        """Of them those around the entity, its own first; the rest it has come away from."""
         self.drops: list[Cell] = []
         """What the client knows and does not see any more: to be told with the next snapshot."""
+        self._rest: tuple[Cell, ...] = ()
         self._knows: set[Cell] = set()
         self._fresh: set[Cell] = set()  # no keyframe sent yet
         self._behind: dict[Cell, int] = {}  # sent last with this tick, which is before `_tick`
         self._tick = -1
 
-    def move(self, centre: Cell, see: int, keep: int, exists: Callable[[Cell], bool]) -> tuple[list[Cell], list[Cell]]:
+    def move(self, near: tuple[Cell, ...], keep: int) -> tuple[list[Cell], list[Cell]]:
         """The entity is in another segment: what is seen from now on, nearest first, and what is let go."""
-        added, dropped = interest.update(self.sees, centre, see, keep, exists)
-        self.centre = centre
+        added, dropped = interest.update(self.sees, near, keep)
+        self.near = near
         self.sees.difference_update(dropped)
         self._fresh.difference_update(dropped)
         for segment in dropped:
             self._behind.pop(segment, None)
         self.sees.update(added)
         self._fresh.update(added)
+        self._rest = tuple(self.sees.difference(near))
         self.drops = sorted(self._knows - self.sees)
         return added, dropped
 
@@ -64,14 +65,18 @@ class Sight:
         """For how many ticks the segment that was sent longest ago, of those known, has not been sent."""
         return tick - (min(self._behind.values()) if self._behind else self._tick)
 
-    def take(self, log: ChangeLog, tick: int, room: int) -> list[bytes]:
-        """The encoded parts of a snapshot for `tick`, of about `room` bytes; they count as sent, as do `drops`."""
+    def take(self, log: ChangeLog, tick: int, room: int) -> tuple[int, bytes]:
+        """How many parts a snapshot for `tick` has, and their bytes, some `room`; they count as sent, as do `drops`."""
         known = log.since(self._tick)
         if not (self._behind or self._fresh or self.drops):  # as nearly always
-            plain = [part for segment in self.sees if (part := known[segment])]
-            if sum(map(len, plain)) <= room:
+            n, plain = known.together(self.near)
+            for segment in self._rest:
+                if part := known[segment]:
+                    n += 1
+                    plain += part
+            if len(plain) <= room:
                 self._tick = tick
-                return plain
+                return n, plain
         special = self._behind | dict.fromkeys(self._fresh, KEYFRAME)
         due = special | {segment: self._tick for segment in self.sees - special.keys() if known[segment]}
         parts = {segment: part for segment, since in due.items() if (part := log.since(since)[segment])}
@@ -87,12 +92,11 @@ class Sight:
             else {}
         )
         self._tick = tick
-        return list(parts.values())
+        return len(parts), b"".join(parts.values())
 
     def _urgent(self, parts: dict[Cell, bytes], due: dict[Cell, int], tick: int, room: int) -> dict[Cell, bytes]:
         """The parts that fit, in the order of urgency; at least the own segment and one more."""
-        centre = self.centre
-        assert centre is not None
+        centre = self.near[0]
 
         def urgency(segment: Cell) -> float:
             waits = tick - due[segment] if due[segment] != KEYFRAME else HISTORY

@@ -2,7 +2,7 @@
 
 import random
 
-from server.interest import distance, update
+from server.interest import around, distance, update
 from shared.checks import Cell
 
 EVERYWHERE = lambda segment: True  # noqa: E731
@@ -17,7 +17,7 @@ def cube(centre: Cell, radius: int) -> set[Cell]:
 
 def moved(sees: set[Cell], centre: Cell, see: int = 1, keep: int = 2) -> tuple[list[Cell], list[Cell]]:
     """One update, carried out."""
-    added, dropped = update(sees, centre, see, keep, EVERYWHERE)
+    added, dropped = update(sees, around(centre, see, EVERYWHERE), keep)
     sees.difference_update(dropped)
     sees.update(added)
     return added, dropped
@@ -30,20 +30,21 @@ def test_distance_is_along_the_longest_axis() -> None:
 
 
 def test_at_first_all_around_is_seen_the_own_segment_first() -> None:
-    added, dropped = update(set(), (4, 5, 6), 1, 2, EVERYWHERE)
-    assert added[0] == (4, 5, 6)
-    assert (set(added), dropped, len(added)) == (cube((4, 5, 6), 1), [], 27)
+    near = around((4, 5, 6), 1, EVERYWHERE)
+    assert near[0] == (4, 5, 6)
+    assert (set(near), len(near)) == (cube((4, 5, 6), 1), 27)
+    assert update(set(), near, 2) == (list(near), [])
 
 
 def test_the_nearest_come_first_and_the_order_is_always_the_same() -> None:
-    added, _ = update(set(), (0, 0, 0), 3, 3, EVERYWHERE)
-    assert [distance(segment, (0, 0, 0)) for segment in added] == [0] + [1] * 26 + [2] * 98 + [3] * 218
-    assert added == sorted(added, key=lambda segment: (distance(segment, (0, 0, 0)), segment))
+    near = around((0, 0, 0), 3, EVERYWHERE)
+    assert [distance(segment, (0, 0, 0)) for segment in near] == [0] + [1] * 26 + [2] * 98 + [3] * 218
+    assert list(near) == sorted(near, key=lambda segment: (distance(segment, (0, 0, 0)), segment))
 
 
 def test_only_what_exists_is_seen_but_for_the_own_segment() -> None:
-    added, _ = update(set(), (0, 0, -1), 1, 2, FLAT)
-    assert added == [(0, 0, -1), *sorted(segment for segment in cube((0, 0, -1), 1) if segment[2] == 0)]
+    near = around((0, 0, -1), 1, FLAT)
+    assert near == ((0, 0, -1), *sorted(segment for segment in cube((0, 0, -1), 1) if segment[2] == 0))
 
 
 def test_a_segment_is_let_go_only_beyond_the_wider_radius() -> None:

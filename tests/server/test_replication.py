@@ -197,12 +197,19 @@ def test_one_encoding_serves_all_who_ask_for_the_same(told: Recorded) -> None:
     told.world.spawn("box", (5, 5, 9))
     told.tick(2)
     assert told.log.since(1)[HOME] is told.log.since(1)[HOME]
-    assert told.log.packed(HOME) is told.log.packed(HOME)
-    before = told.log.packed(HOME)
-    told.edit(1, 1, 1, 1)
-    after = told.log.packed(HOME)
-    assert before != after is not None
-    assert unpack(after).reshape(SEGMENT, SEGMENT, SEGMENT)[1, 1, 1] == 1
+
+
+def test_what_is_seen_around_a_segment_is_joined_once_for_all_who_see_the_same(told: Recorded) -> None:
+    told.tick()
+    for x in (3, 35):
+        told.edit(x, 3, 9, 1)
+    told.tick()
+    known = told.log.since(1)
+    all_three, both = (HOME, EAST, WEST), (HOME, WEST)
+    assert known.together(all_three) == (2, known[HOME] + known[EAST])
+    assert known.together(all_three)[1] is known.together(all_three)[1]
+    assert known.together(both) == (1, known[HOME]), "what one does not see is not what another sees"
+    assert known.together(all_three) == (2, known[HOME] + known[EAST])
 
 
 def test_a_tick_packs_few_segments_and_the_next_one_packs_on(told: Recorded) -> None:

@@ -1,5 +1,7 @@
 """What goes into a client's snapshot where not everything fits."""
 
+from itertools import groupby
+
 import pytest
 
 from server.replication import HISTORY
@@ -30,16 +32,23 @@ class Parts:
         self.log.asked.append((segment, self.since))
         return bytes([ROW.index(segment)]) * self.log.sizes[segment]
 
+    def together(self, segments: tuple[Cell, ...]) -> tuple[int, bytes]:
+        parts = [self[segment] for segment in segments]
+        return len(parts), b"".join(parts)
 
-def looking(*, see: int = 2) -> Sight:
+
+def looking(see: int = 2) -> Sight:
     sight = Sight()
-    sight.move(OWN, see, see, lambda segment: segment in ROW)
+    sight.move(tuple(ROW), see)
     return sight
 
 
 def take(sight: Sight, log: Log, tick: int, room: int) -> list[Cell]:
     log.asked.clear()
-    return [ROW[part[0]] for part in sight.take(log, tick, room)]  # type: ignore[arg-type]
+    n, parts = sight.take(log, tick, room)  # type: ignore[arg-type]
+    taken = [ROW[first] for first, _ in groupby(parts)]
+    assert len(taken) == n
+    return taken
 
 
 def test_everything_goes_where_it_fits_first_whole_and_then_its_changes() -> None:
@@ -99,6 +108,6 @@ def test_who_is_too_far_behind_has_lost_track(ticks: int) -> None:
 def test_only_what_was_sent_and_is_seen_no_more_is_dropped() -> None:
     sight, log = looking(), Log(dict.fromkeys(ROW, 10))
     take(sight, log, 1, 10)  # the client knows of its own segment and one more
-    sight.move((20, 0, 0), 1, 2, lambda segment: False)
+    sight.move(((20, 0, 0),), 2)
     assert sight.drops == [OWN, NEAR]
     assert sight.sees == {(20, 0, 0)}

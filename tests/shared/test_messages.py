@@ -87,7 +87,7 @@ def test_every_kind_is_tried_and_has_a_check_for_each_field() -> None:
 @pytest.mark.parametrize("segments", [0, 1, 15, 16, 1024])
 def test_a_snapshot_joined_from_encoded_segments_is_the_snapshot(segments: int) -> None:
     message = Snapshot(9, 12, b"\x01\x02", 8, b"\x00\x01", bytes(5), bytes(12), (PART,) * segments)
-    assert decode_from_server(join_snapshot(message[:7], [msgpack.packb(PART)] * segments)) == message
+    assert decode_from_server(join_snapshot(message[:7], segments, msgpack.packb(PART) * segments)) == message
 
 
 def test_each_side_refuses_what_only_it_may_say() -> None:

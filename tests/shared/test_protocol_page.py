@@ -54,7 +54,7 @@ def message(text: str, side: str) -> Message:
 def again(decoded: Message) -> bytes:
     """As the peer sends it."""
     if isinstance(decoded, Snapshot):
-        return join_snapshot(decoded[:7], [msgpack.packb(part) for part in decoded.segments])
+        return join_snapshot(decoded[:7], len(decoded.segments), b"".join(map(msgpack.packb, decoded.segments)))
     return encode(decoded)
 
 
