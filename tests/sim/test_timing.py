@@ -142,3 +142,14 @@ def test_least_latency_at_equal_late_share(preset: str) -> None:
     figures = [(row["controller"], *league.point(row), row["its_latency_ms"]) for row in rows]
     assert all(row["first"] for row in rows), figures
     assert sum(row["its_latency_ms"] is not None for row in rows) == 5
+
+
+def test_over_several_seeds_each_rule_is_compared_with_ours_on_the_same_run() -> None:
+    rows = []
+    for seed, ours, its in ((1, 10.0, 13.0), (2, 20.0, 21.0), (3, 30.0, None)):
+        for controller, needs in ((league.OURS, ours), ("naia", its)):
+            row = {"preset": "far", "controller": controller, "seed": seed, "late_inputs_share": 0.01}
+            rows.append(row | {"added_latency_ms": ours, "its_latency_ms": needs})
+    told = [list(column.cells) for column in league.summary(rows).columns]
+    assert told[1] == ["ours", "naia"]
+    assert [cells[1] for cells in told[4:]] == ["17.0", "2.0 ± 1.0", "1.0", "2"]
