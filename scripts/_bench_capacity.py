@@ -38,15 +38,17 @@ def run(args: argparse.Namespace, console: Console) -> tuple[dict[str, Any], int
         cpu_us = statistics.median(
             stage["cpu_us_per_client_tick"] for stage in stages if stage["ticks_share"] > 0.5 or stage is by
         )
+        most = min(int(1e6 / server.RATE / cpu_us), server.CAPACITY)
         size = int(by["bytes_down_per_client_per_s"] / server.RATE)
         console.print(f"  the same gateway without a game, {size} bytes a tick")
         with server.rig("echo", str(size), seed=number + 1) as running:
-            first = int(0.5 * min(1e6 / server.RATE / cpu_us, server.CAPACITY)) if args.quick else 1000
+            first = most if args.quick else 1000  # more than the game holds
             echoed = server.search(running, first, seconds, resolution, 1 if args.quick else steps, report)
         console.print("  the same on picows, which no game is played over: what another library could gain")
         with server.rig(server.ECHO_PICOWS, str(size), seed=number + 1) as running:
+            first = most // 4 if args.quick else 1000
             picows = server.search(running, first, seconds, resolution, 1 if args.quick else steps, report)
-        shares = server.profile(max(50, by["clients"] // 2), seconds)
+        shares = server.profile(max(50, by["clients"] // (4 if args.quick else 2)), seconds)
         runs.append(
             {
                 "gateway": "websockets",
