@@ -420,7 +420,7 @@ async def test_a_peer_that_neither_reads_nor_hangs_up_is_aborted(bench: Bench, m
 async def test_outstanding_counts_what_the_peer_has_not_taken(bench: Bench) -> None:
     peer = await bench.client(limit=1024)
     link = bench.notes.opened[0]
-    await bench.until(lambda: link.outstanding() == 0)
+    await bench.until(lambda: not link.outstanding())
     for _ in range(200):
         link.send(bytes(65_000))
     sent = 200 * 65_004
@@ -432,7 +432,7 @@ async def test_outstanding_counts_what_the_peer_has_not_taken(bench: Bench) -> N
     total = 0
     while total < sent:
         total += len(await asyncio.wait_for(peer.reader.read(1 << 20), TIME_OUT_S))
-    await bench.until(lambda: link.outstanding() == 0)
+    await bench.until(lambda: not link.outstanding())
 
 
 async def test_outstanding_is_harmless_after_a_reset(bench: Bench) -> None:

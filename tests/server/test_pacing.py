@@ -101,7 +101,10 @@ def test_a_path_that_mostly_holds_snapshots_back_is_narrow_and_gets_small_ones_u
     assert path.pacing.room(wide) == 1500
     path.outstanding = 10**6
     now = path.stream(0.5, 320, now)  # a stall
-    assert path.window(1000, now) == wide
+    path.outstanding = 500
+    path.pacing.look()
+    assert path.pacing.room(wide) == 1500
+    path.outstanding = 10**6
     now = path.stream(1.5, 320, now)
     window = path.window(1000, now)
     assert window == int(path.pacing.rate * (0.05 + 2 * TICK_S)) < wide

@@ -197,6 +197,12 @@ def test_one_encoding_serves_all_who_ask_for_the_same(told: Recorded) -> None:
     told.world.spawn("box", (5, 5, 9))
     told.tick(2)
     assert told.log.since(1)[HOME] is told.log.since(1)[HOME]
+    assert told.log.packed(HOME) is told.log.packed(HOME)
+    before = told.log.packed(HOME)
+    told.edit(1, 1, 1, 1)
+    after = told.log.packed(HOME)
+    assert before != after is not None
+    assert unpack(after).reshape(SEGMENT, SEGMENT, SEGMENT)[1, 1, 1] == 1
 
 
 def test_what_is_seen_around_a_segment_is_joined_once_for_all_who_see_the_same(told: Recorded) -> None:
