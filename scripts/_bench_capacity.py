@@ -38,7 +38,8 @@ def run(args: argparse.Namespace, console: Console) -> tuple[dict[str, Any], int
         cpu_us = statistics.median(
             stage["cpu_us_per_client_tick"] for stage in stages if stage["ticks_share"] > 0.5 or stage is by
         )
-        most = min(int(1e6 / server.RATE / cpu_us), server.CAPACITY)
+        by_cpu = int(1e6 / server.RATE / cpu_us)
+        most = min(by_cpu, server.CAPACITY)
         size = int(by["bytes_down_per_client_per_s"] / server.RATE)
         console.print(f"  the same gateway without a game, {size} bytes a tick")
         with server.rig("echo", str(size), seed=number + 1) as running:
@@ -54,7 +55,7 @@ def run(args: argparse.Namespace, console: Console) -> tuple[dict[str, Any], int
                 "gateway": "websockets",
                 "max_clients": best["clients"] if best else 0,
                 "cpu_us_per_client_tick": cpu_us,
-                "clients_by_cpu": int(1e6 / server.RATE / cpu_us),
+                "clients_by_cpu": by_cpu,
                 **bound(echoed),
                 "parts": {name: share * cpu_us for name, share in shares.items()},
                 "entities_in_view": by["entities_in_view"],

@@ -106,7 +106,7 @@ class Delivery:
             verdicts = np.array(player.verdicts[: messages.VERDICTS_MAX], VERDICT).tobytes()
             del player.verdicts[: messages.VERDICTS_MAX]
         first = tick - len(inputs.fates) + 1
-        header = (tick, inputs.newest, inputs.margins.tobytes(), first, inputs.fates, verdicts, drops)
+        header = (tick, inputs.newest, inputs.margins.tobytes(), first, bytes(inputs.fates), verdicts, drops)
         message = messages.join_snapshot(header, n, parts)
         session.send(message)
         session.pacing.sent(tick)

@@ -194,7 +194,7 @@ class Connection(asyncio.Protocol):
     def close(self, code: int, reason: str) -> None:
         """Closes once what was sent has gone out, with an abort if the peer does not finish within `CLOSE_S`."""
         self._deaf = True
-        if self._protocol.state is OPEN:
+        if self._live:
             self._protocol.send_close(code, reason.encode()[:REASON_BYTES_MAX].decode(errors="ignore"))
             self._flush()
 

@@ -128,16 +128,17 @@ class Pacing:
 
     def window(self, snapshot_bytes: int, tick_s: float, now: float) -> int:
         """How many bytes may be on the way now, if the latest snapshot had so many; call once a tick."""
-        if now >= self._measure_at:
+        measure = now >= self._measure_at
+        if measure:
             self._measure_at = now + SAMPLE_S
             self.look()
             self._measure(tick_s, now)
         window = self._carries if self._narrow else max(2 * snapshot_bytes, self._carries)
-        if self.sent_bytes - self._taken + snapshot_bytes > window:
+        if not measure and self.outstanding + snapshot_bytes > window:
             self.look()
         if self._pauses:
             return 0
-        held = self.sent_bytes - self._taken > window
+        held = self.outstanding > window
         if held:
             self._full_at = now
         if held or self._held:

@@ -207,7 +207,6 @@ class Shared(NamedTuple):
 
 Message = Hello | Inputs | Ping | Bye | Command | Resync | Welcome | Snapshot | Terrain | Pong | Happened | Shared
 Check = Callable[[Any], bool]
-Bytes = bytes | bytearray
 
 
 def _whole(low: int, high: int) -> Check:
@@ -294,7 +293,7 @@ def encode(message: Message) -> bytes:
     return _pack((kind, *fields))
 
 
-def join_snapshot(header: tuple[int, int, Bytes, int, Bytes, bytes, bytes], segments: int, parts: bytes) -> bytes:
+def join_snapshot(header: tuple[int, int, bytes, int, bytes, bytes, bytes], segments: int, parts: bytes) -> bytes:
     """A snapshot from its first seven fields and so many segments' parts, encoded already (shared by many clients)."""
     n = 1 + len(header) + segments
     fields = _pack((_SNAPSHOT, *header))[1:]  # without its own head, which is one byte
