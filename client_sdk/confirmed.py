@@ -66,35 +66,21 @@ class Confirmed:
         world = self.world
         parts, states, turns = decode_parts(snapshot.segments, self._templates, compiled=world.compiled)
         ticks = snapshot.tick - world.tick
-        wrong = ""
-        if len(turns):
-            if ticks != 1:
-                raise ProtocolError("segment.heads: the tick before was not told")
-            known = [entity in world for entity in turns[:, 0].tolist()]
-            if not all(known):
-                turns, wrong = turns[known], "entities are missing"
-        here = set(states[:, ID].tolist())
-        if max(states[:, FLAGS].tolist(), default=0) >= ACTED:
-            self._acted.update(states[states[:, FLAGS] & ACTED != 0, ID].tolist())
-            states[:, FLAGS] &= FALLING
+        if len(turns) and ticks != 1:
+            raise ProtocolError("segment.heads: the tick before was not told")
         drops: set[Cell] = set()
         if snapshot.drops:
             drops = {(x, y, z) for x, y, z in np.frombuffer(snapshot.drops, "<i4").reshape(-1, 3).tolist()}
-        world.follow(turns, min(ticks, FOLLOW_MAX))
         if drops or any(part.gone or part.ago == KEYFRAME for part in parts):
-            self._take_away(parts, drops, here)
-        for part in parts:
-            if len(part.edits):
-                changes = part.edits["block"].tolist(), part.edits["kind"].tolist()
-                if part.segment in world.blocks:
-                    world.write_blocks(part.segment, *changes)
-                    self.terrain_changed = True
-                    self.edited_near |= self._near(part.segment, part.edits["block"].astype(np.int64))
-                if part.segment == self._coming:
-                    self._early.update(zip(*changes, strict=True))
-        if here:
+            self._take_away(parts, drops, set(states[:, ID].tolist()))
+        if len(states):
+            if max(states[:, FLAGS].tolist()) >= ACTED:
+                self._acted.update(states[states[:, FLAGS] & ACTED != 0, ID].tolist())
+                states[:, FLAGS] &= FALLING
             world.put(states)
         for part in parts:
+            if len(part.edits):
+                self._edit(part)
             if part.attributes:
                 self.attributes.update((entity, said) for entity, said in part.attributes if entity in world)
         for segment in drops:
@@ -103,12 +89,12 @@ class Confirmed:
             if segment in world.blocks and not len(world.in_segment(segment)):
                 world.unload_segment(segment)
                 self.terrain_changed = True
-        world.rebase(snapshot.tick)
+        there = world.follow(turns, min(ticks, FOLLOW_MAX), snapshot.tick)
         self.states = world.states()
         for part in parts:
             if part.check and part.segment in world.blocks and checksum(world, part.segment) != part.check:
                 return f"segment {part.segment} is not the server's"
-        return wrong
+        return "" if there else "entities are missing"
 
     def grounded(self) -> bool:
         """Whether the blocks of every segment that exists around the own entity are there."""
@@ -121,6 +107,16 @@ class Confirmed:
         """The entities that the server's rules have moved since the last call."""
         acted, self._acted = frozenset(self._acted), set()
         return acted
+
+    def _edit(self, part: SegmentPart) -> None:
+        """Blocks of a segment have changed."""
+        changes = part.edits["block"].tolist(), part.edits["kind"].tolist()
+        if part.segment in self.world.blocks:
+            self.world.write_blocks(part.segment, *changes)
+            self.terrain_changed = True
+            self.edited_near |= self._near(part.segment, part.edits["block"].astype(np.int64))
+        if part.segment == self._coming:
+            self._early.update(zip(*changes, strict=True))
 
     def _near(self, segment: Cell, offsets: Int64s) -> bool:
         """Whether one of these blocks is so near to the own entity that it may have met it."""

@@ -82,7 +82,11 @@ class Prediction:
         self._inputs: Ring[Input] = Ring(HISTORY)
         self._states: Ring[Int64s] = Ring(HISTORY)
         templates = known.world.scene.templates
-        self._shown_ahead = np.array([template.shown == "predicted" for template in templates], np.int64)
+        compiled = known.world.compiled
+        ahead = np.array([template.shown == "predicted" for template in templates], np.int64)
+        self._shown_ahead = kernels.lent(ahead, compiled)
+        states = kernels.lent(known.states, compiled)
+        self._alike = kernels.direct(kernels.of(compiled).alike, states, 0, states, 0, 0, 0, self._shown_ahead)
         self._edits: dict[int, tuple[int, Edit]] = {}  # by number, with its tick; until there is a verdict
         self._refused = False  # an edit that was carried out in the last replay has been, since
         self._compared = -1
@@ -205,10 +209,8 @@ class Prediction:
         """Whether all that could meet the own entity, or is drawn as predicted, is as predicted."""
         if guess.tobytes() == truth.tobytes():
             return True
-        compiled = self.confirmed.compiled
-        kernel = kernels.compiled() if compiled else kernels.PLAIN
-        a, b, always = (kernels.lent(array, compiled) for array in (guess, truth, self._shown_ahead))
-        return bool(kernel.alike(a, len(guess), b, len(truth), self.entity, MEET_BLOCKS * BLOCK, always))
+        a, b = kernels.lent(guess, self.confirmed.compiled), kernels.lent(truth, self.confirmed.compiled)
+        return bool(self._alike(a, len(guess), b, len(truth), self.entity, MEET_BLOCKS * BLOCK, self._shown_ahead))
 
     def _difference(self, guess: Int64s, truth: Int64s) -> tuple[tuple[str, ...], float] | None:
         """In which fields, and by how many blocks, the own entity is not as predicted."""

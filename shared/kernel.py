@@ -113,6 +113,8 @@ CELL_TO_SEGMENT = SEGMENT_SHIFT - CELL_SHIFT
 CELL_TO_SEGMENT_Z = SEGMENT_SHIFT - CELL_SHIFT_Z
 MOVES = 2 * MOVE_MAX + 1
 IN_SEGMENT = (1 << TO_SEGMENT) - 1
+HEAD = 5
+"""Bytes of the head of a turn on the wire."""
 
 
 # -- looking things up ---------------------------------------------------------------------------------------
@@ -748,19 +750,47 @@ def advance(w: Arrays, row: int, events: int, turns: Any, i: int) -> None:
 
 
 @jit
-def follow(w: Arrays, turns: Any, n: int, rows: int, ticks: int, tick: int) -> None:
-    """Takes the first `rows` rows on by `ticks`, the last of which is `tick`; those `n` in `turns`, which are told, by
-    one."""
+def row_of(e: Any, rows: int, entity: int) -> int:
+    """The row of an entity among the first `rows`, or -1. Where they ascend by id, as nearly always, that is quick."""
+    low = 0
+    high = rows
+    while low < high:
+        middle = (low + high) >> 1
+        if e[(middle << WIDTH_SHIFT) + ID] < entity:
+            low = middle + 1
+        else:
+            high = middle
+    if low < rows and e[(low << WIDTH_SHIFT) + ID] == entity:
+        return low
+    for row in range(rows):
+        if e[(row << WIDTH_SHIFT) + ID] == entity:
+            return row
+    return -1
+
+
+@jit
+def follow(w: Arrays, turns: Any, n: int, rows: int, ticks: int, tick: int) -> bool:
+    """Takes the first `rows` rows on by `ticks`; those `n` in `turns`, which are told, by one; whether all of these are
+    there. Nothing counts as changed then. `tick` is any that no row has been marked with."""
     e = w.entities
+    all_there = True
     for i in range(0, n * TURN, TURN):
-        mark(w, turns[i], tick, turns[i + 1])
-        advance(w, turns[i], turns[i + 1], turns, i)
+        row = -1 if turns[i] == 0 else row_of(e, rows, turns[i])
+        if row < 0:
+            all_there = False
+        else:
+            e[(row << WIDTH_SHIFT) + CHANGED] = tick << EVENT_BITS
+            advance(w, row, turns[i + 1], turns, i)
     for row in range(rows):
         at = row << WIDTH_SHIFT
         moves = e[at + VX] != 0 or e[at + VY] != 0 or e[at + VZ] != 0 or e[at + FLAGS] & FALLING != 0
         if moves and e[at + ID] != 0 and e[at + CHANGED] >> EVENT_BITS != tick:
             for _ in range(ticks):
                 advance(w, row, 0, turns, 0)
+        e[at + CHANGED] = -1
+    w.lengths[N_CHANGED] = 0
+    w.lengths[N_FELL] = 0
+    return all_there
 
 
 # -- reading -------------------------------------------------------------------------------------------------
@@ -768,41 +798,84 @@ def follow(w: Arrays, turns: Any, n: int, rows: int, ticks: int, tick: int) -> N
 
 @jit
 def collect(e: Any, rows: int, out: Any) -> int:
-    """Copies the states in use to `out` (12 columns each), ascending by id, and without bookkeeping; how many."""
+    """Copies the states in use to `out` ([rows, 12]), ascending by id, and without bookkeeping; how many."""
     n = 0
     for row in range(rows):
-        entity = e[(row << WIDTH_SHIFT) + ID]
+        from_ = row << WIDTH_SHIFT
+        entity = e[from_ + ID]
         if entity == 0:
             continue
         at = n
-        while at > 0 and out[(at - 1) * CELL + ID] > entity:
+        while at > 0 and out[at - 1, ID] > entity:
+            for k in range(CELL):
+                out[at, k] = out[at - 1, k]
             at -= 1
-        for k in range(n * CELL - 1, at * CELL - 1, -1):
-            out[k + CELL] = out[k]
         for k in range(CELL):
-            out[at * CELL + k] = e[(row << WIDTH_SHIFT) + k]
-        out[at * CELL + FLAGS] &= FALLING
+            out[at, k] = e[from_ + k]
+        out[at, FLAGS] &= FALLING
         n += 1
     return n
 
 
-@jit
-def admit(states: Any, parts: Any, n_parts: int, low: Any, high: Any, templates: int) -> bool:
-    """Whether all values of states from the wire are within bounds; adds to each position its part's corner.
+@inlined
+def word(data: Any, at: int) -> int:
+    """The four bytes from `at` on as a whole number from 0 on, the lowest first."""
+    return data[at] | data[at + 1] << 8 | data[at + 2] << 16 | data[at + 3] << 24
 
-    Of each part, `parts` has the low corner in grid steps, and how many states are its.
-    """
+
+@jit
+def read_turns(heads: bytes, tails: bytes, turns: Any) -> bool:
+    """Unpacks turns (see `shared.snapshot`) to `turns` ([n * 8]); whether `tails` has just what they need."""
     at = 0
-    for part in range(0, 4 * n_parts, 4):
-        for _ in range(parts[part + 3]):
-            for k in range(CELL):
-                if states[at + k] < low[k] or states[at + k] > high[k]:
+    for i in range(len(turns) // TURN):
+        to = TURN * i
+        events = heads[HEAD * i + 4]
+        turns[to] = word(heads, HEAD * i)
+        turns[to + 1] = events
+        for k in range(2, TURN):
+            turns[to + k] = 0
+        if events & TOLD != 0:
+            if at + 3 > len(tails):
+                return False
+            turns[to + 2] = (tails[at] ^ 0x80) - 0x80
+            turns[to + 3] = (tails[at + 1] ^ 0x80) - 0x80
+            turns[to + 4] = tails[at + 2]
+            at += 3
+        for k in range(3):
+            if events & (STOP_X << k) != 0:
+                if at + 4 > len(tails):
                     return False
-            if states[at + TEMPLATE] >= templates:
+                turns[to + 5 + k] = (word(tails, at) ^ 1 << 31) - (1 << 31)
+                at += 4
+    return at == len(tails)
+
+
+@jit
+def read_rows(rows: bytes, parts: Any, low: Any, high: Any, templates: int, states: Any) -> bool:
+    """Unpacks whole states (see `shared.snapshot`) to `states` ([n * 12]); whether all values are within bounds.
+
+    Of each part, `parts` has the low corner in grid steps, which its positions are counted from, and how many are its.
+    """
+    to = at = 0
+    for part in range(0, len(parts), 4):
+        for _ in range(parts[part + 3]):
+            states[to] = word(rows, at)
+            states[to + TEMPLATE] = rows[at + 4]
+            states[to + FLAGS] = rows[at + 5]
+            for k in range(6):
+                states[to + X + k] = (word(rows, at + 6 + 4 * k) ^ 1 << 31) - (1 << 31)
+            states[to + MOVE_X] = (rows[at + 30] ^ 0x80) - 0x80
+            states[to + MOVE_Y] = (rows[at + 31] ^ 0x80) - 0x80
+            states[to + BUTTONS] = rows[at + 32]
+            for k in range(CELL):
+                if states[to + k] < low[k] or states[to + k] > high[k]:
+                    return False
+            if states[to + TEMPLATE] >= templates:
                 return False
             for k in range(3):
-                states[at + X + k] += parts[part + k]
-            at += CELL
+                states[to + X + k] += parts[part + k]
+            to += CELL
+            at += 33
     return True
 
 

@@ -24,6 +24,11 @@ def available() -> bool:
     return importlib.util.find_spec("numba") is not None
 
 
+def of(to_compiled: bool) -> ModuleType:
+    """The one or the other."""
+    return compiled() if to_compiled else PLAIN
+
+
 @contextlib.contextmanager
 def compiling(tell: Callable[[], None]) -> Iterator[None]:
     """Meanwhile calls `tell`, once, as soon as Numba has to compile what is not in its cache on disk."""

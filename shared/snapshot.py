@@ -24,6 +24,7 @@ from its surroundings, so the result is exact whether the client knows them or n
 changed its segment, is sent whole, as is all that something has happened to in a span of more ticks than one.
 """
 
+import functools
 import zlib
 from collections.abc import Collection, Sequence
 from typing import Any, NamedTuple
@@ -77,6 +78,7 @@ TAILS_KEEP = np.array(
 VERDICT = np.dtype([("number", "<u4"), ("verdict", "u1")])
 EDIT = np.dtype([("block", "<u2"), ("kind", "u1")])
 NO_EDITS = np.zeros(0, EDIT)
+NO_STATES = np.zeros((0, CELL), np.int64)
 NO_TURNS = np.zeros((0, TURN), np.int64)
 NO_FIELDS: list[Any] = [b"", b"", b"", b"", 0, b"", []]
 """What the fields of a part from `heads` on are where they are left out."""
@@ -92,8 +94,6 @@ KEYFRAME = -1
 """The `ago` of a part that holds everything."""
 ACTED = 4
 """Flag on the wire: the server's rules placed or threw this entity."""
-PART_MAX = 200 * 1024
-"""No field of a segment's part is longer, in bytes."""
 
 STATE_LOW = np.array([1, 0, 0, 0, 0, 0, -(1 << 30), -(1 << 30), -(1 << 30), -127, -127, 0], np.int64)
 STATE_HIGH = np.array(
@@ -212,34 +212,41 @@ def decode_parts(
     Raises:
         ProtocolError: anything is not as drawn above.
     """
+    if not segments:
+        return [], NO_STATES, NO_TURNS
     corners: list[int] = []
     news: tuple[list[bytes], list[bytes], list[bytes]] = ([], [], [])
     parts = [_decode_part(segment, corners, news) for segment in segments]
     heads, tails, rows = map(b"".join, news)
-    packed = np.frombuffer(rows, ROW_BY_SIZE)
-    states = np.empty((len(packed), CELL), np.int64)
-    if len(packed):
-        for columns, name in COLUMNS_BY_SIZE:
-            states[:, columns] = packed[name]
-        kernel = kernels.compiled() if compiled else kernels.PLAIN
-        flat, of_parts = kernels.lent(states, compiled), kernels.lent(np.array(corners, np.int64), compiled)
-        if not kernel.admit(flat, of_parts, len(parts), *BOUNDS[compiled], templates):
-            raise ProtocolError("segment.rows: a value is out of range")
-    return parts, states, _decode_turns(heads, tails) if heads or tails else NO_TURNS
+    states = _decode_rows(rows, corners, templates, compiled) if rows else NO_STATES
+    return parts, states, _decode_turns(heads, tails, compiled) if heads or tails else NO_TURNS
 
 
-def _decode_turns(packed: bytes, tails: bytes) -> Int64s:
-    heads = np.frombuffer(packed, HEAD)
-    keep = TAILS_KEEP[heads["events"]]
-    if len(tails) != np.count_nonzero(keep):
+def _decode_rows(rows: bytes, corners: list[int], templates: int, compiled: bool) -> Int64s:
+    states = np.empty((len(rows) // ROW_BYTES, CELL), np.int64)
+    read_rows, _ = _reading(compiled)
+    of_parts = kernels.lent(np.array(corners, np.int64), compiled)
+    if not read_rows(rows, of_parts, *BOUNDS[compiled], templates, kernels.lent(states, compiled)):
+        raise ProtocolError("segment.rows: a value is out of range")
+    return states
+
+
+def _decode_turns(heads: bytes, tails: bytes, compiled: bool) -> Int64s:
+    turns = np.empty((len(heads) // HEAD.itemsize, TURN), np.int64)
+    _, read_turns = _reading(compiled)
+    if not read_turns(heads, tails, kernels.lent(turns, compiled)):
         raise ProtocolError("segment.tails: too many or too few")
-    spread = np.zeros(keep.shape, np.uint8)
-    spread[keep] = np.frombuffer(tails, np.uint8)
-    told = spread.reshape(-1).view(TAIL)
-    turns = np.empty((len(heads), TURN), np.int64)
-    turns[:, 0], turns[:, 1] = heads["id"], heads["events"]
-    turns[:, 2:4], turns[:, 4], turns[:, 5:] = told["move"], told["buttons"], told["place"]
     return turns
+
+
+@functools.cache
+def _reading(compiled: bool) -> tuple[Any, Any]:
+    """`read_rows` and `read_turns` of a kernel."""
+    kernel, some = kernels.of(compiled), kernels.lent(NO_TURNS, compiled)
+    return (
+        kernels.direct(kernel.read_rows, b"", some, some, some, 0, some),
+        kernels.direct(kernel.read_turns, b"", b"", some),
+    )
 
 
 def _decode_part(part: Any, corners: list[int], news: tuple[list[bytes], ...]) -> SegmentPart:
@@ -253,13 +260,17 @@ def _decode_part(part: Any, corners: list[int], news: tuple[list[bytes], ...]) -
         raise ProtocolError(f"segment.check = {shown(check)}: not allowed")
     if type(ago) is not int or not -1 <= ago < 1 << 53:
         raise ProtocolError(f"segment.ago = {shown(ago)}: not allowed")
-    for field, size in ((heads, HEAD.itemsize), (tails, 1), (rows, ROW_BYTES), (gone, 4), (edits, EDIT.itemsize)):
-        if field != b"" and (type(field) is not bytes or len(field) > PART_MAX or len(field) % size):
-            raise ProtocolError("segment: heads, tails, rows, gone or edits are no bytes, too many, or part of one")
+    if not (
+        type(heads) is type(tails) is type(rows) is type(gone) is type(edits) is bytes
+        and len(heads) % HEAD.itemsize == len(rows) % ROW_BYTES == len(gone) % 4 == len(edits) % EDIT.itemsize == 0
+    ):
+        raise ProtocolError("segment: heads, tails, rows, gone or edits are no bytes, or part of one")
     if heads and ago != 1:
         raise ProtocolError(f"segment.heads of {ago} ticks: not allowed")
-    for field, all_ in zip((heads, tails, rows), news, strict=True):
-        all_.append(field)
+    all_heads, all_tails, all_rows = news
+    all_heads.append(heads)
+    all_tails.append(tails)
+    all_rows.append(rows)
     edited = np.frombuffer(edits, EDIT) if edits else NO_EDITS
     if edits and int(edited["block"].max()) >= SEGMENT**3:
         raise ProtocolError("segment.edits: a block is out of range")

@@ -49,7 +49,7 @@ class World:
         """How many ticks have passed; see `rebase`."""
         self.blocks = blocks.Blocks()
         self.compiled = kernels.available() if compiled is None else compiled
-        self._kernel: Any = kernels.compiled() if self.compiled else kernels.PLAIN
+        self._kernel: Any = kernels.of(self.compiled)
         self._templates, self._walk, self._parameters = scene.kernel_tables()
         self._row_of: dict[int, int] = {}
         self._next_id = 1
@@ -70,6 +70,8 @@ class World:
         told = self._told = self._lent(self._inputs)
         self._step = kernels.direct(self._kernel.step, self._arrays, told, 0, 0)
         self._store = kernels.direct(self._kernel.store, self._arrays, told, told, 0, 0)
+        self._follow = kernels.direct(self._kernel.follow, self._arrays, told, 0, 0, 0, 0)
+        self._collect = kernels.direct(self._kernel.collect, told, 0, np.zeros((0, STATES), np.int64))
 
     # -- reading -------------------------------------------------------------------------------------------
 
@@ -96,7 +98,7 @@ class World:
         """The whole states of all entities, [n, 12], ascending by id: equal worlds have equal ones. A copy."""
         if self.compiled and self._rows <= COLLECT_MAX:
             out = np.empty((self._rows, STATES), np.int64)
-            return out[: self._kernel.collect(self._arrays.entities, self._rows, out.reshape(-1))]
+            return out[: self._collect(self._arrays.entities, self._rows, out)]
         rows: layout.Int64s = self._entities[: self._rows, :STATES]
         rows = rows[rows[:, ID] != 0]
         rows = rows[np.argsort(rows[:, ID])]
@@ -397,26 +399,30 @@ class World:
                 self._arrays, -1, x * BLOCK, y * BLOCK, (x + 1) * BLOCK, (y + 1) * BLOCK, (z + 1) * BLOCK
             )
 
-    def follow(self, turns: layout.Int64s, ticks: int) -> None:
-        """Takes a world that is written and never stepped on by some ticks: what has no turn in `turns` goes on as it
-        did, with nothing in its way, but does not leave its segment. A `rebase` has to follow.
+    def follow(self, turns: layout.Int64s, ticks: int, tick: int) -> bool:
+        """Takes a world that is written and never stepped on by some ticks, the last of which is `tick`: what has no
+        turn in `turns` goes on as it did, with nothing in its way, but does not leave its segment.
 
         Args:
             turns: of those that do not, [n, 8]: id, events (`layout.STOP_X` ...), wish (3), position (3; only that
                 within its segment, along axes where it stopped). Only where `ticks` is 1.
 
-        Raises:
-            KeyError: a turn of an entity that does not exist.
+        Returns:
+            Whether there is an entity for every turn.
         """
-        turns[:, 0] = [self._row_of[entity] for entity in turns[:, 0].tolist()]
-        self._kernel.follow(self._arrays, self._lent(turns), len(turns), self._rows, ticks, self.tick + 1)
+        there = self._follow(self._arrays, self._lent(turns), len(turns), self._rows, ticks, self.tick + 1)
+        self._rebased(tick)
+        return bool(there)
 
     def rebase(self, tick: int) -> None:
         """Declares what has been written to be the world at the end of `tick`, without a step."""
-        self.tick = tick
-        self.editing, self.edited = {}, {}
         self._entities[: self._rows, layout.CHANGED] = -1  # it may be a tick that has been before
         self._lengths[layout.N_CHANGED] = self._lengths[layout.N_FELL] = 0
+        self._rebased(tick)
+
+    def _rebased(self, tick: int) -> None:
+        self.tick = tick
+        self.editing, self.edited = {}, {}
         if self._limbo:
             for name, length in (("_awake", layout.N_AWAKE), ("_woken", layout.N_WOKEN)):
                 keys = getattr(self, name)[: self._lengths[length]]

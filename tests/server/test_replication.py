@@ -278,7 +278,6 @@ class Model:
         homes = {state[ID]: home_of(state) for state in self.world.states().tolist()}
         assert snapshot.tick == self.tick + 1 or not len(turns)
         self.told += len(turns)
-        self.world.follow(turns, snapshot.tick - self.tick)
         dropped = {tuple(segment) for segment in np.frombuffer(snapshot.drops, "<i4").reshape(-1, 3).tolist()}
         for segment in dropped:
             self.blocks.pop(segment, None)
@@ -289,7 +288,7 @@ class Model:
             if entity not in new and (home in anew or (home, entity) in gone):
                 self.world.remove(entity)
         self.world.put(states)
-        self.world.rebase(snapshot.tick)
+        assert self.world.follow(turns, snapshot.tick - self.tick, snapshot.tick)
         for part in parts:
             assert part.ago == KEYFRAME or 0 < part.ago <= HISTORY
             self.edits.setdefault(part.segment, []).append(part.edits)

@@ -60,9 +60,8 @@ class Told:
         self.bytes += sum(map(len, parts))
         templates = len(self.world.scene.templates)
         _, states, turns = decode_parts(list(map(msgpack.unpackb, parts)), templates, compiled=self.world.compiled)
-        self.other.follow(turns, self.world.tick - self.other.tick)
         self.other.put(states)
-        self.other.rebase(self.world.tick)
+        assert self.other.follow(turns, self.world.tick - self.other.tick, self.world.tick)
 
     def check(self) -> None:
         assert self.other.states().tolist() == self.world.states().tolist()
@@ -182,10 +181,19 @@ def turn(entity: int, what: int, *rest: int) -> list[int]:
     return [entity, what, *rest, *[0] * (6 - len(rest))]
 
 
-def test_a_turn_of_nobody_is_an_error() -> None:
-    world = build()
-    with pytest.raises(KeyError):
-        world.follow(np.array([turn(7, FALL)], np.int64), 1)
+def test_a_turn_of_nobody_is_told_and_the_others_have_theirs(compiled: bool) -> None:
+    """Rows that ascend by id and rows that do not; a row that is free again, and id 0, which free rows have."""
+    world = build(compiled=compiled)
+    for entity in (9, 3, 5):
+        world.put([(entity, 0, 0, 2 * entity * BLOCK, 0, 9 * BLOCK, 0, 0, 0, 0, 0, 0)])
+    world.remove(5)
+    at_rest = world.state(3)
+    for unknown in (0, 4, 5, 7, 10, 2**32 - 1):
+        world.put([at_rest])
+        assert not world.follow(np.array([turn(unknown, FALL), turn(3, FALL)], np.int64), 1, world.tick + 1)
+        assert world.falling(3)
+    assert world.follow(np.array([turn(9, FALL), turn(3, FALL)], np.int64), 1, world.tick + 1)
+    assert world.falling(9)
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -206,8 +214,7 @@ def test_whatever_is_told_an_entity_stays_in_its_segment_and_the_kernel_in_its_t
             )
             for entity in range(1, 9)
         ]  # fmt: skip
-        world.follow(np.array(turns, np.int64), 1)
-        world.rebase(world.tick + 1)
+        world.follow(np.array(turns, np.int64), 1, world.tick + 1)
         states = world.states()
         assert (states[:, X : X + 3] // SIDE == homes).all()
         assert (abs(states[:, MOVE_X:BUTTONS]) <= 127).all()
