@@ -10,12 +10,15 @@ from client_sdk.clock import (
     CALM_S,
     FASTER,
     FIRST_INPUTS,
+    FIRST_S,
     HURRY,
     JUMP,
     MEMORY_S,
     PING_FIRST_S,
     PING_LATER_S,
     PINGS,
+    PRICE,
+    SHIFT,
     PricedLead,
     ServerClock,
     Timeline,
@@ -302,3 +305,33 @@ def test_a_long_way_at_a_high_rate_is_learnt_like_any() -> None:
         timeline.steer(lead, clock, 2.0 + i / clock.rate)
         lead.observe(i, timeline.phase - need, timeline.phase, 2.0 + i / clock.rate)
     assert timeline.phase == pytest.approx(need + SAFETY, abs=0.1)
+
+
+@pytest.mark.parametrize("slope", [0.0, 1e-3, -1e-3, 0.05])
+def test_the_base_is_that_of_its_definition_after_every_input(slope: float) -> None:
+    """Whatever is kept of the inputs before: among falling, rising and equal needs, and when a stall gets longer."""
+    rng = random.Random(5)
+    lead, clock = PricedLead(), clock_at(rtt_s=0.1)
+    lead.start(clock, 0.0)
+    needs: list[float] = []
+    for i in range(3000):
+        needs.append(100.0 + i * slope + rng.choice((0.0, 0.25, 0.5, 1.5)))
+        lead.observe(i, -needs[-1], 0.0, 0.0)
+        least = min(needs[-lead._stall :])
+        calm = min(needs[-max(int(CALM_S * RATE), lead._stall) :])
+        assert lead._base == (least if least > calm + SHIFT else calm)
+        if i % 500 == 250:
+            clock.rtt_s = (0.1, 3.0, 0.5)[i // 500 % 3]
+            lead.steer(100.0, 1.0, clock, 0.0)
+
+
+@pytest.mark.parametrize("top", [0.001, 0.4, 8.0, 1000.0])
+def test_the_cover_is_the_best_of_all_excesses_though_few_are_looked_at(top: float) -> None:
+    rng = random.Random(6)
+    lead = PricedLead()
+    lead.start(clock_at(), 0.0)
+    for _ in range(600):
+        lead._remember(rng.choice((rng.uniform(-top, top), rng.uniform(0, top / 10), 0.0)))
+        falling = sorted(lead._excess, reverse=True)
+        costs = [excess + PRICE * (i / max(len(falling), FIRST_S * RATE)) for i, excess in enumerate(falling)]
+        assert lead._best() == falling[costs.index(min(costs))]
