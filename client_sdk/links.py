@@ -167,15 +167,17 @@ def _late(now: float, cycle: tuple[float, ...]) -> bool:
     return now % cycle[0] >= cycle[0] - cycle[1]
 
 
-class _Packet:
-    __slots__ = ("arrived", "bytes", "last_of", "lost", "sent", "timeout_s")
+_Packet = tuple[int, int, bytes | None]
+"""Its number in the stream, its bytes, and the message that it completes, if it does."""
 
-    def __init__(self, size: int, last_of: bytes | None, timeout_s: float) -> None:
-        self.bytes = size
-        self.last_of = last_of
+
+class _Loss:
+    """A transmission that does not arrive."""
+
+    def __init__(self, packet: _Packet, sent: float, timeout_s: float) -> None:
+        self.packet = packet
+        self.sent = sent
         self.timeout_s = timeout_s
-        self.sent = 0.0
-        self.lost = self.arrived = False
 
 
 class Wire:
@@ -190,10 +192,12 @@ class Wire:
 
     def __init__(self, time: Scheduler, weather: Weather, seed: int, deliver: Callable[[bytes], None]) -> None:
         self._time, self._weather, self._path, self._deliver = time, weather, weather.path, deliver
-        self._rng = random.Random(seed)
-        self._waiting: deque[_Packet] = deque()  # in order of the stream; the first has not arrived
+        self._random = random.Random(seed).random
         self._flying: deque[_Packet] = deque()  # in order of arrival, which is that of transmission
-        self._missing: list[_Packet] = []  # lost, not yet sent again
+        self._missing: list[_Loss] = []  # not yet sent again
+        self._early: dict[int, _Packet] = {}  # arrived, and waits for one before it
+        self._numbers = count()
+        self._next = 0  # the number that is delivered next
         self._free = 0.0  # when the line is
         self._last = 0.0  # when the newest transmission arrives
         self._bytes = 0
@@ -206,17 +210,19 @@ class Wire:
         """Takes a message; never blocks."""
         left = len(message) + FRAME_BYTES
         self._bytes += left
-        while left > 0:
-            size = min(left, PACKET_BYTES)
-            left -= size
-            packet = _Packet(size, message if left == 0 else None, TIMEOUT_S + self._path.rtt_s)
-            self._waiting.append(packet)
-            self._transmit(packet)
+        while left > PACKET_BYTES:
+            left -= PACKET_BYTES
+            self._transmit((next(self._numbers), PACKET_BYTES, None))
+        self._transmit((next(self._numbers), left, message))
+
+    def cut(self) -> None:
+        """What is on the way is lost, and what is sent from here on."""
+        self._deliver = _nowhere
 
     @property
     def idle(self) -> bool:
         """Whether everything has arrived."""
-        return not self._waiting
+        return not self._flying and not self._missing
 
     @property
     def busy(self) -> bool:
@@ -224,8 +230,9 @@ class Wire:
         return self._free > self._time.now
 
     def waiting(self) -> list[bytes]:
-        """The messages that have not arrived."""
-        return [packet.last_of for packet in self._waiting if packet.last_of is not None]
+        """The messages that have not arrived, in order."""
+        packets = [*self._flying, *(loss.packet for loss in self._missing), *self._early.values()]
+        return [message for _, _, message in sorted(packets) if message is not None]
 
     def follow(self, weather: Weather) -> None:
         """Another path from here on; what is under way stays in front."""
@@ -237,49 +244,64 @@ class Wire:
             self._bytes -= self._unacked.popleft()[1]
         return self._bytes
 
-    def _transmit(self, packet: _Packet) -> None:
-        path, weather, now = self._path, self._weather, self._time.now
-        size = packet.bytes + HEADER_BYTES
+    def _transmit(self, packet: _Packet, lost: _Loss | None = None) -> None:
+        """Sends a packet, or sends it again after a loss."""
+        path, weather, now, free = self._path, self._weather, self._time.now, self._free
+        size = packet[1] + HEADER_BYTES
         self.sent_bytes += size
-        packet.sent = now
-        gone = self._free = max(now, self._free) + 8 * size / weather.rate(now)
-        packet.lost = self._rng.random() < path.loss or weather.out(gone)
-        if packet.lost:
-            self._missing.append(packet)
-            wait = gone - now + packet.timeout_s
-            packet.timeout_s *= 2
-            self._time.at(now + wait, lambda: self._timeout(packet, now))
+        rate = path.rate if path.dip is None else weather.rate(now)
+        gone = self._free = max(now, free) + 8 * size / rate
+        if self._random() < path.loss or (path.outage is not None and weather.out(gone)):
+            timeout_s = 2 * lost.timeout_s if lost else TIMEOUT_S + path.rtt_s
+            loss = _Loss(packet, now, timeout_s)
+            self._missing.append(loss)
+            self._time.at(now + (gone - now + timeout_s), lambda: self._timeout(loss))
             return
-        extra = weather.extra(gone)
-        self._last = max(self._last, gone + path.delay_s + self._rng.random() * path.jitter_s + extra)
+        extra = 0.0 if path.spike is None else weather.extra(gone)
+        comes = gone + path.delay_s + self._random() * path.jitter_s + extra
+        if comes < self._last:
+            comes = self._last
+        self._last = comes
         self._flying.append(packet)
-        self._time.at(self._last, self._arrive)
-        if self._missing and self._rng.random() >= path.loss:  # its acknowledgement tells of the missing
-            told = self._last + path.delay_s + path.jitter_s / 2 + extra + path.rtt_s / 4 + TIMER_S
+        self._time.at(comes, self._arrive)
+        if self._missing and self._random() >= path.loss:  # its acknowledgement tells of the missing
+            told = comes + path.delay_s + path.jitter_s / 2 + extra + path.rtt_s / 4 + TIMER_S
             self._time.at(told, lambda: self._find_missing(now))
 
     def _find_missing(self, sent: float) -> None:
-        found = [packet for packet in self._missing if packet.sent < sent]
+        found = [loss for loss in self._missing if loss.sent < sent]
         if found:
-            self._missing = [packet for packet in self._missing if packet.sent >= sent]
-            for packet in found:
-                self._resend(packet)
+            self._missing = [loss for loss in self._missing if loss.sent >= sent]
+            for loss in found:
+                self._resend(loss)
 
-    def _timeout(self, packet: _Packet, sent: float) -> None:
-        if packet.lost and packet.sent == sent:
-            self._missing.remove(packet)
-            self._resend(packet)
+    def _timeout(self, loss: _Loss) -> None:
+        if loss in self._missing:
+            self._missing.remove(loss)
+            self._resend(loss)
 
-    def _resend(self, packet: _Packet) -> None:
+    def _resend(self, loss: _Loss) -> None:
         self.resent += 1
-        self._transmit(packet)
+        self._transmit(loss.packet, loss)
 
     def _arrive(self) -> None:
-        self._flying.popleft().arrived = True
-        back = self._time.now + self._path.delay_s + self._path.jitter_s / 2
-        while self._waiting and self._waiting[0].arrived:
-            first = self._waiting.popleft()
+        first = self._flying.popleft()
+        now, path, early, unacked = self._time.now, self._path, self._early, self._unacked
+        if unacked and unacked[0][0] <= now:
             self.outstanding()  # lets go of what has been acknowledged, where nobody asks
-            self._unacked.append((back, first.bytes))
-            if first.last_of is not None:
-                self._deliver(first.last_of)
+        if first[0] != self._next:
+            early[first[0]] = first
+            return
+        back = now + path.delay_s + path.jitter_s / 2
+        packet: _Packet | None = first
+        while packet is not None:
+            number, size, message = packet
+            self._next = number + 1
+            unacked.append((back, size))
+            if message is not None:
+                self._deliver(message)
+            packet = early.pop(number + 1, None) if early else None
+
+
+def _nowhere(message: bytes) -> None:
+    """Takes what was sent over a connection that is gone."""

@@ -4,10 +4,10 @@ Nothing sleeps and nothing depends on the machine: every delivery, tick and fram
 by simulated time. The wires are those of `client_sdk.links`: TCP, nothing lost or reordered, but sometimes late.
 """
 
-import heapq
 import math
 import random
 from collections.abc import Callable
+from heapq import heappop, heappush
 from itertools import count
 
 from client_sdk import bots
@@ -51,10 +51,8 @@ class Player:
         return self.clock_start + self.match.now * (1 + self.drift)
 
     def _connect_wires(self) -> None:
-        """New wires; what is still on the way in old ones is lost."""
-        up = Wire(self.match, self.weather, self._seed + 1, lambda message: self._at_server(message, up))
-        down = Wire(self.match, self.weather, self._seed + 2, lambda message: self._at_client(message, down))
-        self.up, self.down = up, down
+        self.up = Wire(self.match, self.weather, self._seed + 1, self._at_server)
+        self.down = Wire(self.match, self.weather, self._seed + 2, self._at_client)
         self._seed += 10
 
     def connect(self) -> None:
@@ -69,6 +67,8 @@ class Player:
         self.match.game.lost(self.session, self.match.now)
         self.session = None
         self._inbox.clear()
+        self.up.cut()
+        self.down.cut()
         self._connect_wires()
         self.core.lost(1006, "gone", self.local)
         self._update()
@@ -96,14 +96,11 @@ class Player:
         assert self.session is not None
         self.match.game.lost(self.session, self.match.now)
 
-    def _at_server(self, message: bytes, wire: Wire) -> None:
-        if wire is not self.up or self.session is None:
-            return
-        self.match.game.receive(self.session, message, self.match.now)
+    def _at_server(self, message: bytes) -> None:
+        if self.session is not None:
+            self.match.game.receive(self.session, message, self.match.now)
 
-    def _at_client(self, message: bytes, wire: Wire) -> None:
-        if wire is not self.down:
-            return
+    def _at_client(self, message: bytes) -> None:
         self._inbox.append(message)
         if self._away or self.frame_s:
             return
@@ -113,9 +110,9 @@ class Player:
             self._update()
 
     def _read(self) -> None:
-        now = self.local
+        core, now = self.core, self.local
         for message in self._inbox:
-            self.core.receive(message, now)
+            core.receive(message, now)
         self._inbox.clear()
         self._flush()
 
@@ -125,8 +122,8 @@ class Player:
             return
         if self.frame_s:
             self._read()
-        if core.state == "playing" and core.prediction and core.prediction.predicted.tick != self._acted:
-            self._acted = core.prediction.predicted.tick
+        if core.state == "playing" and (prediction := core.prediction) and prediction.predicted.tick != self._acted:
+            self._acted = prediction.predicted.tick
             core.set_input(self.policy(core, self.rng))
         now = self.local
         core.update(now)
@@ -144,11 +141,12 @@ class Player:
                 self.match.at(when, self._update, key=self)
 
     def _flush(self) -> None:
-        for message in self.core.outgoing():
+        core = self.core
+        for message in core.outgoing():
             self.up.send(message)
-        self.events += self.core.events()
-        if self.core.close_request and self.closed is None:
-            self.close(*self.core.close_request)
+        self.events += core.events()
+        if core.close_request and self.closed is None:
+            self.close(*core.close_request)
 
 
 class Match:
@@ -186,33 +184,30 @@ class Match:
         number = next(self._number)
         if key is not None:
             self._latest[key] = number
-        heapq.heappush(self._queue, (when, number, act, key))
+        heappush(self._queue, (when, number, act, key))
 
     def run(self, seconds: float) -> None:
         """Lets time pass."""
         until = self.now + seconds
-        while self._advance(until):
-            pass
+        self._advance(until)
         self.now = until
 
     def run_until(self, condition: Callable[[], bool], seconds: float) -> None:
         """Lets time pass until a condition holds; fails if it does not within so many simulated seconds."""
-        until = self.now + seconds
-        while self._advance(until):
-            if condition():
-                return
-        raise AssertionError(f"seed {self.seed}: not within {seconds} simulated seconds")
+        if not self._advance(self.now + seconds, condition):
+            raise AssertionError(f"seed {self.seed}: not within {seconds} simulated seconds")
 
-    def _advance(self, until: float) -> bool:
-        """Does what comes next, unless that is after `until`; whether it did."""
-        queue = self._queue
+    def _advance(self, until: float, condition: Callable[[], bool] | None = None) -> bool:
+        """Does all that comes up to `until`, or until a condition holds; whether it does."""
+        queue, latest = self._queue, self._latest
         while queue and queue[0][0] <= until:
-            when, number, act, key = heapq.heappop(queue)
-            if key is None or self._latest[key] == number:
+            when, number, act, key = heappop(queue)
+            if key is None or latest[key] == number:
                 if when > self.now:
                     self.now = when
                 act()
-                return True
+                if condition is not None and condition():
+                    return True
         return False
 
     def _tick(self) -> None:
@@ -236,11 +231,9 @@ def bot(policy: bots.Policy) -> Policy:
 
 def wander(core: Core, rng: random.Random) -> Input:
     """Walks about, jumps and stops, changing its mind about once a second."""
-    assert core.prediction is not None
-    held = core.wish
     if rng.random() < 0.04:
         angle = rng.choice(
             [(127, 0), (-127, 0), (0, 127), (0, -127), (90, 90), (-90, 90), (90, -90), (-90, -90), (0, 0)]
         )
         return Input(*angle, int(rng.random() < 0.5))
-    return held
+    return core.wish

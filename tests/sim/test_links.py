@@ -120,6 +120,33 @@ def test_outstanding_counts_what_is_not_acknowledged() -> None:
     assert wire.outstanding() == 0
 
 
+def test_what_is_on_a_wire_when_it_is_cut_never_comes() -> None:
+    time, got = Time(), list[bytes]()
+    wire = Wire(time, Weather(Path(0.1), 1), 1, got.append)
+    wire.send(b"before")
+    time.run(0.11)
+    wire.send(b"on the way")
+    wire.cut()
+    wire.send(b"after")
+    time.run(1.0)
+    assert got == [b"before"]
+
+
+def test_what_has_not_arrived_is_told_in_order_whatever_was_lost() -> None:
+    for seed in range(20):
+        time, got = Time(), list[bytes]()
+        wire = Wire(time, Weather(Path(0.02, 0.01, 0.3), 1), seed, got.append)
+        sent = [bytes((number,)) * (1 if number % 5 else 3000) for number in range(40)]
+        for number, message in enumerate(sent):
+            time.run(number / 100)
+            wire.send(message)
+            assert got + wire.waiting() == sent[: number + 1]
+            assert wire.idle == (not wire.waiting())
+        time.run(30)
+        assert got == sent
+        assert wire.idle
+
+
 def test_a_dip_narrows_the_line_for_its_time() -> None:
     weather = Weather(PRESETS["dip"], 1)
     assert [weather.rate(at) for at in (0.0, 29.9, 30.1, 39.9, 40.1)] == [2e6, 2e6, 120e3, 120e3, 2e6]
