@@ -282,6 +282,7 @@ SERVER_KINDS = frozenset({4, 17, 18, 19, 20, 21, 22})
 _KIND_OF = {kind: number for number, (kind, _) in KINDS.items()}
 _SNAPSHOT = _KIND_OF[Snapshot]
 _INPUTS_HEAD = bytes((0x94, _KIND_OF[Inputs]))
+_SNAPSHOT_HEAD, _SNAPSHOT_KIND = b"\xdc", bytes((_SNAPSHOT,))
 _pack: Callable[[Any], bytes] = msgpack.Packer().pack
 """Half the time of `msgpack.packb`, which makes a packer and its buffer anew for each message."""
 
@@ -297,7 +298,7 @@ def join_snapshot(header: tuple[int, int, bytes, int, bytes, bytes, bytes], segm
     """A snapshot from its first seven fields and so many segments' parts, encoded already (shared by many clients)."""
     n = 1 + len(header) + segments
     fields = _pack((_SNAPSHOT, *header))[1:]  # without its own head, which is one byte
-    return b"\xdc" + n.to_bytes(2, "big") + fields + parts
+    return _SNAPSHOT_HEAD + n.to_bytes(2, "big") + fields + parts
 
 
 def shown(value: Any) -> str:
@@ -375,5 +376,28 @@ def decode_from_client(data: bytes) -> Message:
 
 
 def decode_from_server(data: bytes) -> Message:
-    """What a client may receive. Raises `ProtocolError`."""
+    """What a client may receive. Raises `ProtocolError`.
+
+    Nearly all of it is what `join_snapshot` makes: one in order, with few margins, that answers no command and drops
+    nothing takes 1.1 us here and not 2.1; for the rest `decode` is the judge.
+    """
+    if data[:1] == _SNAPSHOT_HEAD and data[3:4] == _SNAPSHOT_KIND and len(data) <= MESSAGE_MAX:
+        try:
+            _, tick, newest, margins, first, fates, verdicts, drops, *segments = msgpack.unpackb(
+                data, strict_map_key=True, max_array_len=LIST_MAX, max_map_len=TABLE_MAX
+            )
+        except Exception:
+            return decode(data, SERVER_KINDS, MESSAGE_MAX)
+        if (
+            type(tick) is type(newest) is type(first) is int
+            and type(margins) is type(fates) is bytes
+            and verdicts == drops == b""
+            and -1 <= tick <= TICK_MAX
+            and -1 <= newest <= TICK_MAX
+            and -1 <= first <= TICK_MAX
+            and len(margins) in (0, 2, 4)
+            and len(fates) <= FATES_MAX
+            and len(segments) <= SEGMENTS_MAX
+        ):
+            return Snapshot(tick, newest, margins, first, fates, verdicts, drops, tuple(segments))
     return decode(data, SERVER_KINDS, MESSAGE_MAX)

@@ -2,6 +2,7 @@
 
 import contextlib
 import math
+from collections.abc import Callable
 from typing import Any
 
 import msgpack
@@ -264,7 +265,12 @@ structures = st.recursive(
 near_misses = st.builds(
     lambda kind, fields: [kind, *fields], st.sampled_from(sorted(KINDS)), st.lists(structures, max_size=9)
 )
-valid = st.sampled_from([encode(message) for message in FROM_CLIENT + FROM_SERVER])
+JOINED = [
+    join_snapshot((9, 12, b"\x01\x02", 8, b"\x00", b"", b""), 2, msgpack.packb(PART) * 2),
+    join_snapshot((TICK_MAX, -1, bytes(4), -1, bytes(256), b"", b""), 0, b""),
+]
+"""What the short way is for."""
+valid = st.sampled_from([encode(message) for message in FROM_CLIENT + FROM_SERVER] + JOINED * 4)
 
 
 @st.composite
@@ -295,6 +301,33 @@ def test_any_bytes_are_a_message_or_a_protocol_error(data: bytes) -> None:
             message = decode(data)
             # What was let through is within all bounds: it can be said again, and is understood the same.
             assert decode(encode(message)) == message
+
+
+def outcome(decode: Callable[[], Message]) -> Message | str:
+    """What comes of it: a message, or the text of the error."""
+    try:
+        return decode()
+    except ProtocolError as error:
+        return str(error)
+
+
+@settings(max_examples=300)
+@given(mutated())
+def test_the_short_ways_decide_as_the_long_one(data: bytes) -> None:
+    by_client = outcome(lambda: messages.decode(data, CLIENT_KINDS, CLIENT_MESSAGE_MAX, CLIENT_LIST_MAX))
+    assert repr(outcome(lambda: decode_from_client(data))) == repr(by_client)
+    by_server = outcome(lambda: messages.decode(data, SERVER_KINDS, MESSAGE_MAX))
+    assert repr(outcome(lambda: decode_from_server(data))) == repr(by_server)
+
+
+@pytest.mark.parametrize("field", Snapshot._fields[:7])
+def test_a_joined_snapshot_beyond_its_bounds_is_refused_by_name(field: str) -> None:
+    values = next(values for message, name, values in OUT_OF_BOUNDS if message == BLANK and name == field)
+    for value in [*values, True, 1.0, []]:
+        with pytest.raises(ProtocolError, match=rf"Snapshot\.{field}|not MessagePack"):
+            decode_from_server(join_snapshot(BLANK._replace(**{field: value})[:7], 1, msgpack.packb(PART)))
+    with pytest.raises(ProtocolError, match="fields instead of"):
+        decode_from_server(join_snapshot(BLANK[:7], 1025, b"\x00" * 1025))
 
 
 def assert_refused(data: bytes, *, server: bool = False) -> None:
