@@ -76,13 +76,13 @@ class Core:
         self._open = False
         self._filled: Replica | None = None
         """What the server's messages go into: after a return not yet what is played in."""
+        self._world: Replica | None = None
+        """What is played in, or is going to be."""
         self._play: Play | None = None
         self._orders = Orders()
         self._out: list[bytes] = []
         self._events: deque[Event] = deque(maxlen=EVENTS_MAX)
         self._pings: deque[float] = deque(maxlen=16)
-
-    # What is played in, or is going to be:
 
     @property
     def prediction(self) -> Prediction | None:
@@ -106,10 +106,6 @@ class Core:
     def timeline(self) -> Timeline | None:
         """The own time; None before it has `Joined`."""
         return self._play.timeline if self._play else None
-
-    @property
-    def _world(self) -> Replica | None:
-        return self._play.world if self._play else self._filled
 
     @property
     def appetite(self) -> int:
@@ -216,12 +212,16 @@ class Core:
 
     def outgoing(self) -> list[bytes]:
         """The messages to send since the last call."""
+        if not self._out:
+            return []
         out, self._out = self._out, []
         self.stats.bytes_up += sum(map(len, out))
         return out
 
     def events(self) -> list[Event]:
         """What has happened since the last call."""
+        if not self._events:
+            return []
         events = list(self._events)
         self._events.clear()
         return events
@@ -278,6 +278,8 @@ class Core:
         elif self._play:
             self._events += self._orders.give_up()
         self._filled = world
+        if self._play is None:
+            self._world = world
 
     def _welcomed(self, message: messages.Message) -> Replica:
         if self._filled is None:
@@ -285,14 +287,14 @@ class Core:
         return self._filled
 
     def _snapshot(self, snapshot: messages.Snapshot, now: float) -> None:
-        world = self._welcomed(snapshot)
-        self.stats.snapshots_skipped += world.skipped(snapshot)
-        self.stats.snapshots += 1
-        if self._play:
-            self._play.learn(snapshot, now)
+        world, play, stats = self._welcomed(snapshot), self._play, self.stats
+        stats.snapshots_skipped += world.skipped(snapshot)
+        stats.snapshots += 1
+        if play:
+            play.learn(snapshot, now)
         for answered in self._orders.answer(snapshot.verdicts):
-            if self._play:
-                self._play.world.prediction.settle(answered.number, answered.done)
+            if play:
+                play.world.prediction.settle(answered.number, answered.done)
             self._events.append(answered)
         world.apply(snapshot)
 
@@ -305,6 +307,7 @@ class Core:
         else:
             play = old
             play.world = world
+        self._world = world
         world.prediction.ahead = self._delay
         play.restart(now)
         self.state = "playing"

@@ -56,7 +56,8 @@ class Interpolation:
         at = server_tick - self.delay_ticks
         if not self._states:
             return at
-        return max(self._states[0][0], min(at, self._states[-1][0] + EXTRAPOLATE_S * self._rate))
+        oldest, latest = self._states[0][0], self._states[-1][0] + EXTRAPOLATE_S * self._rate
+        return latest if at > latest else max(oldest, at)
 
     def sample(self, server_tick: float) -> tuple[Int64s, Positions]:
         """States and positions (blocks, [n, 3]) of all entities as they are to be drawn: as they were when `shown`."""

@@ -64,17 +64,18 @@ class Picture:
         self._predicted = {i for i, template in enumerate(scene.templates) if template.shown == "predicted"}
         self._smoothing: dict[int, Smoothing] = {}
 
-    def advance(self, clock: ServerClock, now: float) -> float:
+    def advance(self, server_tick: float, now: float) -> float:
         """Adapts the delay of the others; the tick at which they are drawn."""
-        self.interpolation.advance(clock.tick(now), now)
-        return self.interpolation.shown(clock.tick(now))
+        self.interpolation.advance(server_tick, now)
+        return self.interpolation.shown(server_tick)
 
     def smooth(self, done: Reconciled, now: float) -> None:
         """A replay has moved things: they are shown to go there gradually (what the rules placed jumps)."""
         if not done.replayed:
             return
-        known = self._prediction.predicted
-        self._smoothing = {entity: old for entity, old in self._smoothing.items() if entity in known}
+        if self._smoothing:
+            known = self._prediction.predicted
+            self._smoothing = {entity: old for entity, old in self._smoothing.items() if entity in known}
         for entity, offset in done.offsets.items():
             if entity not in done.acted:
                 self._smoothing.setdefault(entity, Smoothing()).add(offset, now)

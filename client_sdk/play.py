@@ -9,16 +9,16 @@
 """
 
 import math
-import struct
 from collections import deque
+from struct import iter_unpack
 
 from client_sdk.clock import PricedLead, Timeline
 from client_sdk.events import Diverged, Event, Resynchronised
 from client_sdk.picture import View
-from client_sdk.prediction import NONDETERMINISM
+from client_sdk.prediction import NONDETERMINISM, NOTHING
 from client_sdk.replica import Replica
 from client_sdk.stats import Stats
-from shared.inputs import Input
+from shared.inputs import Input, row
 from shared.messages import (
     IDLE,
     INPUT_ROWS_MAX,
@@ -26,6 +26,7 @@ from shared.messages import (
     MARGIN_REFUSED,
     NEUTRALISED,
     REPEATED,
+    USED,
     Inputs,
     Message,
     Resync,
@@ -76,21 +77,25 @@ class Play:
         Without a connection (not `online`), nothing new can be known, and nothing is sent.
         """
         world, stats = self.world, self._stats
+        clock = world.clock
+        server_tick = clock.tick(now)
         stats.measure(now)
         alarm = False
         if online:
             alarm = self._reconcile(now)
-            shown = world.picture.advance(world.clock, now)
+            shown = world.picture.advance(server_tick, now)
             if not self._draws:
                 self.seen = shown
-        inputs = self._predict(now, wish)
-        stats.snapshot_age_s = max(world.clock.tick(now) - world.prediction.confirmed.tick, 0.0) / world.clock.rate
+        messages = self._predict(now, wish)
+        stats.snapshot_age_s = max(server_tick - world.prediction.confirmed.tick, 0.0) / clock.rate
         if not online:
             return []
         # Steered only now: a tick that was due, and for which the program woke up, is not put off by a moment.
-        if self.timeline.steer(self._lead, world.clock, now):
+        if self.timeline.steer(self._lead, clock, now):
             self.restart(now)
-        return ([Resync()] if alarm else []) + inputs
+        if alarm:
+            messages.insert(0, Resync())
+        return messages
 
     def next_tick(self, now: float) -> float:
         """The local time at which there is one to predict; inf: not before something has come in."""
@@ -106,22 +111,25 @@ class Play:
 
     def learn(self, snapshot: Snapshot, now: float) -> None:
         """How the inputs fared: feeds the lead, and tells whether any of these ticks lacked its own."""
-        margins = struct.unpack(f"<{len(snapshot.margins) // 2}h", snapshot.margins)
-        for tick, margin in enumerate(margins, snapshot.newest + 1 - len(margins)):
-            phase = self._phases.get(tick)
+        stats, phases, margins, fates = self._stats, self._phases, snapshot.margins, snapshot.fates
+        for tick, (margin,) in enumerate(iter_unpack("<h", margins), snapshot.newest + 1 - len(margins) // 2):
+            phase = phases.get(tick)
             if phase is None:
                 continue  # a tick that was left out
-            self._stats.inputs_refused += margin == MARGIN_REFUSED
-            self._stats.inputs_late += MARGIN_REFUSED < margin < 0
-            if margin != MARGIN_REFUSED:
-                self._lead.observe(tick, margin / MARGIN_ONE, phase, now)
-        neutralised = snapshot.fates.count(NEUTRALISED)
-        missing = snapshot.fates.count(REPEATED) + neutralised
-        if IDLE in snapshot.fates:  # the very first ones came late: until then nothing stood in for them
-            ticks = enumerate(snapshot.fates, snapshot.first)
-            missing += sum(fate == IDLE and self._phases.get(tick) is not None for tick, fate in ticks)
-        self._stats.inputs_substituted += missing
-        self._stats.inputs_neutralised += neutralised
+            if margin == MARGIN_REFUSED:
+                stats.inputs_refused += 1
+                continue
+            stats.inputs_late += margin < 0
+            self._lead.observe(tick, margin / MARGIN_ONE, phase, now)
+        if fates.count(USED) == len(fates):
+            return
+        neutralised = fates.count(NEUTRALISED)
+        missing = fates.count(REPEATED) + neutralised
+        if IDLE in fates:  # the very first ones came late: until then nothing stood in for them
+            ticks = enumerate(fates, snapshot.first)
+            missing += sum(fate == IDLE and phases.get(tick) is not None for tick, fate in ticks)
+        stats.inputs_substituted += missing
+        stats.inputs_neutralised += neutralised
         self._late |= missing > 0
 
     def unheard(self) -> list[Message]:
@@ -143,14 +151,15 @@ class Play:
         world, stats = self.world, self._stats
         done = world.prediction.reconcile(self._late)
         self._late = False
-        stats.replayed_ticks += done.replayed
-        stats.repredictions += done.repredicted
-        world.picture.smooth(done, now)
-        if done.correction:
-            stats.corrected(done.correction)
-            self._events.append(done.correction)
-            if done.correction.cause == NONDETERMINISM:
-                world.wrong = f"own {', '.join(done.correction.fields)}"
+        if done is not NOTHING:
+            stats.replayed_ticks += done.replayed
+            stats.repredictions += done.repredicted
+            world.picture.smooth(done, now)
+            if done.correction:
+                stats.corrected(done.correction)
+                self._events.append(done.correction)
+                if done.correction.cause == NONDETERMINISM:
+                    world.wrong = f"own {', '.join(done.correction.fields)}"
         if not world.wrong:
             return False
         stats.divergences += 1
@@ -171,16 +180,15 @@ class Play:
         first = max(self.newest, confirmed) + 1  # an input for the past would only be late
         self.newest = max(to, first - 1)
         if to >= first:
+            clock, phase = self.world.clock, timeline.phase
             for tick in range(first, to + 1):
                 prediction.file(tick, wish)
-                self._phases.put(tick, timeline.phase)
-            clock = self.world.clock
+                self._phases.put(tick, phase)
             stats.inputs_sent += to + 1 - first
             stats.rtt_s = clock.rtt_s
-            stats.lead_ticks = timeline.phase - clock.phase
+            stats.lead_ticks = phase - clock.phase
             stats.lead_s = stats.lead_ticks / clock.rate
-            row = bytes(part & 0xFF for part in wish)
-            inputs.append(Inputs(first, confirmed, row * (to + 1 - first)))
+            inputs.append(Inputs(first, confirmed, row(wish) * (to + 1 - first)))
         while prediction.predicted.tick < self.newest - prediction.ahead:
             prediction.step()
         return inputs

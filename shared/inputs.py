@@ -33,6 +33,12 @@ def make_input(x: float = 0.0, y: float = 0.0, *, jump: bool = False, buttons: i
     return clamp(Input(rounded(x * MOVE_MAX), rounded(y * MOVE_MAX), buttons | (JUMP if jump else 0)))
 
 
+def row(wish: Input) -> bytes:
+    """An input as it goes over the wire, in `Inputs.rows`."""
+    x, y, buttons = wish
+    return bytes((x & 0xFF, y & 0xFF, buttons & 0xFF))
+
+
 def clamp(wish: Input) -> Input:
     """`wish` with its move intent shortened to length 127 in whole numbers (the one rule for both sides)."""
     x, y = wish.move_x, wish.move_y

@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from shared.inputs import JUMP, MOVE_MAX, NEUTRAL, Input, clamp, make_input
+from shared.inputs import JUMP, MOVE_MAX, NEUTRAL, Input, clamp, make_input, row
 
 BYTES = range(-128, 128)
 
@@ -21,6 +21,11 @@ def test_every_wish_that_fits_into_its_record_comes_out_no_longer_than_full_spee
             assert short.buttons == 3
             if x * x + y * y <= MOVE_MAX**2:
                 assert short == Input(x, y, 3)
+
+
+def test_a_row_holds_signed_moves_and_the_buttons() -> None:
+    assert row(Input(-1, 127, 255)) == b"\xff\x7f\xff"
+    assert row(NEUTRAL) == bytes(3)
 
 
 def test_clamping_twice_is_clamping_once() -> None:
