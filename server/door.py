@@ -60,7 +60,8 @@ class Door:
         self._figures = figures
         self._origins = frozenset(origin.rstrip("/").lower() for origin in origins)
         self._closing = closing
-        self._total = 0
+        self.total = 0
+        """Connections that have come and not gone."""
         self._by_network: Counter[str] = Counter()
         self._joins = math.inf  # that is: the whole burst
         self._joins_at = 0.0
@@ -68,20 +69,20 @@ class Door:
     def arrive(self, address: str) -> bool:
         """A connection has come from an address; if False, drop it at once (and do not call `leave`)."""
         limits, network = self.limits, network_of(address)
-        if self._total >= limits.connections_max + SPARE:
+        if self.total >= limits.connections_max + SPARE:
             self.refused["connections"] += 1
             return False
         if self._limited(address) and self._by_network[network] >= limits.connections_per_address + SPARE_PER_ADDRESS:
             self.refused["address"] += 1
             return False
-        self._total += 1
+        self.total += 1
         self._by_network[network] += 1
         return True
 
     def leave(self, address: str) -> None:
         """A connection that had arrived is gone."""
         network = network_of(address)
-        self._total -= 1
+        self.total -= 1
         self._by_network[network] -= 1
         if not self._by_network[network]:
             del self._by_network[network]
@@ -102,7 +103,7 @@ class Door:
             return "closing", line(HTTPStatus.SERVICE_UNAVAILABLE, "the server is going down", retry_after=retry)
         if not self._welcome(request):
             return "origin", line(HTTPStatus.FORBIDDEN, f"not from pages of {str(request.origin)[:100]}")
-        if self._total > limits.connections_max:
+        if self.total > limits.connections_max:
             reason = f"the server is full ({limits.connections_max} connections)"
             return "connections", line(HTTPStatus.SERVICE_UNAVAILABLE, reason, retry_after=RETRY_S)
         if self._limited(address):

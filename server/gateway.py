@@ -29,6 +29,7 @@ from websockets.server import ServerProtocol
 
 from server.door import Door, Request
 from server.faults import Faults
+from server.handshakes import Guest, Handshakes
 from server.pages import Page
 from shared.messages import CLIENT_MESSAGE_MAX
 
@@ -101,7 +102,7 @@ class Gateway:
         self.door = door or Door()
         self.faults = faults or Faults()
         self.connections: set[Connection] = set()
-        self._server: asyncio.Server | None = None
+        self._server: asyncio.Server | Handshakes | None = None
         self._fewer: asyncio.Event = asyncio.Event()
         self._closing = False
 
@@ -112,14 +113,11 @@ class Gateway:
             OSError: the address cannot be used.
         """
         loop = asyncio.get_running_loop()
-        self._server = await loop.create_server(
-            lambda: Connection(self, loop),
-            host,
-            port,
-            backlog=ACCEPT_BACKLOG,
-            ssl=tls,
-            ssl_handshake_timeout=self.door.limits.handshake_s if tls else None,
-        )
+        if tls is None:
+            self._server = await loop.create_server(lambda: Connection(self, loop), host, port, backlog=ACCEPT_BACKLOG)
+        else:
+            self._server = Handshakes(lambda: Connection(self, loop), tls, self.door.limits.handshake_s)
+            await self._server.listen(host, port, ACCEPT_BACKLOG)
         sockets = self._server.sockets
         address = sockets[0].getsockname()
         # A name with several addresses has a port of its own on each if the system picked them.
@@ -150,7 +148,7 @@ class Gateway:
         self._fewer.set()
 
 
-class Connection(asyncio.Protocol):
+class Connection(Guest):
     """One accepted socket; to the game it is a `server.session.Link`."""
 
     def __init__(self, gateway: Gateway, loop: asyncio.AbstractEventLoop) -> None:
@@ -204,11 +202,9 @@ class Connection(asyncio.Protocol):
         self._transport = cast("asyncio.Transport", transport)
         self._gateway.made(self)
         peer = transport.get_extra_info("peername")
-        address = str(peer[0]) if peer else ""
-        if not self._gateway.door.arrive(address):
+        if self._address is None and not self.enter(str(peer[0]) if peer else ""):
             self.abort()
             return
-        self._address = address
         self._abort_in(self._gateway.door.limits.handshake_s)
         sock = transport.get_extra_info("socket")
         self._fd = sock.fileno()
@@ -244,12 +240,23 @@ class Connection(asyncio.Protocol):
         if self._timer is not None:
             self._timer.cancel()
         self._transport = None
-        if self._address is not None:
-            self._gateway.door.leave(self._address)
+        self.leave()
         self._gateway.gone(self)
         self._lose()
 
     # -- inside --------------------------------------------------------------------------------------------
+
+    def enter(self, address: str) -> bool:
+        """See `Guest`."""
+        if self._gateway.door.arrive(address):
+            self._address = address
+        return self._address is not None
+
+    def leave(self) -> None:
+        """See `Guest`."""
+        if self._address is not None:
+            self._gateway.door.leave(self._address)
+            self._address = None
 
     def abort(self) -> None:
         if self._transport is not None:

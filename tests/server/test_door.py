@@ -40,7 +40,7 @@ def test_what_has_left_leaves_nothing_behind() -> None:
         address = f"10.0.{n >> 8}.{n & 255}"
         assert door.arrive(address)
         door.leave(address)
-    assert (door._total, len(door._by_network)) == (0, 0)
+    assert (door.total, len(door._by_network)) == (0, 0)
 
 
 def test_all_connections_together_have_a_limit() -> None:

@@ -1,0 +1,142 @@
+"""TLS over real loopback sockets: a connection counts before its handshake, and no longer than it lasts."""
+
+import asyncio
+import ssl
+from collections.abc import AsyncIterator, Callable
+
+import pytest
+import pytest_asyncio
+import trustme
+
+from server import handshakes
+from server.door import SPARE_PER_ADDRESS, Door
+from server.gateway import Gateway
+from server.limits import Limits
+
+TIME_OUT_S = 30.0
+ALLOWED = 3
+ALL = ALLOWED + SPARE_PER_ADDRESS
+
+
+class Silent:
+    """A game in which nothing happens."""
+
+    def open(self, link: object, now: float) -> None: ...
+
+    def receive(self, session: object, data: bytes, now: float) -> None: ...
+
+    def lost(self, session: object, now: float) -> None: ...
+
+
+@pytest.fixture(scope="module")
+def authority() -> trustme.CA:
+    return trustme.CA()
+
+
+@pytest.fixture
+def context(authority: trustme.CA) -> ssl.SSLContext:
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+    authority.issue_cert("127.0.0.1").configure_cert(context)
+    return context
+
+
+@pytest.fixture
+def trust(authority: trustme.CA) -> ssl.SSLContext:
+    trust = ssl.create_default_context()
+    authority.configure_trust(trust)
+    return trust
+
+
+@pytest_asyncio.fixture
+async def gateway() -> AsyncIterator[Gateway]:
+    gateway = Gateway(Silent(), Door(Limits(connections_per_address=ALLOWED, loopback_exempt=False)))
+    yield gateway
+    gateway.stop_listening()
+
+
+async def until(condition: Callable[[], bool]) -> None:
+    async with asyncio.timeout(TIME_OUT_S):
+        while not condition():  # noqa: ASYNC110 - any condition, not one event
+            await asyncio.sleep(0.001)
+
+
+async def page(address: tuple[str, int], trust: ssl.SSLContext) -> bytes:
+    """The first line of the answer to a request."""
+    async with asyncio.timeout(TIME_OUT_S):
+        reader, writer = await asyncio.open_connection(*address, ssl=trust)
+        writer.write(b"GET /healthz HTTP/1.1\r\nHost: x\r\n\r\n")
+        line = await reader.readline()
+        await reader.read()
+        writer.close()
+    return line
+
+
+async def test_who_only_opens_the_socket_counts_until_it_goes(
+    gateway: Gateway, context: ssl.SSLContext, trust: ssl.SSLContext
+) -> None:
+    address = await gateway.listen("127.0.0.1", 0, context)
+    silent = [await asyncio.open_connection(*address) for _ in range(ALL + 2)]
+    async with asyncio.timeout(TIME_OUT_S):
+        assert [await reader.read() for reader, _ in silent[ALL:]] == [b""] * 2
+    assert gateway.door.refused == {"address": 2}
+    with pytest.raises(ConnectionError):
+        await page(address, trust)
+    for _, writer in silent:
+        writer.close()
+    await until(lambda: gateway.door.total == 0)
+    assert await page(address, trust) == b"HTTP/1.1 200 OK\r\n"
+    await until(lambda: gateway.door.total == 0)
+
+
+async def test_a_handshake_has_a_limit_and_rubbish_is_none(
+    gateway: Gateway, context: ssl.SSLContext, trust: ssl.SSLContext
+) -> None:
+    gateway.door.limits = Limits(handshake_s=0.2)
+    address = await gateway.listen("127.0.0.1", 0, context)
+    peers = [await asyncio.open_connection(*address) for _ in range(4)]
+    for (_, writer), first in zip(peers, (b"", b"\x16\x03\x01", b"GET / HTTP/1.1\r\n\r\n", bytes(100)), strict=True):
+        writer.write(first)
+    async with asyncio.timeout(TIME_OUT_S):
+        for reader, writer in peers:
+            await reader.read()
+            writer.close()
+    await until(lambda: gateway.door.total == 0)
+    assert await page(address, trust) == b"HTTP/1.1 200 OK\r\n"
+
+
+async def test_the_end_cuts_handshakes_off(gateway: Gateway, context: ssl.SSLContext) -> None:
+    address = await gateway.listen("127.0.0.1", 0, context)
+    reader, writer = await asyncio.open_connection(*address)
+    await until(lambda: gateway.door.total == 1)
+    gateway.stop_listening()
+    async with asyncio.timeout(TIME_OUT_S):
+        assert await reader.read() == b""
+    writer.close()
+    assert gateway.door.total == 0
+    with pytest.raises(ConnectionError):
+        await asyncio.open_connection(*address)
+
+
+async def test_trouble_in_accepting_is_told_and_passes(
+    gateway: Gateway, context: ssl.SSLContext, trust: ssl.SSLContext, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(handshakes, "AGAIN_S", 0.0)
+    loop, told = asyncio.get_running_loop(), list[str]()
+    loop.set_exception_handler(lambda _, context: told.append(context["message"]))
+    real, failures = loop.sock_accept, [OSError(24, "Too many open files"), ConnectionAbortedError()]
+
+    async def accept(listener: object) -> object:
+        if failures:
+            raise failures.pop()
+        return await real(listener)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(loop, "sock_accept", accept)
+    address = await gateway.listen("127.0.0.1", 0, context)
+    assert await page(address, trust) == b"HTTP/1.1 200 OK\r\n"
+    assert told == ["cannot accept a connection"]
+
+
+async def test_a_busy_port_is_an_os_error(gateway: Gateway, context: ssl.SSLContext) -> None:
+    address = await gateway.listen("127.0.0.1", 0, context)
+    with pytest.raises(OSError, match=r"in use"):
+        await Gateway(Silent()).listen(*address, context)
