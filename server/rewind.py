@@ -18,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from server.rays import Ray
-from shared import layout
+from shared import kernels, layout
 from shared.checks import Cell, Vec, finite, vector
 from shared.layout import ID, TEMPLATE, Int64s, X
 from shared.scene import Scene
@@ -68,6 +68,9 @@ class Rewind:
         self._alive = 0
         self._now = np.zeros((0, len(KEPT)), np.int64)
         self._begin()
+        kernel = kernels.compiled() if world.compiled else kernels.PLAIN
+        matrix, told = (kernels.lent(array, world.compiled) for array in (world.matrix, self._now))
+        self._recall = kernels.direct(kernel.recall, matrix, told, told, told, 0)
 
     def record(self) -> None:
         """Takes in what the step has changed."""
@@ -80,9 +83,9 @@ class Rewind:
             more = np.zeros((2 * len(matrix), len(KEPT)), np.int64)
             more[: len(self._now)] = self._now
             self._now = more
-        before, new = self._now[rows], matrix[rows][:, KEPT]
-        self._now[rows] = new
-        self._alive += int(np.count_nonzero(new[:, 0])) - int(np.count_nonzero(before[:, 0]))
+        before = np.empty((len(rows), len(KEPT)), np.int64)
+        flat = (kernels.lent(array, world.compiled) for array in (matrix, rows, self._now, before))
+        self._alive += self._recall(*flat, len(rows))
         if self._alive != len(world):  # some have been removed
             gone = np.flatnonzero(self._now[: len(matrix), 0] != matrix[:, ID])
             rows, before = np.concatenate((rows, gone)), np.concatenate((before, self._now[gone]))
@@ -121,7 +124,7 @@ class Rewind:
         """Knows the present and no past."""
         self._undo.clear()
         self._tick = self._world.tick
-        self._now = self._world.matrix[:, KEPT]
+        self._now = np.ascontiguousarray(self._world.matrix[:, KEPT])
         self._alive = len(self._world)
 
 

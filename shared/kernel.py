@@ -115,6 +115,7 @@ MOVES = 2 * MOVE_MAX + 1
 IN_SEGMENT = (1 << TO_SEGMENT) - 1
 HEAD = 5
 """Bytes of the head of a turn on the wire."""
+ALL_EVENTS = (1 << EVENT_BITS) - 1
 
 
 # -- looking things up ---------------------------------------------------------------------------------------
@@ -919,3 +920,143 @@ def alike(a: Any, n: int, b: Any, m: int, entity: int, reach: int, always: Any) 
                 return False
         i += 1
         j += 1
+
+
+# -- what the wire is told -----------------------------------------------------------------------------------
+
+
+@inlined
+def ahead(e: Any, a: int, b: int) -> int:
+    """How far the segment of the state at `a` is behind that of the one at `b`, in their order; 0: it is the same."""
+    for k in (Z, Y, X):
+        by: int = (e[a + k] >> TO_SEGMENT) - (e[b + k] >> TO_SEGMENT)
+        if by != 0:
+            return by
+    return 0
+
+
+@inlined
+def wire(packed: Any, at: int, value: int, size: int) -> int:
+    """Writes a whole number as `size` bytes, the lowest first; where they end."""
+    for k in range(size):
+        packed[at + k] = value >> 8 * k & 255
+    return at + size
+
+
+@jit
+def news(e: Any, rows: Any, n: int, tick: int, every: int, ids: Any, parts: Any, due: Any, packed: Any) -> Any:
+    """What has happened to entities, by segment, as it is packed in `shared.snapshot`.
+
+    Args:
+        rows: [n] of all that have changed.
+        tick: for which segments are due: each once in `every` ticks.
+        ids: [n] gets those to which something happened, segment by segment, those that are sent whole last.
+        parts: [n * 8] gets each segment's index, then where in `ids` those sent whole begin, and end; and where in
+            `packed` its heads, tails and rows end.
+        due: [n * 3] gets the index of each segment that is due, once for each that has changed there.
+        packed: [n * 33] gets the bytes.
+
+    Returns:
+        How many numbers have gone to `parts` and to `due`.
+    """
+    told = n_parts = n_due = 0
+    for i in range(n):
+        at = rows[i] << WIDTH_SHIFT
+        if e[at + ID] == 0:
+            continue
+        x = e[at + X] >> TO_SEGMENT
+        y = e[at + Y] >> TO_SEGMENT
+        z = e[at + Z] >> TO_SEGMENT
+        if (x + 3 * y + 5 * z + tick) % every == 0:
+            due[n_due] = x
+            due[n_due + 1] = y
+            due[n_due + 2] = z
+            n_due += 3
+        if e[at + CHANGED] & ALL_EVENTS != 0:
+            ids[told] = at
+            told += 1
+
+    gap = 1
+    while gap < told:
+        gap = 3 * gap + 1
+    while gap > 1:  # Shell's way of sorting: a thousand in 0.1 ms
+        gap //= 3
+        for i in range(gap, told):
+            at = ids[i]
+            key = (e[at + CHANGED] & WHOLE) << ROW_BITS | e[at + ID]
+            to = i
+            while to >= gap:
+                other = ids[to - gap]
+                by = ahead(e, other, at)
+                if by < 0 or (by == 0 and (e[other + CHANGED] & WHOLE) << ROW_BITS | e[other + ID] < key):
+                    break
+                ids[to] = other
+                to -= gap
+            ids[to] = at
+
+    start = 0
+    end = 0
+    to = 0
+    while start < told:
+        first = ids[start]
+        while end < told and e[ids[end] + CHANGED] & WHOLE == 0 and ahead(e, ids[end], first) == 0:
+            to = wire(packed, to, e[ids[end] + ID], 4)
+            to = wire(packed, to, e[ids[end] + CHANGED] & ALL_EVENTS, 1)
+            end += 1
+        parts[n_parts] = e[first + X] >> TO_SEGMENT
+        parts[n_parts + 1] = e[first + Y] >> TO_SEGMENT
+        parts[n_parts + 2] = e[first + Z] >> TO_SEGMENT
+        parts[n_parts + 3] = end
+        parts[n_parts + 5] = to
+        for i in range(start, end):
+            at = ids[i]
+            if e[at + CHANGED] & TOLD != 0:
+                for k in range(MOVE_X, CELL):
+                    to = wire(packed, to, e[at + k], 1)
+            for k in range(3):
+                if e[at + CHANGED] & STOP_X << k != 0:
+                    to = wire(packed, to, e[at + X + k] & IN_SEGMENT, 4)
+        parts[n_parts + 6] = to
+        while end < told and ahead(e, ids[end], first) == 0:
+            at = ids[end]
+            to = wire(packed, to, e[at + ID], 4)
+            to = wire(packed, to, e[at + TEMPLATE], 1)
+            to = wire(packed, to, e[at + FLAGS] & ~AWAKE, 1)
+            for k in range(X, VX):
+                to = wire(packed, to, e[at + k] & IN_SEGMENT, 4)
+            for k in range(VX, MOVE_X):
+                to = wire(packed, to, e[at + k], 4)
+            for k in range(MOVE_X, CELL):
+                to = wire(packed, to, e[at + k], 1)
+            end += 1
+        parts[n_parts + 4] = end
+        parts[n_parts + 7] = to
+        n_parts += 8
+        for i in range(start, end):
+            ids[i] = e[ids[i] + ID]
+        start = end
+    return n_parts, n_due
+
+
+# -- what was before -----------------------------------------------------------------------------------------
+
+
+@jit
+def recall(e: Any, rows: Any, known: Any, before: Any, n: int) -> int:
+    """Brings what is kept of `n` rows up to date; by how many more are in use.
+
+    Args:
+        known: [rows * 5] of each row id, template, x, y, z.
+        before: [n * 5] gets what it was.
+    """
+    more = to = 0
+    for i in range(n):
+        at = rows[i] << WIDTH_SHIFT
+        was = 5 * rows[i]
+        more += int(e[at + ID] != 0) - int(known[was] != 0)
+        for column in (ID, TEMPLATE, X, Y, Z):
+            before[to] = known[was]
+            known[was] = e[at + column]
+            to += 1
+            was += 1
+    return more

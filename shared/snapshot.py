@@ -37,8 +37,6 @@ from shared.checks import Cell
 from shared.layout import (
     BUTTONS,
     CELL,
-    CHANGED,
-    EVENT_BITS,
     FALLING,
     ID,
     MOVE_X,
@@ -48,8 +46,6 @@ from shared.layout import (
     TEMPLATE,
     TOLD,
     TURN,
-    VX,
-    WHOLE,
     Int64s,
     X,
 )
@@ -63,6 +59,7 @@ ROW = np.dtype(
     + [("move_x", "i1"), ("move_y", "i1"), ("buttons", "u1")]
 )
 ROW_BYTES = ROW.itemsize
+FLAGS_AT = 5
 ROW_BY_SIZE = np.dtype([("id", "<u4"), ("kind", "u1", 2), ("place", "<i4", 6), ("move", "i1", 2), ("buttons", "u1")])
 """The same bytes in runs of equal size, each of which is converted at once."""
 COLUMNS_BY_SIZE = (
@@ -128,36 +125,68 @@ def encode_rows(rows: Int64s, acted: Collection[int] = ()) -> bytes:
     return packed.tobytes()
 
 
+class Share(NamedTuple):
+    """What has happened in a segment: the ids to which, those of them that are sent `whole`, and the fields `heads`,
+    `tails` and `rows`."""
+
+    segment: Cell
+    ids: list[int]
+    whole: list[int]
+    packed: tuple[bytes, bytes, bytes]
+
+
 class News:
-    """What has happened to entities in a tick, packed all at once; a segment's share is a slice of that.
+    """Packs what has happened to entities in a tick, all at once; what it needs of memory serves for the next, too.
 
     Args:
-        rows: [n, 16], in the order of segments; those to which nothing happened are left out already.
-        acted: ids that the rules placed or threw.
+        world: stepped elsewhere.
+        check_ticks: how often a segment in which something changes is due.
     """
 
-    def __init__(self, rows: Int64s, acted: Collection[int]) -> None:
-        events = rows[:, CHANGED] & (1 << EVENT_BITS) - 1
-        whole = events >= WHOLE
-        self._rows = encode_rows(rows[whole], acted)
-        events[whole] = 0
-        heads = np.empty(len(rows) - np.count_nonzero(whole), HEAD)
-        heads["id"], heads["events"] = rows[~whole, ID], events[~whole]
-        tails = np.empty(len(rows), TAIL)
-        tails["move"], tails["buttons"] = rows[:, MOVE_X:BUTTONS], rows[:, BUTTONS]
-        tails["place"] = rows[:, X:VX] & (SIDE - 1)
-        keep = TAILS_KEEP[events]
-        self._heads, self._tails = heads.tobytes(), tails.view(np.uint8).reshape(keep.shape)[keep].tobytes()
-        self._rows_at = [0, *np.cumsum(whole).tolist()]
-        self._tails_at = [0, *np.cumsum(np.count_nonzero(keep, axis=1)).tolist()]
+    def __init__(self, world: World, check_ticks: int) -> None:
+        self._world, self._check_ticks = world, check_ticks
+        self._allocate(32)
+        kernel = kernels.compiled() if world.compiled else kernels.PLAIN
+        arrays = self._ids, self._parts, self._due, self._packed
+        matrix = kernels.lent(world.matrix, world.compiled)
+        self._news = kernels.direct(kernel.news, matrix, self._ids, 0, 0, 1, *arrays)
 
-    def share(self, start: int, stop: int) -> tuple[bytes, bytes, bytes]:
-        """The fields `heads`, `tails` and `rows` for some of the rows."""
-        first, end = self._rows_at[start], self._rows_at[stop]
-        return (
-            self._heads[(start - first) * HEAD.itemsize : (stop - end) * HEAD.itemsize],
-            self._tails[self._tails_at[start] : self._tails_at[stop]],
-            self._rows[first * ROW_BYTES : end * ROW_BYTES],
+    def pack(self, acted: Collection[int]) -> tuple[list[Share], set[Cell]]:
+        """What there is to tell of the entities that the latest step changed, and the segments of them that are due.
+
+        Args:
+            acted: ids that the rules placed or threw.
+        """
+        world = self._world
+        rows = world.changed_rows
+        if len(rows) > self._room:
+            self._allocate(2 * len(rows))
+        n_parts, n_due = self._news(
+            kernels.lent(world.matrix, world.compiled), kernels.lent(rows, world.compiled), len(rows),
+            world.tick, self._check_ticks, self._ids, self._parts, self._due, self._packed,
+        )  # fmt: skip
+        shares: list[Share] = []
+        start = at = 0
+        parts = self._parts[:n_parts].tolist()
+        for i in range(0, n_parts, 8):
+            x, y, z, whole, end, heads, tails, stop = parts[i : i + 8]
+            ids = self._ids[start:end].tolist()
+            for row, entity in enumerate(ids[whole - start :] if acted else ()):
+                if entity in acted:
+                    self._packed[tails + row * ROW_BYTES + FLAGS_AT] |= ACTED
+            packed = self._packed[at:stop].tobytes()
+            fields = packed[: heads - at], packed[heads - at : tails - at], packed[tails - at :]
+            shares.append(Share((x, y, z), ids, ids[whole - start :], fields))
+            start, at = end, stop
+        due = self._due[:n_due].tolist()
+        return shares, {(due[i], due[i + 1], due[i + 2]) for i in range(0, n_due, 3)}
+
+    def _allocate(self, room: int) -> None:
+        """Makes room for so many entities."""
+        self._room = room
+        self._ids, self._parts, self._due, self._packed = (
+            kernels.lent(np.empty(room * numbers, kind), self._world.compiled)
+            for numbers, kind in ((1, np.int64), (8, np.int64), (3, np.int64), (ROW_BYTES, np.uint8))
         )
 
 

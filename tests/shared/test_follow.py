@@ -1,31 +1,39 @@
 """What goes on as it did is not told: a world that is told only what happens is the one that is stepped, bit by bit."""
 
 import random
+import struct
+from types import SimpleNamespace
 from typing import Any
 
 import msgpack
 import numpy as np
 import pytest
 
-from shared.checks import SceneError
+from shared.checks import Cell, SceneError
 from shared.inputs import NEUTRAL, Input
 from shared.layout import (
     BUTTONS,
+    CELL,
     CHANGED,
+    COLUMNS,
     EVENT_BITS,
     FALL,
+    FLAGS,
     GO_X,
+    ID,
     LAUNCH,
     MOVE_X,
     STOP_X,
     STOP_Z,
+    TEMPLATE,
     TOLD,
+    VX,
     WHOLE,
     Int64s,
     X,
 )
 from shared.scene import Scene, load_scene
-from shared.snapshot import News, decode_parts, join_part
+from shared.snapshot import News, decode_parts, encode_rows, join_part
 from shared.units import BLOCK, SEGMENT
 from shared.world import OverlapError, World
 from tests.worlds import EAST, JUMP, WEST, build, floor, steps
@@ -38,6 +46,7 @@ class Told:
 
     def __init__(self, world: World) -> None:
         self.world = world
+        self.packs = News(world, 1)
         self.other = World(world.scene, compiled=world.compiled)
         self.other.put(world.states())
         self.other.rebase(world.tick)
@@ -45,18 +54,10 @@ class Told:
 
     def tell(self) -> None:
         """What the latest step has made of the world goes over the wire, segment by segment."""
-        rows = self.world.changed
-        self.turns += len(rows)
-        rows = rows[rows[:, CHANGED] & (1 << EVENT_BITS) - 1 != 0]
-        self.news += len(rows)
-        cells = rows[:, X : X + 3] // SIDE
-        order = np.lexsort(cells.T)
-        rows, cells = rows[order], cells[order]
-        news = News(rows, ())
-        parts = []
-        for cell in sorted(set(map(tuple, cells.tolist()))):
-            inside = np.flatnonzero((cells == cell).all(axis=1))
-            parts.append(join_part(cell, 1, news.share(int(inside[0]), int(inside[-1]) + 1)))
+        self.turns += len(self.world.changed)
+        shares, _ = self.packs.pack(())
+        self.news += sum(len(share.ids) for share in shares)
+        parts = [join_part(share.segment, 1, share.packed) for share in shares]
         self.bytes += sum(map(len, parts))
         templates = len(self.world.scene.templates)
         _, states, turns = decode_parts(list(map(msgpack.unpackb, parts)), templates, compiled=self.world.compiled)
@@ -172,6 +173,47 @@ def test_holding_a_course_costs_nothing(compiled: bool) -> None:
     told.tell()
     assert told.bytes == 17, "5 for the part, 7 for the head, 5 for the tail"
     told.check()
+
+
+@pytest.mark.parametrize("n", [0, 1, 2, 40, 1500])
+def test_news_are_packed_in_the_order_of_ids_segment_by_segment(n: int, compiled: bool) -> None:
+    rng = np.random.default_rng(n)
+    matrix = np.zeros((n + 50, len(COLUMNS)), np.int64)
+    rows = rng.permutation(n + 50)[:n]
+    matrix[rows, ID] = rng.choice(np.arange(1, 1 << 20), n, replace=False)
+    matrix[rows, TEMPLATE : FLAGS + 1] = rng.integers(0, 3, (n, 2))
+    matrix[rows, X:VX] = rng.integers(-2 * SIDE, 2 * SIDE, (n, 3))
+    matrix[rows, VX:MOVE_X] = rng.integers(-(1 << 30), 1 << 30, (n, 3))
+    matrix[rows, MOVE_X:CELL] = rng.integers(-127, 128, (n, 3))
+    matrix[rows, BUTTONS] &= 255
+    matrix[rows, CHANGED] = 7 << EVENT_BITS | rng.integers(0, 2 * WHOLE, n) * rng.integers(0, 2, n)
+    changed = np.concatenate((rows, np.flatnonzero(matrix[:, ID] == 0)[:20]))  # some are gone since they changed
+    acted = set(matrix[rows[::3], ID].tolist())
+    world = SimpleNamespace(matrix=matrix, changed_rows=changed, tick=7, compiled=compiled)
+    shares, due = News(world, 4).pack(acted)  # type: ignore[arg-type]
+    told: dict[Cell, list[Int64s]] = {}
+    everywhere: set[Cell] = set()
+    for row in sorted(matrix[rows], key=lambda row: int(row[ID])):
+        x, y, z = (row[X:VX] // SIDE).tolist()
+        everywhere.add((x, y, z))
+        if row[CHANGED] & 2 * WHOLE - 1:
+            told.setdefault((x, y, z), []).append(row)
+    assert due == {(x, y, z) for x, y, z in everywhere if (x + 3 * y + 5 * z + 7) % 4 == 0}
+    assert {share.segment for share in shares} == told.keys()
+    assert len(shares) == len(told)
+    for segment, ids, whole, packed in shares:
+        heads = tails = b""
+        sent_whole = [row for row in told[segment] if row[CHANGED] & WHOLE]
+        for row in told[segment]:
+            events = int(row[CHANGED]) & 2 * WHOLE - 1
+            if events < WHOLE:
+                heads += struct.pack("<IB", row[ID], events)
+                tails += struct.pack("<bbB", *row[MOVE_X:CELL]) if events & TOLD else b""
+                for axis in range(3):
+                    tails += struct.pack("<i", row[X + axis] % SIDE) if events & STOP_X << axis else b""
+        assert packed == (heads, tails, encode_rows(np.array(sent_whole).reshape(-1, len(COLUMNS)), acted))
+        assert whole == [row[ID] for row in sent_whole]
+        assert sorted(ids) == [row[ID] for row in told[segment]]
 
 
 # -- what no server says -------------------------------------------------------------------------------------
