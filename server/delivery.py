@@ -37,11 +37,9 @@ class Delivery:
 
     def serve(self, session: Session, now: float) -> None:
         """Sends a session the tick that has been recorded, if its path has room."""
-        centre = self._log.segment(session.entity)
-        near = session.sight.near
+        pacing, near, centre = session.pacing, session.sight.near, self._log.segment(session.entity)
         if not near or near[0] != centre:
             self._look_around(session, centre)
-        pacing = session.pacing
         window = pacing.window(session.snapshot_bytes, self._tick_s, now)
         if session.acked < 0:
             window = max(window, self._limits.first_bytes)
@@ -100,21 +98,20 @@ class Delivery:
             self.forget(session)
         drops = np.array(sight.drops, "<i4").tobytes() if sight.drops else b""
         n, parts = sight.take(self._log, tick, room)
-        verdicts, player = b"", session.player
+        player, verdicts = session.player, b""
         assert player is not None
         if player.verdicts:
             verdicts = np.array(player.verdicts[: messages.VERDICTS_MAX], VERDICT).tobytes()
             del player.verdicts[: messages.VERDICTS_MAX]
-        first = tick - len(inputs.fates) + 1
-        header = (tick, inputs.newest, inputs.margins.tobytes(), first, bytes(inputs.fates), verdicts, drops)
+        margins, fates = inputs.told()
+        header = (tick, inputs.newest, margins, tick - len(fates) + 1, fates, verdicts, drops)
         message = messages.join_snapshot(header, n, parts)
         session.send(message)
         session.pacing.sent(tick)
         session.tick = tick
-        session.snapshot_bytes = len(message)
-        inputs.told()
+        size = session.snapshot_bytes = len(message)
         self._counters.snapshots_sent += 1
-        self._counters.snapshot_bytes += len(message)
+        self._counters.snapshot_bytes += size
 
     def _send_terrain(self, session: Session, room: int) -> None:
         """Terrain behind the snapshot, as far as it fits into what may be on the way.

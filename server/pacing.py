@@ -133,12 +133,14 @@ class Pacing:
             self._measure_at = now + SAMPLE_S
             self.look()
             self._measure(tick_s, now)
-        window = self._carries if self._narrow else max(2 * snapshot_bytes, self._carries)
-        if not measure and self.outstanding + snapshot_bytes > window:
+        window = self._carries
+        if not self._narrow and 2 * snapshot_bytes > window:
+            window = 2 * snapshot_bytes
+        if not measure and self.sent_bytes - self._taken + snapshot_bytes > window:
             self.look()
         if self._pauses:
             return 0
-        held = self.outstanding > window
+        held = self.sent_bytes - self._taken > window
         if held:
             self._full_at = now
         if held or self._held:

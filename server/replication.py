@@ -9,7 +9,7 @@ or has just begun to see the segment, gets a keyframe. Nothing is computed per e
 from collections import defaultdict
 from collections.abc import Mapping
 from itertools import accumulate
-from typing import Any, NamedTuple
+from typing import Any
 
 import msgpack
 
@@ -51,18 +51,17 @@ class _Tick:
         return self.gone.keys() | self.edited.keys() | self.said.keys()
 
 
-class _Span(NamedTuple):
-    """The ticks after some tick, the segments in which anything changed, and those with `more`."""
-
-    ticks: list[_Tick]
-    segments: set[Cell]
-    more: set[Cell]
-
-
 class Parts(dict[Cell, bytes]):
-    """The encoded changes after one tick, each made when it is asked for first."""
+    """The encoded changes after one tick, each made when it is asked for first.
 
-    def __init__(self, log: "ChangeLog", since: int) -> None:
+    Args:
+        ticks: those after that tick.
+        changed: the segments in which anything changed in them: of all others the part is empty.
+        more: those of which there is more to tell than rows.
+    """
+
+    def __init__(self, log: "ChangeLog", since: int, ticks: list[_Tick], changed: set[Cell], more: set[Cell]) -> None:
+        self.ticks, self.changed, self.more = ticks, changed, more
         self._log, self._since = log, since
         self._together: dict[Cell, tuple[tuple[Cell, ...], int, bytes]] = {}
 
@@ -83,7 +82,7 @@ class Parts(dict[Cell, bytes]):
         """
         made = self._together.get(segments[0])
         if made is None or made[0] is not segments:
-            parts = [part for segment in segments if (part := self[segment])]
+            parts = [part for segment in segments if segment in self.changed and (part := self[segment])]
             made = self._together[segments[0]] = segments, len(parts), b"".join(parts)
         return made[1], made[2]
 
@@ -113,7 +112,6 @@ class ChangeLog:
         self._home: dict[int, Cell] = {
             entity: (x, y, z) for entity, (x, y, z) in zip(states[:, ID].tolist(), homes, strict=True)
         }
-        self._spans: dict[int, _Span] = {}
         self._parts: dict[int, Parts] = {}
         self._packed: dict[Cell, tuple[int, bytes]] = {}
         self._packs_left = PACKS_PER_TICK
@@ -172,22 +170,27 @@ class ChangeLog:
         self._ticks.put(self._world.tick, now)
         self._now = _Tick()
         self._parts.clear()
-        self._spans.clear()
         self._packs_left = PACKS_PER_TICK
 
     def since(self, since: int) -> Parts:
         """Each segment's encoded changes after tick `since`, `KEYFRAME` or at most `HISTORY` ago; empty: none."""
         parts = self._parts.get(since)
         if parts is None:
-            parts = self._parts[since] = Parts(self, since)
+            newest = self._world.tick
+            assert since == KEYFRAME or newest - since <= HISTORY, "lost track"
+            first = (newest if since == KEYFRAME else since) + 1  # a keyframe needs none of them
+            ticks = [tick for at in range(first, newest + 1) if (tick := self._ticks.get(at)) is not None]
+            more = set().union(*(tick.more() for tick in ticks))
+            changed = more.union(self._due, *(tick.changed for tick in ticks))
+            parts = self._parts[since] = Parts(self, since, ticks, changed, more)
         return parts
 
     def encode(self, segment: Cell, since: int) -> bytes:
         """A part, made anew: ask `since` for one that is shared."""
         if since == KEYFRAME:
             return self._keyframe(segment)
-        span = self._span(since)
-        return self._changes(segment, since, span) if segment in span.segments else b""
+        known = self.since(since)
+        return self._changes(segment, since, known) if segment in known.changed else b""
 
     def packed(self, segment: Cell) -> bytes | None:
         """A segment's blocks as they are, packed; None: that has to wait for another tick."""
@@ -200,17 +203,6 @@ class ChangeLog:
             known = self._packed[segment] = (digest, pack(self._world.blocks.segment(segment)))
         return known[1]
 
-    def _span(self, since: int) -> _Span:
-        span = self._spans.get(since)
-        if span is None:
-            newest = self._world.tick
-            assert newest - since <= HISTORY, "lost track"
-            ticks = [tick for at in range(since + 1, newest + 1) if (tick := self._ticks.get(at)) is not None]
-            more = set().union(*(tick.more() for tick in ticks))
-            changed = more.union(self._due, *(tick.changed for tick in ticks))
-            span = self._spans[since] = _Span(ticks, changed, more)
-        return span
-
     def _keyframe(self, segment: Cell) -> bytes:
         if segment in self._world.blocks:
             rows = self._world.in_segment(segment)
@@ -219,12 +211,12 @@ class ChangeLog:
             rows = self._world.rows(sorted(strays))
         return encode_part(segment, KEYFRAME, rows, attributes=self._of(rows[:, ID].tolist()))
 
-    def _changes(self, segment: Cell, since: int, span: _Span) -> bytes:
+    def _changes(self, segment: Cell, since: int, known: Parts) -> bytes:
         due = segment in self._due and segment in self._world.blocks
         check = checksum(self._world, segment) if due else 0
-        ticks = span.ticks
+        ticks = known.ticks
         ago, news = self._world.tick - since, self._share(segment, since, ticks)
-        if segment not in span.more:
+        if segment not in known.more:
             return join_part(segment, ago, news, check=check)
         gone = {entity for tick in ticks for entity in tick.gone.get(segment, ()) if self._home.get(entity) != segment}
         edited = {offset for tick in ticks for offset in tick.edited.get(segment, ())}

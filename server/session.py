@@ -73,7 +73,9 @@ class InputQueue:
             if at <= self.newest:  # a duplicate, or an order that TCP cannot produce
                 self.refused += 1
             else:
-                self._reached(at)
+                if self.first < 0 or at > self.newest + 1:
+                    self._skipped(at)
+                self.newest = at
                 self.margins.append(self._filed(at, rows[start : start + INPUT_ROW_BYTES], tick, ahead))
             at += 1
         if len(self.margins) > FATES_MAX:
@@ -93,13 +95,12 @@ class InputQueue:
             margin = min(margin, -1)
         return margin if abs(margin) < -MARGIN_REFUSED else max(MARGIN_REFUSED + 1, min(margin, -MARGIN_REFUSED - 1))
 
-    def _reached(self, at: int) -> None:
-        """`at` is the newest from here on: ticks left out get a margin each, so that they can be counted off."""
-        if self.newest < 0:
+    def _skipped(self, at: int) -> None:
+        """The tick `at` is the first, or some before it are left out: each gets a margin, to count them off by."""
+        if self.first < 0:
             self.first = at
-        elif at > self.newest + 1:
+        else:
             self.margins.extend([MARGIN_REFUSED] * min(at - self.newest - 1, FATES_MAX))
-        self.newest = at
 
     def take(self, tick: int) -> Input:
         """The input for a tick whose time has come."""
@@ -118,10 +119,12 @@ class InputQueue:
             del self.fates[0]
         return NEUTRAL if fate == NEUTRALISED else self._held
 
-    def told(self) -> None:
-        """Margins and fates have been sent."""
+    def told(self) -> tuple[bytes, bytes]:
+        """Margins and fates as they go over the wire, which count as sent."""
+        margins, fates = self.margins.tobytes(), bytes(self.fates)
         del self.margins[:]
         self.fates.clear()
+        return margins, fates
 
 
 class Player:

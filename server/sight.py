@@ -71,7 +71,7 @@ class Sight:
         if not (self._behind or self._fresh or self.drops):  # as nearly always
             n, plain = known.together(self.near)
             for segment in self._rest:
-                if part := known[segment]:
+                if segment in known.changed and (part := known[segment]):
                     n += 1
                     plain += part
             if len(plain) <= room:

@@ -26,7 +26,7 @@ class Log:
 
 class Parts:
     def __init__(self, log: Log, since: int) -> None:
-        self.log, self.since = log, since
+        self.log, self.since, self.changed = log, since, ROW
 
     def __getitem__(self, segment: Cell) -> bytes:
         self.log.asked.append((segment, self.since))
