@@ -943,6 +943,21 @@ def wire(packed: Any, at: int, value: int, size: int) -> int:
     return at + size
 
 
+@inlined
+def wire_state(packed: Any, to: int, e: Any, at: int) -> int:
+    """Writes the whole state at `at`; where it ends."""
+    to = wire(packed, to, e[at + ID], 4)
+    to = wire(packed, to, e[at + TEMPLATE], 1)
+    to = wire(packed, to, e[at + FLAGS] & ~AWAKE, 1)
+    for k in range(X, VX):
+        to = wire(packed, to, e[at + k] & IN_SEGMENT, 4)
+    for k in range(VX, MOVE_X):
+        to = wire(packed, to, e[at + k], 4)
+    for k in range(MOVE_X, CELL):
+        to = wire(packed, to, e[at + k], 1)
+    return to
+
+
 @jit
 def news(e: Any, rows: Any, n: int, tick: int, every: int, ids: Any, parts: Any, due: Any, packed: Any) -> Any:
     """What has happened to entities, by segment, as it is packed in `shared.snapshot`.
@@ -1018,16 +1033,7 @@ def news(e: Any, rows: Any, n: int, tick: int, every: int, ids: Any, parts: Any,
                     to = wire(packed, to, e[at + X + k] & IN_SEGMENT, 4)
         parts[n_parts + 6] = to
         while end < told and ahead(e, ids[end], first) == 0:
-            at = ids[end]
-            to = wire(packed, to, e[at + ID], 4)
-            to = wire(packed, to, e[at + TEMPLATE], 1)
-            to = wire(packed, to, e[at + FLAGS] & ~AWAKE, 1)
-            for k in range(X, VX):
-                to = wire(packed, to, e[at + k] & IN_SEGMENT, 4)
-            for k in range(VX, MOVE_X):
-                to = wire(packed, to, e[at + k], 4)
-            for k in range(MOVE_X, CELL):
-                to = wire(packed, to, e[at + k], 1)
+            to = wire_state(packed, to, e, ids[end])
             end += 1
         parts[n_parts + 4] = end
         parts[n_parts + 7] = to
@@ -1036,6 +1042,28 @@ def news(e: Any, rows: Any, n: int, tick: int, every: int, ids: Any, parts: Any,
             ids[i] = e[ids[i] + ID]
         start = end
     return n_parts, n_due
+
+
+@jit
+def muster(e: Any, heads: Any, keys: Any, packed: Any, segment: int) -> int:
+    """Packs the whole state of all in the segment of a row, ascending by id; how many bytes.
+
+    Args:
+        keys: [entities] is written to.
+        packed: [entities * 33] gets the bytes.
+    """
+    n = 0
+    for cell in range(segment << CELLS_SHIFT, (segment + 1) << CELLS_SHIFT):
+        row = heads[cell]
+        while row >= 0:
+            at = row << WIDTH_SHIFT
+            push(keys, n, e[at + ID] << ROW_BITS | row)
+            n += 1
+            row = e[at + NEXT]
+    to = 0
+    for left in range(n, 0, -1):
+        to = wire_state(packed, to, e, (pop(keys, left) & ROW_MASK) << WIDTH_SHIFT)
+    return to
 
 
 # -- what was before -----------------------------------------------------------------------------------------

@@ -225,8 +225,12 @@ def join_part(
 
 def checksum(world: World, segment: Cell) -> int:
     """A number from 1 on for all of a loaded segment as it is: entities and blocks."""
-    rows = encode_rows(world.in_segment(segment))
-    return zlib.crc32(world.blocks.digest(segment).to_bytes(8, "little") + rows) or 1
+    kernel = kernels.compiled() if world.compiled else kernels.PLAIN
+    keys, packed = np.empty(len(world), np.int64), np.empty(len(world) * ROW_BYTES, np.uint8)
+    arrays = (kernels.lent(array, world.compiled) for array in (world.matrix, world.blocks.heads, keys, packed))
+    end = kernel.muster(*arrays, world.blocks.rows[segment])
+    blocks = zlib.crc32(world.blocks.digest(segment).to_bytes(8, "little"))
+    return zlib.crc32(packed[:end].data, blocks) or 1
 
 
 def decode_parts(

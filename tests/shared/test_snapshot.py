@@ -1,5 +1,6 @@
 """One segment's part: lossless for any legal state, and refused for anything that could harm a world."""
 
+import random
 import zlib
 from typing import Any
 
@@ -11,6 +12,7 @@ from hypothesis import strategies as st
 
 from shared.blocks import BLOCKS, PACKED_MAX, pack, unpack
 from shared.checks import Cell
+from shared.inputs import Input
 from shared.layout import CELL, FALLING, FLAGS, ID, MOVE_X, STOP_Y, TEMPLATE, TOLD, TURN, VX, X
 from shared.messages import ENTITY_MAX, TICK_MAX, ProtocolError
 from shared.snapshot import ACTED, FIELDS, ROW, SIDE, SegmentPart, checksum, decode_parts, encode_part, encode_rows
@@ -129,6 +131,22 @@ def test_who_was_acted_upon_is_flagged_and_nobody_else() -> None:
     _, decoded, _ = decode_parts([msgpack.unpackb(encode_part((0, 0, 0), 0, rows, acted={5, 9}))], 255)
     assert [flags & ACTED for flags in decoded[:, FLAGS].tolist()] == [0, ACTED, 0]
     assert (decoded[:, FLAGS] & FALLING).tolist() == [1, 1, 1]
+
+
+def test_a_checksum_is_that_of_the_blocks_and_the_rows_ascending_by_id(compiled: bool) -> None:
+    rng = random.Random(4)
+    world = build([[-9, -9, -32, 9, 9, -31, 3]], compiled=compiled)
+    segments = sorted(world.blocks)
+    for entity in range(1, 120):
+        world.spawn("ghost", (rng.uniform(-30, 30), rng.uniform(-30, 30), rng.uniform(-28, 28)))
+        if entity % 3 == 0:
+            world.remove(entity - 1)
+        world.step({entity: Input(rng.randint(-127, 127), -1, 1)})
+        segment = segments[entity % len(segments)]
+        rows = world.in_segment(segment)
+        packed = world.blocks.digest(segment).to_bytes(8, "little") + encode_rows(rows)
+        assert checksum(world, segment) == zlib.crc32(packed)
+    assert min(len(world.in_segment(segment)) for segment in segments) > 1
 
 
 def test_a_checksum_is_of_all_a_segment_holds_and_of_nothing_else() -> None:
