@@ -68,7 +68,7 @@ class Rewind:
         self._alive = 0
         self._now = np.zeros((0, len(KEPT)), np.int64)
         self._begin()
-        kernel = kernels.compiled() if world.compiled else kernels.PLAIN
+        kernel = kernels.of(world.compiled)
         matrix, told = (kernels.lent(array, world.compiled) for array in (world.matrix, self._now))
         self._recall = kernels.direct(kernel.recall, matrix, told, told, told, 0)
 

@@ -40,11 +40,7 @@ from shared.layout import (
     FALLING,
     ID,
     MOVE_X,
-    STOP_X,
-    STOP_Y,
-    STOP_Z,
     TEMPLATE,
-    TOLD,
     TURN,
     Int64s,
     X,
@@ -67,11 +63,6 @@ COLUMNS_BY_SIZE = (
     (BUTTONS, "buttons"),
 )  # fmt: skip
 HEAD = np.dtype([("id", "<u4"), ("events", "u1")])
-TAIL = np.dtype([("move", "i1", 2), ("buttons", "u1"), ("place", "<i4", 3)])
-TAILS_KEEP = np.array(
-    [np.repeat([bool(events & part) for part in (TOLD, STOP_X, STOP_Y, STOP_Z)], (3, 4, 4, 4)) for events in range(256)]
-)
-"""Which bytes of its `TAIL` an entity has, by its events."""
 VERDICT = np.dtype([("number", "<u4"), ("verdict", "u1")])
 EDIT = np.dtype([("block", "<u2"), ("kind", "u1")])
 NO_EDITS = np.zeros(0, EDIT)
@@ -146,7 +137,7 @@ class News:
     def __init__(self, world: World, check_ticks: int) -> None:
         self._world, self._check_ticks = world, check_ticks
         self._allocate(32)
-        kernel = kernels.compiled() if world.compiled else kernels.PLAIN
+        kernel = kernels.of(world.compiled)
         arrays = self._ids, self._parts, self._due, self._packed
         matrix = kernels.lent(world.matrix, world.compiled)
         self._news = kernels.direct(kernel.news, matrix, self._ids, 0, 0, 1, *arrays)
@@ -225,7 +216,7 @@ def join_part(
 
 def checksum(world: World, segment: Cell) -> int:
     """A number from 1 on for all of a loaded segment as it is: entities and blocks."""
-    kernel = kernels.compiled() if world.compiled else kernels.PLAIN
+    kernel = kernels.of(world.compiled)
     keys, packed = np.empty(len(world), np.int64), np.empty(len(world) * ROW_BYTES, np.uint8)
     arrays = (kernels.lent(array, world.compiled) for array in (world.matrix, world.blocks.heads, keys, packed))
     end = kernel.muster(*arrays, world.blocks.rows[segment])
