@@ -45,10 +45,9 @@ class Hit(NamedTuple):
 
 
 class _Undo(NamedTuple):
-    """What a tick has changed, as it was before: rows of the matrix, and blocks."""
+    """What a tick has changed, as it was before: rows of the matrix ([n, 6], each after its number), and blocks."""
 
     rows: Int64s
-    before: Int64s  # [n, 5]
     blocks: dict[Cell, int]
 
 
@@ -68,9 +67,8 @@ class Rewind:
         self._alive = 0
         self._now = np.zeros((0, len(KEPT)), np.int64)
         self._begin()
-        kernel = kernels.of(world.compiled)
-        matrix, told = (kernels.lent(array, world.compiled) for array in (world.matrix, self._now))
-        self._recall = kernels.direct(kernel.recall, matrix, told, told, told, 0)
+        w, now = world.arrays, kernels.lent(self._now, world.compiled)
+        self._recall = kernels.direct(kernels.of(world.compiled).recall, w.entities, w.changed, now, now, 0)
 
     def record(self) -> None:
         """Takes in what the step has changed."""
@@ -78,20 +76,21 @@ class Rewind:
         if world.tick != self._tick + 1:  # it has been put elsewhere in time
             self._begin()
             return
-        matrix, rows = world.matrix, world.changed_rows
-        if len(self._now) < len(matrix):
-            more = np.zeros((2 * len(matrix), len(KEPT)), np.int64)
-            more[: len(self._now)] = self._now
-            self._now = more
-        before = np.empty((len(rows), len(KEPT)), np.int64)
-        flat = (kernels.lent(array, world.compiled) for array in (matrix, rows, self._now, before))
-        self._alive += self._recall(*flat, len(rows))
+        w = world.arrays
+        more = (len(w.entities) >> layout.WIDTH_SHIFT) - len(self._now)
+        if more > 0:
+            self._now = np.concatenate((self._now, np.zeros((more, len(KEPT)), np.int64)))
+        n = int(w.lengths[layout.N_CHANGED])
+        rows = np.empty((n, 1 + len(KEPT)), np.int64)
+        now, before = kernels.lent(self._now, world.compiled), kernels.lent(rows, world.compiled)
+        self._alive += self._recall(w.entities, w.changed, now, before, n)
         if self._alive != len(world):  # some have been removed
+            matrix = world.matrix
             gone = np.flatnonzero(self._now[: len(matrix), 0] != matrix[:, ID])
-            rows, before = np.concatenate((rows, gone)), np.concatenate((before, self._now[gone]))
+            rows = np.concatenate((rows, np.column_stack((gone, self._now[gone]))))
             self._now[gone] = 0
             self._alive = len(world)
-        self._undo.append(_Undo(rows, before, world.edited))
+        self._undo.append(_Undo(rows, world.edited))
         self._tick = world.tick
 
     def at(self, seen: float, own: int = 0) -> "Past":
@@ -114,7 +113,7 @@ class Rewind:
             if back == self._tick - first - 1:
                 after = states.copy()
             undo = self._undo[-1 - back]
-            states[undo.rows] = undo.before
+            states[undo.rows[:, 0]] = undo.rows[:, 1:]
             blocks |= undo.blocks
         share = seen - first
         entities = _between(states, states if after is None or not share else after, share)

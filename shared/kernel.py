@@ -959,11 +959,12 @@ def wire_state(packed: Any, to: int, e: Any, at: int) -> int:
 
 
 @jit
-def news(e: Any, rows: Any, n: int, tick: int, every: int, ids: Any, parts: Any, due: Any, packed: Any) -> Any:
+def news(
+    e: Any, changed: Any, lengths: Any, tick: int, every: int, ids: Any, parts: Any, due: Any, packed: Any
+) -> tuple[int, int]:
     """What has happened to entities, by segment, as it is packed in `shared.snapshot`.
 
     Args:
-        rows: [n] of all that have changed.
         tick: for which segments are due: each once in `every` ticks.
         ids: [n] gets those to which something happened, segment by segment, those that are sent whole last.
         parts: [n * 8] gets each segment's index, then where in `ids` those sent whole begin, and end; and where in
@@ -975,8 +976,8 @@ def news(e: Any, rows: Any, n: int, tick: int, every: int, ids: Any, parts: Any,
         How many numbers have gone to `parts` and to `due`.
     """
     told = n_parts = n_due = 0
-    for i in range(n):
-        at = rows[i] << WIDTH_SHIFT
+    for i in range(lengths[N_CHANGED]):
+        at = changed[i] << WIDTH_SHIFT
         if e[at + ID] == 0:
             continue
         x = e[at + X] >> TO_SEGMENT
@@ -1070,21 +1071,19 @@ def muster(e: Any, heads: Any, keys: Any, packed: Any, segment: int) -> int:
 
 
 @jit
-def recall(e: Any, rows: Any, known: Any, before: Any, n: int) -> int:
-    """Brings what is kept of `n` rows up to date; by how many more are in use.
+def recall(e: Any, changed: Any, known: Any, before: Any, n: int) -> int:
+    """Brings what is kept of the `n` rows that have changed up to date; by how many more entities are there.
 
     Args:
         known: [rows * 5] of each row id, template, x, y, z.
-        before: [n * 5] gets what it was.
+        before: [n * 6] gets each row, and what was kept of it.
     """
-    more = to = 0
+    more = 0
     for i in range(n):
-        at = rows[i] << WIDTH_SHIFT
-        was = 5 * rows[i]
-        more += int(e[at + ID] != 0) - int(known[was] != 0)
-        for column in (ID, TEMPLATE, X, Y, Z):
-            before[to] = known[was]
-            known[was] = e[at + column]
-            to += 1
-            was += 1
+        row = changed[i]
+        more += int(e[(row << WIDTH_SHIFT) + ID] != 0) - int(known[5 * row] != 0)
+        before[6 * i] = row
+        for k in range(5):
+            before[6 * i + 1 + k] = known[5 * row + k]
+            known[5 * row + k] = e[(row << WIDTH_SHIFT) + (k if k < 2 else k + 1)]
     return more

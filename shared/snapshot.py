@@ -136,11 +136,9 @@ class News:
 
     def __init__(self, world: World, check_ticks: int) -> None:
         self._world, self._check_ticks = world, check_ticks
-        self._allocate(32)
-        kernel = kernels.of(world.compiled)
-        arrays = self._ids, self._parts, self._due, self._packed
-        matrix = kernels.lent(world.matrix, world.compiled)
-        self._news = kernels.direct(kernel.news, matrix, self._ids, 0, 0, 1, *arrays)
+        self._allocate(len(world.arrays.changed))
+        w, mine = world.arrays, (self._ids, self._parts, self._due, self._packed)
+        self._news = kernels.direct(kernels.of(world.compiled).news, w.entities, w.changed, w.lengths, 0, 1, *mine)
 
     def pack(self, acted: Collection[int]) -> tuple[list[Share], set[Cell]]:
         """What there is to tell of the entities that the latest step changed, and the segments of them that are due.
@@ -148,14 +146,11 @@ class News:
         Args:
             acted: ids that the rules placed or threw.
         """
-        world = self._world
-        rows = world.changed_rows
-        if len(rows) > self._room:
-            self._allocate(2 * len(rows))
-        n_parts, n_due = self._news(
-            kernels.lent(world.matrix, world.compiled), kernels.lent(rows, world.compiled), len(rows),
-            world.tick, self._check_ticks, self._ids, self._parts, self._due, self._packed,
-        )  # fmt: skip
+        w, tick = self._world.arrays, self._world.tick
+        if len(w.changed) > len(self._ids):
+            self._allocate(len(w.changed))
+        mine = self._ids, self._parts, self._due, self._packed
+        n_parts, n_due = self._news(w.entities, w.changed, w.lengths, tick, self._check_ticks, *mine)
         shares: list[Share] = []
         start = at = 0
         parts = self._parts[:n_parts].tolist()
@@ -174,7 +169,6 @@ class News:
 
     def _allocate(self, room: int) -> None:
         """Makes room for so many entities."""
-        self._room = room
         self._ids, self._parts, self._due, self._packed = (
             kernels.lent(np.empty(room * numbers, kind), self._world.compiled)
             for numbers, kind in ((1, np.int64), (8, np.int64), (3, np.int64), (ROW_BYTES, np.uint8))
@@ -218,8 +212,8 @@ def checksum(world: World, segment: Cell) -> int:
     """A number from 1 on for all of a loaded segment as it is: entities and blocks."""
     kernel = kernels.of(world.compiled)
     keys, packed = np.empty(len(world), np.int64), np.empty(len(world) * ROW_BYTES, np.uint8)
-    arrays = (kernels.lent(array, world.compiled) for array in (world.matrix, world.blocks.heads, keys, packed))
-    end = kernel.muster(*arrays, world.blocks.rows[segment])
+    mine = kernels.lent(keys, world.compiled), kernels.lent(packed, world.compiled)
+    end = kernel.muster(world.arrays.entities, world.arrays.heads, *mine, world.blocks.rows[segment])
     blocks = zlib.crc32(world.blocks.digest(segment).to_bytes(8, "little"))
     return zlib.crc32(packed[:end].data, blocks) or 1
 

@@ -159,6 +159,11 @@ class World:
         return rows
 
     @property
+    def arrays(self) -> Arrays:
+        """All that the kernel works on, as it lies now: to be read, by other functions of it."""
+        return self._arrays
+
+    @property
     def next_id(self) -> int:
         """The id of the next entity to be spawned.
 

@@ -9,6 +9,7 @@ import msgpack
 import numpy as np
 import pytest
 
+from shared import kernels
 from shared.checks import Cell, SceneError
 from shared.inputs import NEUTRAL, Input
 from shared.layout import (
@@ -22,7 +23,9 @@ from shared.layout import (
     GO_X,
     ID,
     LAUNCH,
+    LENGTHS,
     MOVE_X,
+    N_CHANGED,
     STOP_X,
     STOP_Z,
     TEMPLATE,
@@ -189,7 +192,11 @@ def test_news_are_packed_in_the_order_of_ids_segment_by_segment(n: int, compiled
     matrix[rows, CHANGED] = 7 << EVENT_BITS | rng.integers(0, 2 * WHOLE, n) * rng.integers(0, 2, n)
     changed = np.concatenate((rows, np.flatnonzero(matrix[:, ID] == 0)[:20]))  # some are gone since they changed
     acted = set(matrix[rows[::3], ID].tolist())
-    world = SimpleNamespace(matrix=matrix, changed_rows=changed, tick=7, compiled=compiled)
+    lengths = np.zeros(LENGTHS, np.int64)
+    lengths[N_CHANGED] = len(changed)
+    lists = {"entities": matrix, "changed": np.append(changed, 0), "lengths": lengths}
+    arrays = SimpleNamespace(**{name: kernels.lent(each, compiled) for name, each in lists.items()})
+    world = SimpleNamespace(arrays=arrays, tick=7, compiled=compiled)
     shares, due = News(world, 4).pack(acted)  # type: ignore[arg-type]
     told: dict[Cell, list[Int64s]] = {}
     everywhere: set[Cell] = set()
