@@ -283,7 +283,7 @@ SERVER_KINDS = frozenset({4, 17, 18, 19, 20, 21, 22})
 _KIND_OF = {kind: number for number, (kind, _) in KINDS.items()}
 _INPUTS_HEAD = bytes((0x94, _KIND_OF[Inputs]))
 _SNAPSHOT_HEAD, _SNAPSHOT_KIND = b"\xdc", bytes((_KIND_OF[Snapshot],))
-_pack: Callable[[Any], bytes] = msgpack.Packer().pack
+pack: Callable[[Any], bytes] = msgpack.Packer().pack
 """Half the time of `msgpack.packb`, which makes a packer and its buffer anew for each message."""
 
 
@@ -291,13 +291,13 @@ def encode(message: Message) -> bytes:
     """One message as bytes."""
     kind = _KIND_OF[type(message)]
     fields = (*message[:-1], *message.segments) if isinstance(message, Snapshot) else message
-    return _pack((kind, *fields))
+    return pack((kind, *fields))
 
 
 def join_snapshot(header: tuple[int, int, bytes, int, bytes, bytes, bytes], segments: int, parts: bytes) -> bytes:
     """A snapshot from its first seven fields and so many segments' parts, encoded already (shared by many clients)."""
     n = 1 + len(header) + segments
-    fields = _pack(header)[1:]  # without their own head, which is one byte
+    fields = pack(header)[1:]  # without their own head, which is one byte
     return b"".join((_SNAPSHOT_HEAD, n.to_bytes(2, "big"), _SNAPSHOT_KIND, fields, parts))
 
 

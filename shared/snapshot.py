@@ -29,7 +29,6 @@ import zlib
 from collections.abc import Collection, Sequence
 from typing import Any, NamedTuple
 
-import msgpack
 import numpy as np
 
 from shared import kernels
@@ -45,7 +44,7 @@ from shared.layout import (
     Int64s,
     X,
 )
-from shared.messages import ENTITY_MAX, ProtocolError, shown
+from shared.messages import ENTITY_MAX, ProtocolError, pack, shown
 from shared.units import BLOCK, SEGMENT
 from shared.world import World
 
@@ -205,7 +204,7 @@ def join_part(
     fields = [*news, packed_gone, check, packed_edits, attributes]
     while fields and not fields[-1]:
         del fields[-1]
-    return msgpack.packb((*segment, ago, *fields))  # type: ignore[no-any-return]
+    return pack((*segment, ago, *fields))
 
 
 def checksum(world: World, segment: Cell) -> int:

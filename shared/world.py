@@ -153,12 +153,6 @@ class World:
         return view
 
     @property
-    def changed_rows(self) -> layout.Int64s:
-        """The rows of `matrix` that hold, or held, what `changed` lists. A copy."""
-        rows: layout.Int64s = self._changed[: self._lengths[layout.N_CHANGED]].copy()
-        return rows
-
-    @property
     def arrays(self) -> Arrays:
         """All that the kernel works on, as it lies now: to be read, by other functions of it."""
         return self._arrays
@@ -181,7 +175,8 @@ class World:
     @property
     def fell(self) -> list[int]:
         """The entities that the latest step left below the scene's floor."""
-        return [int(entity) for entity in self._fell[: self._lengths[layout.N_FELL]]]
+        fell: list[int] = self._fell[: self._lengths[layout.N_FELL]].tolist()
+        return fell
 
     def in_segment(self, index: Cell) -> layout.Int64s:
         """The entities whose position lies in a loaded segment, [n, 16], ascending by id. A copy.
