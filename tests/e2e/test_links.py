@@ -63,7 +63,7 @@ class Link:
     policy: Callable[[int], Policy]
 
 
-DIP_S, DIP_RATE = (4.0, 9.0), 28e3
+DIP_S, DIP_RATE = (4.0, 9.0), 25e3
 LINKS = {
     "typical": Link(PRESETS["typical"], 9.0, lambda turn: Wander(random.Random(turn))),
     # Too narrow for a snapshot in every tick.
@@ -130,8 +130,9 @@ class Figures:
 
     def __str__(self) -> str:
         return (
-            f"{self.snapshots_share:6.1%} of the snapshots, age {self.age_ms(0.5):4.0f} / {self.age_ms(0.99):4.0f} / "
-            f"{self.age_ms(1):4.0f} ms, {self.late_share:5.2%} late, {self.substituted:3d} substituted, "
+            f"{self.snapshots_share:6.1%} of the snapshots, {self.skipped:3d} skipped, "
+            f"age {self.age_ms(0.5):4.0f} / {self.age_ms(0.99):4.0f} / {self.age_ms(1):4.0f} ms, "
+            f"{self.late_share:5.2%} late, {self.substituted:3d} substituted, "
             f"lead {self.lead_ticks:4.1f} ticks, rtt {self.rtt_ms:3.0f} ms, corrections {dict(self.corrections)}"
         )
 
