@@ -12,7 +12,7 @@ from shared.layout import FALLING, FLAGS, ID, Int64s, X
 from shared.messages import ProtocolError, Snapshot
 from shared.scene import Scene
 from shared.snapshot import ACTED, KEYFRAME, SegmentPart, checksum, decode_parts
-from shared.units import BLOCK_SHIFT, SEGMENT, SEGMENT_SHIFT
+from shared.units import SEGMENT, TO_SEGMENT
 from shared.world import World
 
 FOLLOW_MAX = 64
@@ -99,7 +99,7 @@ class Confirmed:
     def grounded(self) -> bool:
         """Whether the blocks of every segment that exists around the own entity are there."""
         place = self.world.state(self.entity)[X : X + 3]
-        x, y, z = (part >> (BLOCK_SHIFT + SEGMENT_SHIFT) for part in place)
+        x, y, z = (part >> TO_SEGMENT for part in place)
         around = {(x + i, y + j, z + k) for i in (-1, 0, 1) for j in (-1, 0, 1) for k in (-1, 0, 1)}
         return all(segment in self.world.blocks for segment in around & self._exist)
 
@@ -131,7 +131,7 @@ class Confirmed:
 
     def _take_away(self, parts: list[SegmentPart], drops: set[Cell], here: set[int]) -> None:
         """Removes who is gone, or was in a segment that is not seen any more or sent whole, and is not `here`."""
-        segments = (self.states[:, X : X + 3] >> (BLOCK_SHIFT + SEGMENT_SHIFT)).tolist()
+        segments = (self.states[:, X : X + 3] >> TO_SEGMENT).tolist()
         whole = drops | {part.segment for part in parts if part.ago == KEYFRAME}
         gone = {(part.segment, entity) for part in parts for entity in part.gone}
         for entity, (x, y, z) in zip(self.states[:, ID].tolist(), segments, strict=True):

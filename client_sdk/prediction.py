@@ -23,7 +23,7 @@ import numpy as np
 
 from client_sdk.confirmed import Confirmed
 from client_sdk.events import Corrected
-from shared import edits, kernels
+from shared import bulk, edits, kernels
 from shared.edits import Edit
 from shared.inputs import NEUTRAL, Input
 from shared.layout import COLUMNS, ID, Int64s, X
@@ -86,7 +86,7 @@ class Prediction:
         ahead = np.array([template.shown == "predicted" for template in templates], np.int64)
         self._shown_ahead = kernels.lent(ahead, compiled)
         states = kernels.lent(known.states, compiled)
-        self._alike = kernels.direct(kernels.of(compiled).alike, states, 0, states, 0, 0, 0, self._shown_ahead)
+        self._alike = kernels.direct(kernels.of(bulk, compiled).alike, states, 0, states, 0, 0, 0, self._shown_ahead)
         self._edits: dict[int, tuple[int, Edit]] = {}  # by number, with its tick; until there is a verdict
         self._refused = False  # an edit that was carried out in the last replay has been, since
         self._compared = -1

@@ -18,7 +18,7 @@ from shared.checks import Cell
 from shared.inputs import Input, make_input
 from shared.layout import CELL, Int64s, X
 from shared.scene import Scene, load_scene
-from shared.units import BLOCK_SHIFT, SEGMENT_SHIFT
+from shared.units import TO_SEGMENT
 from shared.world import OverlapError, World
 
 RATE = 20
@@ -100,7 +100,7 @@ class Scenery:
     def seen(self, rows: Int64s) -> Int64s:
         """Those that lie in the segments which the client sees."""
         sees: set[Cell] = self.session.sight.sees
-        cells = (rows[:, X : X + 3] >> (BLOCK_SHIFT + SEGMENT_SHIFT)).tolist()
+        cells = (rows[:, X : X + 3] >> TO_SEGMENT).tolist()
         seen: Int64s = rows[np.array([tuple(cell) in sees for cell in cells], bool)]
         return seen
 

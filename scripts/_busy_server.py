@@ -42,7 +42,7 @@ from shared.layout import X
 from shared.messages import Hello, Ping, Pong, Welcome, decode_from_client, encode, join_snapshot
 from shared.scene import load_scene
 from shared.terrain import generate
-from shared.units import BLOCK_SHIFT, SEGMENT_SHIFT
+from shared.units import TO_SEGMENT
 from shared.world import World
 
 
@@ -225,7 +225,7 @@ VARIANTS: dict[str, tuple[ModuleType, str, Callable[[], Any]]] = {
 
 def in_view(game: Game) -> float:
     """Entities in the segments that a client sees, on average."""
-    cells = game.world.states()[:, X : X + 3] >> (BLOCK_SHIFT + SEGMENT_SHIFT)
+    cells = game.world.states()[:, X : X + 3] >> TO_SEGMENT
     inhabitants = collections.Counter(map(tuple, cells.tolist()))
     views = [sum(inhabitants[segment] for segment in session.sight.sees) for session in game.sessions]
     return sum(views) / max(len(views), 1)

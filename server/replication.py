@@ -19,7 +19,7 @@ from shared.checks import Cell
 from shared.layout import ID, X
 from shared.ring import Ring
 from shared.snapshot import KEYFRAME, News, checksum, encode_part, encode_rows, join_part
-from shared.units import BLOCK_SHIFT, SEGMENT_SHIFT
+from shared.units import TO_SEGMENT
 from shared.world import World
 
 HISTORY = 64
@@ -108,7 +108,7 @@ class ChangeLog:
         self._ticks: Ring[_Tick] = Ring(HISTORY)
         self._now = _Tick()
         states = world.states()
-        homes = (states[:, X : X + 3] >> (BLOCK_SHIFT + SEGMENT_SHIFT)).tolist()
+        homes = (states[:, X : X + 3] >> TO_SEGMENT).tolist()
         self._home: dict[int, Cell] = {
             entity: (x, y, z) for entity, (x, y, z) in zip(states[:, ID].tolist(), homes, strict=True)
         }

@@ -18,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from server.rays import Ray
-from shared import kernels, layout
+from shared import bulk, kernels, layout
 from shared.checks import Cell, Vec, finite, vector
 from shared.layout import ID, TEMPLATE, Int64s, X
 from shared.scene import Scene
@@ -68,7 +68,7 @@ class Rewind:
         self._now = np.zeros((0, len(KEPT)), np.int64)
         self._begin()
         w, now = world.arrays, kernels.lent(self._now, world.compiled)
-        self._recall = kernels.direct(kernels.of(world.compiled).recall, w.entities, w.changed, now, now, 0)
+        self._recall = kernels.direct(kernels.of(bulk, world.compiled).recall, w.entities, w.changed, now, now, 0)
 
     def record(self) -> None:
         """Takes in what the step has changed."""

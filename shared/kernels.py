@@ -1,7 +1,7 @@
-"""One kernel source, two speeds: `PLAIN`, and `compiled()` where Numba is installed.
+"""One source, two speeds: `shared.kernel` and `shared.bulk` as they are, and compiled where Numba is installed.
 
-`shared/kernel.py` is loaded a second time under another name, in which its functions are jitted; so there is
-one source, and neither instance can drift from the other.
+A source is loaded a second time under another name, in which its functions are jitted (`shared.jit`); so there is one
+source, and neither instance can drift from the other.
 """
 
 import contextlib
@@ -14,9 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from shared import kernel
-
-PLAIN: ModuleType = kernel
+from shared.jit import COMPILED
 
 
 def available() -> bool:
@@ -24,9 +22,9 @@ def available() -> bool:
     return importlib.util.find_spec("numba") is not None
 
 
-def of(to_compiled: bool) -> ModuleType:
-    """The one or the other."""
-    return compiled() if to_compiled else PLAIN
+def of(source: ModuleType, to_compiled: bool) -> ModuleType:
+    """The one instance of a source or the other."""
+    return compiled(source) if to_compiled else source
 
 
 @contextlib.contextmanager
@@ -73,14 +71,14 @@ def direct(function: Any, *arguments: Any) -> Any:
 
 
 @functools.cache
-def compiled() -> ModuleType:
-    """The compiled kernel.
+def compiled(source: ModuleType) -> ModuleType:
+    """The compiled instance of a source.
 
     Raises:
         ImportError: Numba is not installed.
     """
-    name = "shared.kernel_compiled"
-    spec = importlib.util.spec_from_file_location(name, kernel.__file__)
+    name = source.__name__ + COMPILED
+    spec = importlib.util.spec_from_file_location(name, source.__file__)
     assert spec is not None
     assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)

@@ -31,7 +31,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from shared import kernels
+from shared import bulk, kernels
 from shared.checks import Cell
 from shared.layout import (
     BUTTONS,
@@ -74,6 +74,7 @@ SIDE = SEGMENT * BLOCK
 FIELDS = ("id", "template", "flags", "x", "y", "z", "vx", "vy", "vz", "move_x", "move_y", "buttons")
 assert len(FIELDS) == CELL == BUTTONS + 1
 assert SIDE & (SIDE - 1) == 0
+assert (HEAD.itemsize, ROW_BYTES) == (bulk.HEAD_BYTES, bulk.ROW_BYTES)
 FAR = 1 << 23
 """No index of a segment is further from 0 along an axis."""
 
@@ -137,7 +138,9 @@ class News:
         self._world, self._check_ticks = world, check_ticks
         self._allocate(len(world.arrays.changed))
         w, mine = world.arrays, (self._ids, self._parts, self._due, self._packed)
-        self._news = kernels.direct(kernels.of(world.compiled).news, w.entities, w.changed, w.lengths, 0, 1, *mine)
+        self._news = kernels.direct(
+            kernels.of(bulk, world.compiled).news, w.entities, w.changed, w.lengths, 0, 1, *mine
+        )
 
     def pack(self, acted: Collection[int]) -> tuple[list[Share], set[Cell]]:
         """What there is to tell of the entities that the latest step changed, and the segments of them that are due.
@@ -209,7 +212,7 @@ def join_part(
 
 def checksum(world: World, segment: Cell) -> int:
     """A number from 1 on for all of a loaded segment as it is: entities and blocks."""
-    kernel = kernels.of(world.compiled)
+    kernel = kernels.of(bulk, world.compiled)
     keys, packed = np.empty(len(world), np.int64), np.empty(len(world) * ROW_BYTES, np.uint8)
     mine = kernels.lent(keys, world.compiled), kernels.lent(packed, world.compiled)
     end = kernel.muster(world.arrays.entities, world.arrays.heads, *mine, world.blocks.rows[segment])
@@ -259,7 +262,7 @@ def _decode_turns(heads: bytes, tails: bytes, compiled: bool) -> Int64s:
 @functools.cache
 def _reading(compiled: bool) -> tuple[Any, Any]:
     """`read_rows` and `read_turns` of a kernel."""
-    kernel, some = kernels.of(compiled), kernels.lent(NO_TURNS, compiled)
+    kernel, some = kernels.of(bulk, compiled), kernels.lent(NO_TURNS, compiled)
     return (
         kernels.direct(kernel.read_rows, b"", some, some, some, 0, some),
         kernels.direct(kernel.read_turns, b"", b"", some),

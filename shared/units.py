@@ -25,6 +25,8 @@ SPEED_MAX = 1024.0
 SEGMENT_SHIFT = 5
 SEGMENT = 1 << SEGMENT_SHIFT
 """Blocks along one side of a world segment."""
+TO_SEGMENT = BLOCK_SHIFT + SEGMENT_SHIFT
+"""A position shifted right by so much is the index of its segment."""
 
 
 def rounded(value: float) -> int:

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from shared import blocks, kernels, layout, terrain
+from shared import blocks, kernel, kernels, layout, terrain
 from shared.checks import Cell, SceneError, whole
 from shared.inputs import Input
 from shared.layout import ENTITY, FALLING, FLAGS, ID, NEXT, PREV, TEMPLATE, VX, Arrays, X
@@ -49,7 +49,7 @@ class World:
         """How many ticks have passed; see `rebase`."""
         self.blocks = blocks.Blocks()
         self.compiled = kernels.available() if compiled is None else compiled
-        self._kernel: Any = kernels.of(self.compiled)
+        self._kernel: Any = kernels.of(kernel, self.compiled)
         self._templates, self._walk, self._parameters = scene.kernel_tables()
         self._row_of: dict[int, int] = {}
         self._next_id = 1

@@ -11,7 +11,7 @@ from server.game import Game
 from server.replication import HISTORY
 from server.session import Session
 from server.warmup import warm_up
-from shared import edits, kernels, messages
+from shared import bulk, edits, kernel, kernels, messages
 from shared.checks import SceneError
 from shared.messages import Bye, Command, Hello, Inputs, Resync, encode
 from shared.scene import load_scene
@@ -21,15 +21,15 @@ pytestmark = pytest.mark.skipif(not kernels.available(), reason="there is nothin
 
 @pytest.fixture
 def cold() -> Iterator[None]:
-    """A kernel of which nothing has been compiled yet in this process."""
+    """Kernels of which nothing has been compiled yet in this process."""
     kernels.compiled.cache_clear()
     yield
     kernels.compiled.cache_clear()
 
 
 def compiled() -> dict[str, int]:
-    """The functions of the kernel that have been called from Python, and for how many kinds of arguments."""
-    functions = vars(kernels.compiled())
+    """The functions of the kernels that have been called from Python, and for how many kinds of arguments."""
+    functions = vars(kernels.compiled(kernel)) | vars(kernels.compiled(bulk))
     found = {name: len(getattr(function, "signatures", ())) for name, function in functions.items()}
     return {name: n for name, n in found.items() if n}
 

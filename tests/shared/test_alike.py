@@ -5,7 +5,7 @@ import random
 import numpy as np
 import pytest
 
-from shared import kernels
+from shared import bulk, kernels
 from shared.layout import CELL, ID, TEMPLATE, Int64s, X
 
 REACH = 10
@@ -46,7 +46,7 @@ def changed(states: Int64s, rng: random.Random) -> Int64s:
 @pytest.mark.parametrize("seed", range(8))
 def test_alike_are_those_whose_rows_that_count_are_equal(seed: int, compiled: bool) -> None:
     rng = random.Random(seed)
-    kernel = kernels.compiled() if compiled else kernels.PLAIN
+    kernel = kernels.of(bulk, compiled)
     found = set()
     for _ in range(200):
         a = drawn(rng)

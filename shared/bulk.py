@@ -1,0 +1,337 @@
+"""States by the dozen: unpacked from the wire, packed for it, compared and kept. Nothing here moves anything.
+
+Like `shared.kernel`, this source runs compiled by Numba and, unchanged, without it: whole numbers, loops and
+comparisons only. How the bytes lie is told in `shared.snapshot`, how entities do in `shared.layout`.
+"""
+
+from typing import Any
+
+from shared.jit import decorators
+from shared.layout import (
+    AWAKE,
+    BUTTONS,
+    CELL,
+    CELLS_SHIFT,
+    CHANGED,
+    EVENT_BITS,
+    FLAGS,
+    ID,
+    MOVE_X,
+    MOVE_Y,
+    N_CHANGED,
+    NEXT,
+    STOP_X,
+    TEMPLATE,
+    TOLD,
+    TURN,
+    VX,
+    WHOLE,
+    WIDTH_SHIFT,
+    X,
+    Y,
+    Z,
+)
+from shared.units import TO_SEGMENT
+
+jit, inlined = decorators(__name__)
+
+IN_SEGMENT = (1 << TO_SEGMENT) - 1
+HEAD_BYTES = 5
+ROW_BYTES = 33
+ALL_EVENTS = (1 << EVENT_BITS) - 1
+ID_BITS = 32
+
+
+# -- unpacking -----------------------------------------------------------------------------------------------
+
+
+@inlined
+def word(data: Any, at: int) -> int:
+    """The four bytes from `at` on as a whole number from 0 on, the lowest first."""
+    return data[at] | data[at + 1] << 8 | data[at + 2] << 16 | data[at + 3] << 24
+
+
+@jit
+def read_turns(heads: bytes, tails: bytes, turns: Any) -> bool:
+    """Unpacks turns (see `shared.snapshot`) to `turns` ([n * 8]); whether `tails` has just what they need."""
+    at = 0
+    for i in range(len(turns) // TURN):
+        to = TURN * i
+        events = heads[HEAD_BYTES * i + 4]
+        turns[to] = word(heads, HEAD_BYTES * i)
+        turns[to + 1] = events
+        for k in range(2, TURN):
+            turns[to + k] = 0
+        if events & TOLD != 0:
+            if at + 3 > len(tails):
+                return False
+            turns[to + 2] = (tails[at] ^ 0x80) - 0x80
+            turns[to + 3] = (tails[at + 1] ^ 0x80) - 0x80
+            turns[to + 4] = tails[at + 2]
+            at += 3
+        for k in range(3):
+            if events & (STOP_X << k) != 0:
+                if at + 4 > len(tails):
+                    return False
+                turns[to + 5 + k] = (word(tails, at) ^ 1 << 31) - (1 << 31)
+                at += 4
+    return at == len(tails)
+
+
+@jit
+def read_rows(rows: bytes, parts: Any, low: Any, high: Any, templates: int, states: Any) -> bool:
+    """Unpacks whole states (see `shared.snapshot`) to `states` ([n * 12]); whether all values are within bounds.
+
+    Of each part, `parts` has the low corner in grid steps, which its positions are counted from, and how many are its.
+    """
+    to = at = 0
+    for part in range(0, len(parts), 4):
+        for _ in range(parts[part + 3]):
+            states[to] = word(rows, at)
+            states[to + TEMPLATE] = rows[at + 4]
+            states[to + FLAGS] = rows[at + 5]
+            for k in range(6):
+                states[to + X + k] = (word(rows, at + 6 + 4 * k) ^ 1 << 31) - (1 << 31)
+            states[to + MOVE_X] = (rows[at + 30] ^ 0x80) - 0x80
+            states[to + MOVE_Y] = (rows[at + 31] ^ 0x80) - 0x80
+            states[to + BUTTONS] = rows[at + 32]
+            for k in range(CELL):
+                if states[to + k] < low[k] or states[to + k] > high[k]:
+                    return False
+            if states[to + TEMPLATE] >= templates:
+                return False
+            for k in range(3):
+                states[to + X + k] += parts[part + k]
+            to += CELL
+            at += ROW_BYTES
+    return True
+
+
+# -- comparing -----------------------------------------------------------------------------------------------
+
+
+@inlined
+def counts(states: Any, at: int, mine: int, reach: int, always: Any) -> bool:
+    """Whether the state at `at` counts for the one at `mine`; -1: for nobody, so it does."""
+    if mine < 0 or always[states[at + TEMPLATE]] != 0:
+        return True
+    return (
+        abs(states[at + X] - states[mine + X]) < reach
+        and abs(states[at + Y] - states[mine + Y]) < reach
+        and abs(states[at + Z] - states[mine + Z]) < reach
+    )
+
+
+@jit
+def alike(a: Any, n: int, b: Any, m: int, entity: int, reach: int, always: Any) -> bool:
+    """Whether two lists of states are the same in all that count for `entity`.
+
+    Those that do are less than `reach` away from it along each axis, or of a template that `always` counts (not 0);
+    where `entity` is not in a list, all of that list do.
+    """
+    mine = -1
+    for i in range(n):
+        if a[CELL * i + ID] == entity:
+            mine = CELL * i
+    own = -1
+    for j in range(m):
+        if b[CELL * j + ID] == entity:
+            own = CELL * j
+    i = j = 0
+    while True:
+        while i < n and not counts(a, CELL * i, mine, reach, always):
+            i += 1
+        while j < m and not counts(b, CELL * j, own, reach, always):
+            j += 1
+        if i == n or j == m:
+            return i == n and j == m
+        for k in range(CELL):
+            if a[CELL * i + k] != b[CELL * j + k]:
+                return False
+        i += 1
+        j += 1
+
+
+# -- packing -------------------------------------------------------------------------------------------------
+
+
+@inlined
+def ahead(e: Any, a: int, b: int) -> int:
+    """How far the segment of the state at `a` is behind that of the one at `b`, in their order; 0: it is the same."""
+    for k in (Z, Y, X):
+        by: int = (e[a + k] >> TO_SEGMENT) - (e[b + k] >> TO_SEGMENT)
+        if by != 0:
+            return by
+    return 0
+
+
+@inlined
+def wire(packed: Any, at: int, value: int, size: int) -> int:
+    """Writes a whole number as `size` bytes, the lowest first; where they end."""
+    for k in range(size):
+        packed[at + k] = value >> 8 * k & 255
+    return at + size
+
+
+@inlined
+def wire_state(packed: Any, to: int, e: Any, at: int) -> int:
+    """Writes the whole state at `at`; where it ends."""
+    to = wire(packed, to, e[at + ID], 4)
+    to = wire(packed, to, e[at + TEMPLATE], 1)
+    to = wire(packed, to, e[at + FLAGS] & ~AWAKE, 1)
+    for k in range(X, VX):
+        to = wire(packed, to, e[at + k] & IN_SEGMENT, 4)
+    for k in range(VX, MOVE_X):
+        to = wire(packed, to, e[at + k], 4)
+    for k in range(MOVE_X, CELL):
+        to = wire(packed, to, e[at + k], 1)
+    return to
+
+
+@jit
+def news(
+    e: Any, changed: Any, lengths: Any, tick: int, every: int, ids: Any, parts: Any, due: Any, packed: Any
+) -> tuple[int, int]:
+    """What has happened to entities, by segment, as it is packed in `shared.snapshot`.
+
+    Args:
+        tick: for which segments are due: each once in `every` ticks.
+        ids: [n] gets those to which something happened, segment by segment, those that are sent whole last.
+        parts: [n * 8] gets each segment's index, then where in `ids` those sent whole begin, and end; and where in
+            `packed` its heads, tails and rows end.
+        due: [n * 3] gets the index of each segment that is due, once for each that has changed there.
+        packed: [n * 33] gets the bytes.
+
+    Returns:
+        How many numbers have gone to `parts` and to `due`.
+    """
+    told = n_parts = n_due = 0
+    for i in range(lengths[N_CHANGED]):
+        at = changed[i] << WIDTH_SHIFT
+        if e[at + ID] == 0:
+            continue
+        x = e[at + X] >> TO_SEGMENT
+        y = e[at + Y] >> TO_SEGMENT
+        z = e[at + Z] >> TO_SEGMENT
+        if (x + 3 * y + 5 * z + tick) % every == 0:
+            due[n_due] = x
+            due[n_due + 1] = y
+            due[n_due + 2] = z
+            n_due += 3
+        if e[at + CHANGED] & ALL_EVENTS != 0:
+            ids[told] = at
+            told += 1
+
+    gap = 1
+    while gap < told:
+        gap = 3 * gap + 1
+    while gap > 1:  # Shell's way of sorting: a thousand in 0.1 ms
+        gap //= 3
+        for i in range(gap, told):
+            at = ids[i]
+            key = (e[at + CHANGED] & WHOLE) << ID_BITS | e[at + ID]
+            to = i
+            while to >= gap:
+                other = ids[to - gap]
+                by = ahead(e, other, at)
+                if by < 0 or (by == 0 and (e[other + CHANGED] & WHOLE) << ID_BITS | e[other + ID] < key):
+                    break
+                ids[to] = other
+                to -= gap
+            ids[to] = at
+
+    start = 0
+    end = 0
+    to = 0
+    while start < told:
+        first = ids[start]
+        while end < told and e[ids[end] + CHANGED] & WHOLE == 0 and ahead(e, ids[end], first) == 0:
+            to = wire(packed, to, e[ids[end] + ID], 4)
+            to = wire(packed, to, e[ids[end] + CHANGED] & ALL_EVENTS, 1)
+            end += 1
+        parts[n_parts] = e[first + X] >> TO_SEGMENT
+        parts[n_parts + 1] = e[first + Y] >> TO_SEGMENT
+        parts[n_parts + 2] = e[first + Z] >> TO_SEGMENT
+        parts[n_parts + 3] = end
+        parts[n_parts + 5] = to
+        for i in range(start, end):
+            at = ids[i]
+            if e[at + CHANGED] & TOLD != 0:
+                for k in range(MOVE_X, CELL):
+                    to = wire(packed, to, e[at + k], 1)
+            for k in range(3):
+                if e[at + CHANGED] & STOP_X << k != 0:
+                    to = wire(packed, to, e[at + X + k] & IN_SEGMENT, 4)
+        parts[n_parts + 6] = to
+        while end < told and ahead(e, ids[end], first) == 0:
+            to = wire_state(packed, to, e, ids[end])
+            end += 1
+        parts[n_parts + 4] = end
+        parts[n_parts + 7] = to
+        n_parts += 8
+        for i in range(start, end):
+            ids[i] = e[ids[i] + ID]
+        start = end
+    return n_parts, n_due
+
+
+@jit
+def sort(keys: Any, n: int) -> None:
+    """Sorts the first `n` whole numbers, Shell's way."""
+    gap = 1
+    while gap < n:
+        gap = 3 * gap + 1
+    while gap > 1:
+        gap //= 3
+        for i in range(gap, n):
+            key = keys[i]
+            to = i
+            while to >= gap and keys[to - gap] > key:
+                keys[to] = keys[to - gap]
+                to -= gap
+            keys[to] = key
+
+
+@jit
+def muster(e: Any, heads: Any, keys: Any, packed: Any, segment: int) -> int:
+    """Packs the whole state of all in the segment of a row, ascending by id; how many bytes.
+
+    Args:
+        keys: [entities] is written to.
+        packed: [entities * 33] gets the bytes.
+    """
+    n = 0
+    for cell in range(segment << CELLS_SHIFT, (segment + 1) << CELLS_SHIFT):
+        row = heads[cell]
+        while row >= 0:
+            at = row << WIDTH_SHIFT
+            keys[n] = e[at + ID] << ID_BITS | at
+            n += 1
+            row = e[at + NEXT]
+    sort(keys, n)
+    to = 0
+    for i in range(n):
+        to = wire_state(packed, to, e, keys[i] & (1 << ID_BITS) - 1)
+    return to
+
+
+# -- keeping -------------------------------------------------------------------------------------------------
+
+
+@jit
+def recall(e: Any, changed: Any, known: Any, before: Any, n: int) -> int:
+    """Brings what is kept of the `n` rows that have changed up to date; by how many more entities are there.
+
+    Args:
+        known: [rows * 5] of each row id, template, x, y, z.
+        before: [n * 6] gets each row, and what was kept of it.
+    """
+    more = 0
+    for i in range(n):
+        row = changed[i]
+        more += int(e[(row << WIDTH_SHIFT) + ID] != 0) - int(known[5 * row] != 0)
+        before[6 * i] = row
+        for k in range(5):
+            before[6 * i + 1 + k] = known[5 * row + k]
+            known[5 * row + k] = e[(row << WIDTH_SHIFT) + (k if k < 2 else k + 1)]
+    return more
