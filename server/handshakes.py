@@ -6,11 +6,11 @@ is asked first.
 """
 
 import asyncio
+import errno
 import socket
 import ssl
 from abc import abstractmethod
-from collections.abc import Callable, Coroutine
-from typing import Any
+from collections.abc import Callable
 
 AGAIN_S = 1.0
 """Where nothing can be accepted (no descriptor is left, for one), the next try is so much later."""
@@ -41,28 +41,37 @@ class Handshakes:
         self._guest, self._context, self._limit_s = guest, context, limit_s
         self._loop = asyncio.get_running_loop()
         self._tasks: set[asyncio.Task[None]] = set()
+        """What accepts, and every handshake that has begun: cancelled before, it would have no end of its own."""
+        self._closed = False
         self.sockets: list[socket.socket] = []
         """Those that listen."""
 
     async def listen(self, host: str, port: int, backlog: int) -> None:
-        """Begins, on all addresses of the host.
+        """Begins, on all addresses of the host (empty: of this machine) whose family this system has, as asyncio does.
 
         Raises:
-            OSError: one of them cannot be used.
+            OSError: there is none, or one of them cannot be used.
         """
-        found = await self._loop.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
+        found = await self._loop.getaddrinfo(host or None, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
         try:
             for family, _, _, _, address in dict.fromkeys(found):
-                self.sockets.append(socket.create_server(address, family=family, backlog=backlog))
-                self.sockets[-1].setblocking(False)
+                try:
+                    self.sockets.append(socket.create_server(address, family=family, backlog=backlog))
+                except OSError as error:
+                    if error.errno != errno.EAFNOSUPPORT:
+                        raise
         except OSError:
             self.close()
             raise
+        if not self.sockets:
+            raise OSError(errno.EAFNOSUPPORT, f"{host}: no address of a family that this system has")
         for listener in self.sockets:
-            self._go(self._accept(listener))
+            listener.setblocking(False)
+            self._keep(self._loop.create_task(self._accept(listener)))
 
     def close(self) -> None:
         """No further connection; handshakes under way are cut off."""
+        self._closed = True
         for task in self._tasks:
             task.cancel()
         for listener in self.sockets:
@@ -73,6 +82,7 @@ class Handshakes:
             try:
                 sock, peer = await self._loop.sock_accept(listener)
             except ConnectionError:  # gone already
+                await asyncio.sleep(0)
                 continue
             except OSError as error:
                 self._loop.call_exception_handler({"message": "cannot accept a connection", "exception": error})
@@ -80,11 +90,17 @@ class Handshakes:
                 continue
             guest = self._guest()
             if guest.enter(str(peer[0])):
-                self._go(self._shake(sock, guest))
+                self._loop.create_task(self._shake(sock, guest))  # is kept once it has begun
             else:
                 sock.close()
+            await asyncio.sleep(0)  # asyncio's `sock_accept` does not wait while there is one: others have their turn
 
     async def _shake(self, sock: socket.socket, guest: Guest) -> None:
+        if self._closed:
+            sock.close()
+            guest.leave()
+            return
+        self._keep(asyncio.current_task())
         try:
             await self._loop.connect_accepted_socket(
                 lambda: guest, sock, ssl=self._context, ssl_handshake_timeout=self._limit_s
@@ -94,7 +110,7 @@ class Handshakes:
             if not isinstance(error, OSError):  # of TLS and of time, too: the peer's affair
                 raise
 
-    def _go(self, work: Coroutine[Any, Any, None]) -> None:
-        task = self._loop.create_task(work)
+    def _keep(self, task: asyncio.Task[None] | None) -> None:
+        assert task is not None
         self._tasks.add(task)
         task.add_done_callback(self._tasks.discard)

@@ -1,6 +1,8 @@
 """TLS over real loopback sockets: a connection counts before its handshake, and no longer than it lasts."""
 
 import asyncio
+import errno
+import socket
 import ssl
 from collections.abc import AsyncIterator, Callable
 
@@ -117,6 +119,38 @@ async def test_the_end_cuts_handshakes_off(gateway: Gateway, context: ssl.SSLCon
         await asyncio.open_connection(*address)
 
 
+async def test_the_end_finds_who_is_accepted_and_has_not_begun(
+    gateway: Gateway, context: ssl.SSLContext, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    arrive, loop = gateway.door.arrive, asyncio.get_running_loop()
+
+    def arrive_at_the_end(address: str) -> bool:
+        loop.call_soon(gateway.stop_listening)
+        return arrive(address)
+
+    monkeypatch.setattr(gateway.door, "arrive", arrive_at_the_end)
+    reader, writer = await asyncio.open_connection(*await gateway.listen("127.0.0.1", 0, context))
+    async with asyncio.timeout(TIME_OUT_S):
+        assert await reader.read() == b""
+    writer.close()
+    assert gateway.door.total == 0
+
+
+async def test_many_who_come_at_once_are_accepted_one_in_a_pass_of_the_loop(
+    gateway: Gateway, context: ssl.SSLContext
+) -> None:
+    address = await gateway.listen("127.0.0.1", 0, context)
+    peers = [socket.create_connection(address) for _ in range(20)]
+    passes = 0
+    async with asyncio.timeout(TIME_OUT_S):
+        while gateway.door.total + gateway.door.refused["address"] < len(peers):
+            await asyncio.sleep(0)
+            passes += 1
+    for peer in peers:
+        peer.close()
+    assert passes >= len(peers)
+
+
 async def test_trouble_in_accepting_is_told_and_passes(
     gateway: Gateway, context: ssl.SSLContext, trust: ssl.SSLContext, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -140,3 +174,20 @@ async def test_a_busy_port_is_an_os_error(gateway: Gateway, context: ssl.SSLCont
     address = await gateway.listen("127.0.0.1", 0, context)
     with pytest.raises(OSError, match=r"in use"):
         await Gateway(Silent()).listen(*address, context)
+
+
+async def test_no_host_is_all_of_this_machine_and_families_that_it_lacks_are_left_out(
+    gateway: Gateway, context: ssl.SSLContext, trust: ssl.SSLContext, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    real = socket.create_server
+
+    def without_ipv6(address: tuple[str, int], *, family: int, backlog: int) -> socket.socket:
+        if family == socket.AF_INET6:
+            raise OSError(errno.EAFNOSUPPORT, "Address family not supported by protocol")
+        return real(address, family=family, backlog=backlog)
+
+    monkeypatch.setattr(socket, "create_server", without_ipv6)
+    _, port = await gateway.listen("", 0, context)
+    assert await page(("127.0.0.1", port), trust) == b"HTTP/1.1 200 OK\r\n"
+    with pytest.raises(OSError, match="family"):
+        await Gateway(Silent()).listen("::1", 0, context)
