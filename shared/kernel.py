@@ -732,32 +732,13 @@ def advance(w: Arrays, row: int, events: int, turns: Any, i: int) -> None:
 
 
 @jit
-def row_of(e: Any, rows: int, entity: int) -> int:
-    """The row of an entity among the first `rows`, or -1. Where they ascend by id, as nearly always, that is quick."""
-    low = 0
-    high = rows
-    while low < high:
-        middle = (low + high) >> 1
-        if e[(middle << WIDTH_SHIFT) + ID] < entity:
-            low = middle + 1
-        else:
-            high = middle
-    if low < rows and e[(low << WIDTH_SHIFT) + ID] == entity:
-        return low
-    for row in range(rows):
-        if e[(row << WIDTH_SHIFT) + ID] == entity:
-            return row
-    return -1
-
-
-@jit
 def follow(w: Arrays, turns: Any, n: int, rows: int, ticks: int, tick: int) -> bool:
     """Takes the first `rows` rows on by `ticks`; those `n` in `turns`, which are told, by one; whether all of these are
-    there. Nothing counts as changed then. `tick` is any that no row has been marked with."""
+    there (a row that is not: -1). Nothing counts as changed then. What was written ahead of `tick` is as it says."""
     e = w.entities
     all_there = True
     for i in range(0, n * TURN, TURN):
-        row = -1 if turns[i] == 0 else row_of(e, rows, turns[i])
+        row = turns[i]
         if row < 0:
             all_there = False
         else:

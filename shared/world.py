@@ -405,11 +405,14 @@ class World:
 
         Args:
             turns: of those that do not, [n, 8]: id, events (`layout.STOP_X` ...), wish (3), position (3; only that
-                within its segment, along axes where it stopped). Only where `ticks` is 1.
+                within its segment, along axes where it stopped). Only where `ticks` is 1. Is written to.
 
         Returns:
             Whether there is an entity for every turn.
         """
+        if len(turns):
+            row_of = self._row_of
+            turns[:, 0] = [row_of.get(entity, -1) for entity in turns[:, 0].tolist()]
         there = self._follow(self._arrays, self._lent(turns), len(turns), self._rows, ticks, self.tick + 1)
         self._rebased(tick)
         return bool(there)
