@@ -11,7 +11,7 @@ from shared.checks import Cell
 from shared.layout import FALLING, FLAGS, ID, Int64s, X
 from shared.messages import ProtocolError, Snapshot
 from shared.scene import Scene
-from shared.snapshot import ACTED, KEYFRAME, SegmentPart, checksum, decode_parts
+from shared.snapshot import ACTED, KEYFRAME, SegmentPart, checksum, decode_parts, prepare
 from shared.units import SEGMENT, TO_SEGMENT
 from shared.world import World
 
@@ -27,6 +27,7 @@ class Confirmed:
     def __init__(self, scene: Scene, entity: int, *, compiled: bool | None = None) -> None:
         self.entity = entity
         self.world = World(scene, compiled=compiled)
+        prepare(self.world.compiled)
         self.states = self.world.states()
         """Those of the world, [n, 12], ascending by id. Not to be written to."""
         self.attributes: dict[int, dict[str, Any]] = {}

@@ -29,7 +29,7 @@ STOP_X, STOP_Y, STOP_Z, GO_X, GO_Y, FALL, LAUNCH, TOLD, WHOLE = (1 << bit for bi
 """What a turn decided: stopped along an axis, walks as wished again, nothing stands under it, jumped; its wish is
 another one; it was written from outside or came into another segment."""
 TURN = 8
-"""Numbers of a turn that is told: row, events, the wish (3), the position (3)."""
+"""Numbers of a turn that is told: id (to the kernel: row, or -1), events, the wish (3), the position (3)."""
 
 # A template's row: the box relative to the position, and what it may do.
 LO_X, LO_Y, LO_Z, SIZE_X, SIZE_Y, SIZE_Z, SOLID, WALKS, JUMP_SPEED = range(9)

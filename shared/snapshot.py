@@ -269,6 +269,13 @@ def _reading(compiled: bool) -> tuple[Any, Any]:
     )
 
 
+def prepare(compiled: bool) -> None:
+    """Has everything compiled that parts are read and checked by: the first checksum comes when one plays already."""
+    _reading(compiled)
+    ids, heads, packed = (kernels.lent(np.zeros(0, kind), compiled) for kind in (np.int64, np.int32, np.uint8))
+    kernels.direct(kernels.of(bulk, compiled).muster, ids, heads, ids, packed, 0)
+
+
 def _decode_part(part: Any, corners: list[int], news: tuple[list[bytes], ...]) -> SegmentPart:
     """One part; its low corner in grid steps and its number of rows go to the `corners`, what they hold to `news`."""
     if type(part) is not list or not 4 <= len(part) <= 11:

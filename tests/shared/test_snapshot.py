@@ -10,12 +10,24 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from shared import bulk, kernels
 from shared.blocks import BLOCKS, PACKED_MAX, pack, unpack
 from shared.checks import Cell
 from shared.inputs import Input
 from shared.layout import CELL, FALLING, FLAGS, ID, MOVE_X, STOP_Y, TEMPLATE, TOLD, TURN, VX, X
 from shared.messages import ENTITY_MAX, TICK_MAX, ProtocolError
-from shared.snapshot import ACTED, FIELDS, ROW, SIDE, SegmentPart, checksum, decode_parts, encode_part, encode_rows
+from shared.snapshot import (
+    ACTED,
+    FIELDS,
+    ROW,
+    SIDE,
+    SegmentPart,
+    checksum,
+    decode_parts,
+    encode_part,
+    encode_rows,
+    prepare,
+)
 from tests.worlds import build
 
 FAR = (1 << 23) - 1
@@ -147,6 +159,18 @@ def test_a_checksum_is_that_of_the_blocks_and_the_rows_ascending_by_id(compiled:
         packed = world.blocks.digest(segment).to_bytes(8, "little") + encode_rows(rows)
         assert checksum(world, segment) == zlib.crc32(packed)
     assert min(len(world.in_segment(segment)) for segment in segments) > 1
+
+
+@pytest.mark.skipif(not kernels.available(), reason="there is nothing to compile without Numba")
+def test_the_first_checksum_has_nothing_to_compile_once_all_is_prepared() -> None:
+    kernels.compiled.cache_clear()
+    prepare(True)
+    signatures = list(kernels.compiled(bulk).muster.signatures)
+    assert len(signatures) == 1
+    world = build(compiled=True)
+    checksum(world, next(iter(world.blocks)))
+    assert kernels.compiled(bulk).muster.signatures == signatures
+    kernels.compiled.cache_clear()
 
 
 def test_a_checksum_is_of_all_a_segment_holds_and_of_nothing_else() -> None:
