@@ -1,10 +1,11 @@
 """WebSockets to calls of the game and back; the only file of the server that knows websockets.
 
 websockets parses (its Sans-I/O `ServerProtocol`; only plain messages are cut out here), asyncio moves bytes, and there
-is no task and no await per connection: what arrives is handed to the game in the call that brings it, what the game
-sends is written in the call that sends it. Nothing here waits for a client. asyncio's flow control (`pause_writing`)
-has no effect: the game looks at `outstanding()` before it sends. What the game does not get, and so cannot count
-(pings, fragments, whatever comes after the end), is bounded here: who sends too much of it is aborted.
+is no task and no await per connection but for its TLS handshake: what arrives is handed to the game in the call that
+brings it, what the game sends is written in the call that sends it. Nothing here waits for a client. asyncio's flow
+control (`pause_writing`) has no effect: the game looks at `outstanding()` before it sends. What the game does not get,
+and so cannot count (pings, fragments, whatever comes after the end), is bounded here: who sends too much of it is
+aborted.
 
 The life of a connection: handshake (or an HTTP page) -> `game.open` -> `game.receive` ... -> `game.lost`, exactly
 once, as soon as the peer has closed, broken the protocol or gone. A stage that has a peer to wait for has a limit.

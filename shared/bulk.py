@@ -31,11 +31,10 @@ from shared.layout import (
     Y,
     Z,
 )
-from shared.units import TO_SEGMENT
+from shared.units import IN_SEGMENT, TO_SEGMENT
 
 jit, inlined = decorators(__name__)
 
-IN_SEGMENT = (1 << TO_SEGMENT) - 1
 HEAD_BYTES = 5
 ROW_BYTES = 33
 ALL_EVENTS = (1 << EVENT_BITS) - 1

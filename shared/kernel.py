@@ -84,7 +84,7 @@ from shared.layout import (
     Y,
     Z,
 )  # fmt: skip
-from shared.units import BLOCK, BLOCK_SHIFT, SEGMENT_SHIFT, TO_SEGMENT
+from shared.units import BLOCK, BLOCK_SHIFT, IN_SEGMENT, SEGMENT_SHIFT, TO_SEGMENT
 
 jit, inlined = decorators(__name__)
 
@@ -96,7 +96,6 @@ TO_CELL_Z = BLOCK_SHIFT + CELL_SHIFT_Z
 CELL_TO_SEGMENT = SEGMENT_SHIFT - CELL_SHIFT
 CELL_TO_SEGMENT_Z = SEGMENT_SHIFT - CELL_SHIFT_Z
 MOVES = 2 * MOVE_MAX + 1
-IN_SEGMENT = (1 << TO_SEGMENT) - 1
 
 
 # -- looking things up ---------------------------------------------------------------------------------------

@@ -26,7 +26,9 @@ SEGMENT_SHIFT = 5
 SEGMENT = 1 << SEGMENT_SHIFT
 """Blocks along one side of a world segment."""
 TO_SEGMENT = BLOCK_SHIFT + SEGMENT_SHIFT
-"""A position shifted right by so much is the index of its segment."""
+"""A position shifted right by so much is the index of its segment,"""
+IN_SEGMENT = (1 << TO_SEGMENT) - 1
+"""and these bits of it count from the segment's low corner."""
 
 
 def rounded(value: float) -> int:
