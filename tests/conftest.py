@@ -1,6 +1,24 @@
-"""Property tests are the same in every run and on every machine: the same examples, and no limit on time."""
+"""Property tests are the same in every run and on every machine: the same examples, and no limit on time.
 
+A test that steps a world runs it both ways: compiled by Numba, and the same source plain.
+"""
+
+import pytest
 from hypothesis import HealthCheck, settings
+
+from shared import kernels
 
 settings.register_profile("same", derandomize=True, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile("same")
+
+
+@pytest.fixture(
+    params=[
+        pytest.param(True, marks=pytest.mark.skipif(not kernels.available(), reason="Numba is not installed")),
+        False,
+    ],
+    ids=["compiled", "plain"],
+)
+def compiled(request: pytest.FixtureRequest) -> bool:
+    """Whether the world of this test runs the compiled kernel."""
+    return bool(request.param)

@@ -37,8 +37,8 @@ def row_of_segments() -> Scene:
 class Recorded:
     """A world with its log, ticking."""
 
-    def __init__(self) -> None:
-        self.world = World(row_of_segments(), compiled=False)
+    def __init__(self, compiled: bool) -> None:
+        self.world = World(row_of_segments(), compiled=compiled)
         self.world.load_terrain()
         self.log = ChangeLog(self.world)
 
@@ -73,8 +73,8 @@ class Recorded:
 
 
 @pytest.fixture
-def told() -> Recorded:
-    return Recorded()
+def told(compiled: bool) -> Recorded:
+    return Recorded(compiled)
 
 
 def test_what_nothing_happened_to_is_not_mentioned(told: Recorded) -> None:

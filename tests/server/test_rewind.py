@@ -35,10 +35,10 @@ def rewinding(**changes: object) -> tuple[World, Rewind]:
 # -- the past ------------------------------------------------------------------------------------------------
 
 
-def crowd(seed: int, ticks: int, each: Callable[[World, Rewind], None]) -> None:
+def crowd(seed: int, ticks: int, compiled: bool, each: Callable[[World, Rewind], None]) -> None:
     """Entities that walk, come, go and are moved by hand; `each` is called after every tick."""
     rng = random.Random(seed)
-    world, rewind = rewinding(tick_rate=rng.choice((30, 32, 60)))
+    world, rewind = rewinding(tick_rate=rng.choice((30, 32, 60)), compiled=compiled)
     for _ in range(ticks):
         for entity in world.entities["id"].tolist():
             if rng.random() < 0.03:
@@ -66,7 +66,7 @@ def _ids(world: World) -> list[int]:
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_every_tick_of_the_window_is_as_it_was_with_its_blocks(seed: int) -> None:
+def test_every_tick_of_the_window_is_as_it_was_with_its_blocks(seed: int, compiled: bool) -> None:
     then: list[World] = []
 
     def check(world: World, rewind: Rewind) -> None:
@@ -85,11 +85,11 @@ def test_every_tick_of_the_window_is_as_it_was_with_its_blocks(seed: int) -> Non
             for cell in itertools.product(range(-25, 25, 3), range(-25, 25), (-1, 7)):
                 assert past.block(*cell) == old.blocks.get(*cell)
 
-    crowd(seed, 60, check)
+    crowd(seed, 60, compiled, check)
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_between_two_ticks_everybody_is_where_the_sdk_draws_them(seed: int) -> None:
+def test_between_two_ticks_everybody_is_where_the_sdk_draws_them(seed: int, compiled: bool) -> None:
     kept: list[tuple[int, Int64s]] = []
     rng = random.Random(seed)
 
@@ -106,7 +106,7 @@ def test_between_two_ticks_everybody_is_where_the_sdk_draws_them(seed: int) -> N
             zip(states[:, 0].tolist(), map(tuple, places.tolist()), strict=True)
         )
 
-    crowd(seed, 60, check)
+    crowd(seed, 60, compiled, check)
 
 
 def test_the_moment_is_clamped_and_must_be_a_number() -> None:

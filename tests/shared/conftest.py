@@ -1,20 +1,6 @@
-"""Every test that steps a world runs it both ways: compiled by Numba, and the same source plain."""
+"""What tests of the physics run under."""
 
 import pytest
-
-from shared import kernels
-
-
-@pytest.fixture(
-    params=[
-        pytest.param(True, marks=pytest.mark.skipif(not kernels.available(), reason="Numba is not installed")),
-        False,
-    ],
-    ids=["compiled", "plain"],
-)
-def compiled(request: pytest.FixtureRequest) -> bool:
-    """Whether the world of this test runs the compiled kernel."""
-    return bool(request.param)
 
 
 @pytest.fixture(params=["mean", "semi"])
