@@ -6,15 +6,18 @@ source, and neither instance can drift from the other.
 
 import contextlib
 import functools
+import importlib
 import importlib.util
 import sys
+import zlib
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from types import ModuleType
 from typing import Any
 
 import numpy as np
 
-from shared.jit import COMPILED
+from shared.jit import COMPILED, OPTIONS
 
 
 def available() -> bool:
@@ -77,15 +80,27 @@ def compiled(source: ModuleType) -> ModuleType:
     Raises:
         ImportError: Numba is not installed.
     """
+    config: Any = importlib.import_module("numba.core.config")
     name = source.__name__ + COMPILED
+    assert source.__file__ is not None
     spec = importlib.util.spec_from_file_location(name, source.__file__)
     assert spec is not None
     assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     sys.modules[name] = module
+    place = config.CACHE_DIR
+    config.CACHE_DIR = str(
+        Path(place or Path(source.__file__).parent / "__pycache__") / f"numba-{_built_in(source):08x}"
+    )
     try:
         spec.loader.exec_module(module)
-    except ImportError:
-        del sys.modules[name]
-        raise
+    finally:
+        config.CACHE_DIR = place
     return module
+
+
+def _built_in(source: ModuleType) -> int:
+    """A number for what is compiled into a source's functions though it stands in other files: the constants that it
+    imports, and how it is compiled. Numba's cache on disk looks at the source alone."""
+    constants = sorted((name, value) for name, value in vars(source).items() if isinstance(value, int))
+    return zlib.crc32(repr((constants, OPTIONS)).encode())

@@ -1,0 +1,40 @@
+"""What Numba has compiled and kept on disk is used for what it was compiled of, and for nothing else."""
+
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from shared import kernels
+
+ROOT = Path(__file__).parent.parent.parent
+READ = """
+import numpy as np
+from shared import bulk, kernels, layout
+turns = np.zeros(8, np.int64)
+assert kernels.of(bulk, True).read_turns(bytes((1, 0, 0, 0, layout.TOLD)), b"\\1\\2\\3", turns)
+print(turns[2:5].tolist())
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not kernels.available(), reason="there is nothing compiled without Numba")
+def test_a_constant_that_changes_in_another_file_is_compiled_anew(tmp_path: Path) -> None:
+    shutil.copytree(ROOT / "shared", tmp_path / "shared", ignore=shutil.ignore_patterns("__pycache__"))
+
+    def read() -> tuple[str, int]:
+        done = subprocess.run(
+            (sys.executable, "-c", READ), cwd=tmp_path, env={}, capture_output=True, text=True, check=True
+        )
+        return done.stdout, len(list(tmp_path.rglob("*read_turns*.nbi")))
+
+    assert read() == ("[1, 2, 3]\n", 1)
+    assert read() == ("[1, 2, 3]\n", 1)
+    layout = tmp_path / "shared" / "layout.py"
+    events = "STOP_X, STOP_Y, STOP_Z, GO_X, GO_Y, FALL, LAUNCH, TOLD, WHOLE"
+    text = layout.read_text("utf-8")
+    assert text.count(events) == 1
+    layout.write_text(text.replace(events, "TOLD, STOP_Y, STOP_Z, GO_X, GO_Y, FALL, LAUNCH, STOP_X, WHOLE"), "utf-8")
+    assert read() == ("[1, 2, 3]\n", 2)
