@@ -12,7 +12,7 @@
 import math
 import operator
 from collections import deque
-from typing import Any
+from typing import Any, SupportsIndex
 
 from client_sdk.advice import advised
 from client_sdk.clock import ServerClock, Timeline
@@ -151,7 +151,7 @@ class Core:
         play = self._joined("command")
         return self._order(self._orders.command(play.world.prediction.next_order, play.seen, name, data))
 
-    def edit(self, x: int, y: int, z: int, kind: int) -> int:
+    def edit(self, x: SupportsIndex, y: SupportsIndex, z: SupportsIndex, kind: SupportsIndex) -> int:
         """Places (kind 1 to 255) or removes (0) a block with the next tick; the number by which it is `Answered`.
 
         Raises:

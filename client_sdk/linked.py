@@ -9,10 +9,10 @@ Over a socket the kernels hide some of that: with "thin", snapshots are 0.4 to 1
 """
 
 import math
-from typing import Any
 
 from client_sdk.core import Core
 from client_sdk.links import Agenda, Path, Weather, Wire, named
+from shared.scene import Scene
 
 LOST = b""
 """Stands for the loss of the connection among the messages; an empty one is not taken."""
@@ -29,8 +29,17 @@ class LinkedCore(Core):
 
     seed = 1
 
-    def __init__(self, *args: Any, **more: Any) -> None:
-        super().__init__(*args, **more)
+    def __init__(
+        self,
+        name: str = "",
+        scene: Scene | None = None,
+        *,
+        token: str = "",
+        patience_s: float = 0.0,
+        compiled: bool | None = None,
+        neighbours: bool = True,
+    ) -> None:
+        super().__init__(name, scene, token=token, patience_s=patience_s, compiled=compiled, neighbours=neighbours)
         self._link: Path | None = None
         self._line: _Line | None = None
         self._now = 0.0

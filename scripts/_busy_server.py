@@ -15,10 +15,11 @@ import asyncio
 import collections
 import functools
 import gc
+import operator
 import signal
 import sys
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from types import FrameType, FunctionType, ModuleType
 from typing import Any, cast
 
@@ -35,6 +36,7 @@ from server.rewind import Rewind
 from server.rules import Rules
 from server.session import Link, Session
 from server.settings import Settings
+from server.ticker import Ticker
 from server.warmup import warm_up
 from shared.checks import Cell
 from shared.inputs import Input
@@ -174,10 +176,11 @@ class Stopwatch:
     def __init__(self, game: Game) -> None:
         self.ticks, self.before_step, self.collections = Histogram(), Histogram(), Histogram()
         self._plain_tick, self._plain_step = game.tick, game.world.step
+        cast("Any", app).Ticker = lambda rate, tick, *more: Ticker(rate, self._tick, *more)
         self._tick_began = self._collection_began = 0.0
         self.full_collection_s: float | None = None
         """Of the one that SIGUSR1 has asked for."""
-        cast("Any", game).tick, cast("Any", game.world).step = self._tick, self._step
+        cast("Any", game.world).step = self._step
         gc.callbacks.append(self._collect)
         signal.signal(signal.SIGUSR1, lambda number, frame: self._collect_all())
 
@@ -231,12 +234,23 @@ def in_view(game: Game) -> float:
     return sum(views) / max(len(views), 1)
 
 
-def serve(served: Game) -> None:
-    """As `python -m server` does, on a port that the system picks."""
+class Measured(app.Server):
+    """The product's server, with more figures."""
+
+    def __init__(self, settings: Settings, game: Game, more: Sequence[Callable[[], dict[str, Any]]]) -> None:
+        self._more = more
+        super().__init__(settings, game)
+
+    def stats(self) -> dict[str, Any]:
+        return functools.reduce(operator.or_, (each() for each in self._more), super().stats())
+
+
+def serve(served: Game, *more: Callable[[], dict[str, Any]]) -> None:
+    """As `python -m server` does, on a port that the system picks, with more figures."""
     settings = Settings(port=0, page=False, log_level="warning")
     log.set_up(settings.log_level, settings.log_format, sys.stderr)
     with asyncio.Runner(loop_factory=process.loop_factory()) as runner:
-        runner.run(app.Server(settings, served).serve())
+        runner.run(Measured(settings, served, more).serve())
 
 
 def main(argv: list[str]) -> int:
@@ -248,7 +262,6 @@ def main(argv: list[str]) -> int:
     warm_up(rules)
     churn = Churn() if kind == "churn" else None
     made = Game(rules, rules=churn)
-    plain_stats = made.stats
     more: list[Callable[[], dict[str, Any]]] = [lambda: {"entities_in_view": in_view(made)}]
     if churn is not None:
         churn.world = made.world
@@ -262,8 +275,7 @@ def main(argv: list[str]) -> int:
     if kind == "profile":
         profile = Profile()
         more.append(lambda: {"samples": dict(profile.samples)})
-    cast("Any", made).stats = lambda: functools.reduce(lambda stats, each: stats | each(), more, plain_stats())
-    serve(made)
+    serve(made, *more)
     return 0
 
 

@@ -14,6 +14,7 @@ import sys
 import time
 from collections import Counter
 from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +28,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 import league
 from client_sdk.events import Corrected
 from client_sdk.links import PRESETS
+from client_sdk.stats import Stats
 from shared.scene import load_scene
 from tests.match import Match, Player, wander
 
@@ -69,7 +71,7 @@ def play(preset: str, clients: int, minutes: float, seed: int) -> dict[str, Any]
     players = [match.join(wander, path) for _ in range(clients)]
     match.run_until(lambda: all(player.core.state == "playing" for player in players), 120)
     match.run(SETTLE_S)
-    before = [vars(player.core.stats) | {} for player in players]
+    before = [replace(player.core.stats) for player in players]
     for player in players:
         player.events.clear()
     watch = Watch(match)
@@ -79,14 +81,15 @@ def play(preset: str, clients: int, minutes: float, seed: int) -> dict[str, Any]
     return {**figures(match, players, before, watch, minutes), "simulated_s_per_cpu_s": round(minutes * 60 / spent, 1)}
 
 
-def figures(
-    match: Match, players: list[Player], before: list[dict[str, Any]], watch: Watch, minutes: float
-) -> dict[str, Any]:
+def figures(match: Match, players: list[Player], before: list[Stats], watch: Watch, minutes: float) -> dict[str, Any]:
     """All that is reported of one run."""
 
     def gained(name: str) -> float:
         return float(
-            sum(vars(player.core.stats)[name] - old[name] for player, old in zip(players, before, strict=True))
+            sum(
+                getattr(player.core.stats, name) - getattr(old, name)
+                for player, old in zip(players, before, strict=True)
+            )
         )
 
     corrections = [event for player in players for event in player.events if isinstance(event, Corrected)]

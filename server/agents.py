@@ -145,12 +145,13 @@ class Arena(ParallelEnv):  # type: ignore[misc]  # it says nothing of its types
         game.tick(0.0, 0.0)  # the rules set their scene before anybody comes
         self.agents = list(self.possible_agents)
         self._seats = {agent: Session(_Nobody(), 0.0) for agent in self.agents}
-        self._wheels: dict[str, _Wheel] = {}
+        self._wheels: dict[str, InputQueue] = {}
         for agent, seat in self._seats.items():
             player = game.roster.enter(seat, agent)
             if player is None:
                 raise ValueError(f"{len(self.agents)} agents: no room to spawn {agent} in {self.scene.name}")
-            player.inputs = self._wheels[agent] = _Wheel()
+            self._wheels[agent] = player.inputs
+            player.inputs.wheel = NEUTRAL
         self._number, self._end = 0, game.world.tick + self._ticks
         self._scores = {agent: self._reward(game.stage, self.entity(agent)) for agent in self.agents}
         return self._look(), {agent: {"verdicts": []} for agent in self.agents}
@@ -180,7 +181,7 @@ class Arena(ParallelEnv):  # type: ignore[misc]  # it says nothing of its types
         """Everybody acts, `repeat` ticks go by; who gives no action stands still."""
         for agent in self.agents:
             given = actions.get(agent)
-            self._wheels[agent].wish = NEUTRAL if given is None else clamp(Input(*map(int, given)))
+            self._wheels[agent].wheel = NEUTRAL if given is None else clamp(Input(*map(int, given)))
         for _ in range(self._repeat):
             self._game.tick(0.0, 0.0)
         truncated, stage = self.world.tick >= self._end, self._game.stage
@@ -251,16 +252,6 @@ class _Nobody:
 
     def close(self, code: int, reason: str) -> None:
         """There is nothing to close."""
-
-
-class _Wheel(InputQueue):
-    """The inputs of a player who is always in time."""
-
-    wish = NEUTRAL
-
-    def take(self, tick: int) -> Input:
-        self.used += 1
-        return self.wish
 
 
 def _attribute(name: str) -> Reward:

@@ -65,6 +65,8 @@ class InputQueue:
         """As they go over the wire, up to that of `newest`; at most `FATES_MAX`, like the fates."""
         self.fates = bytearray()
         self.late = self.refused = self.used = self.substituted = 0
+        self.wheel: Input | None = None
+        """What is taken in every tick, whatever comes: of a player who is inside the server."""
 
     def file(self, message: Inputs, tick: int, ahead: float) -> None:
         """Takes a message at tick `tick`; the next tick's deadline is `ahead` ticks away."""
@@ -104,6 +106,9 @@ class InputQueue:
 
     def take(self, tick: int) -> Input:
         """The input for a tick whose time has come."""
+        if self.wheel is not None:
+            self.used += 1
+            return self.wheel
         wish = self._waiting.pop(tick, None)
         if wish is not None:
             fate, self._missing, self._held = USED, 0, wish

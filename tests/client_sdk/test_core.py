@@ -130,7 +130,7 @@ def test_what_cannot_be_sent_is_not_predicted() -> None:
         with pytest.raises((TypeError, OverflowError)):
             core.edit(wrong, 16, 2, 1)  # type: ignore[arg-type]
     served.live(1 / SCENE.tick_rate)
-    assert core.edit(np.int64(17), np.int64(18), 1, 1) == 1  # type: ignore[arg-type]
+    assert core.edit(np.int64(17), np.int64(18), 1, 1) == 1
     sent = served.live(1 / SCENE.tick_rate)
     assert [message.number for message in sent if isinstance(message, messages.Command)] == [1]
     assert core.prediction.predicted.blocks.get(17, 18, 1) == 1
