@@ -1,0 +1,12 @@
+"""Compiles modules of the folder it is started in, in place, for `native.py`: `_native_build.py 3 shared/ring.py`."""
+
+import sys
+
+from mypyc.build import mypycify
+from setuptools import Distribution
+
+extensions = mypycify(sys.argv[2:], opt_level=sys.argv[1], debug_level="0")
+command = Distribution({"name": "native", "ext_modules": extensions}).get_command_obj("build_ext")
+command.inplace = True
+command.ensure_finalized()
+command.run()

@@ -1,0 +1,102 @@
+#!/usr/bin/env python3
+"""Runs a program of the repository on the same sources, compiled by mypyc: half the time in the network lab.
+
+    python scripts/native.py scripts/netlab.py --preset typical --minutes 60
+    python scripts/native.py -m server --scene hills
+
+Needs a C compiler and Python's headers. A copy of the sources is compiled in `build/native`, once for each state of
+them (a minute), and the program runs there; without this script nothing knows of it.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import shutil
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+from _env import DEV, PYTHON, ROOT, ensure
+
+SOURCES = ("client_sdk", "scripts", "server", "shared", "tests")
+BUILT = ROOT / "build" / "native"
+MODULES = (
+    "client_sdk/clock.py", "client_sdk/comeback.py", "client_sdk/confirmed.py", "client_sdk/core.py",
+    "client_sdk/events.py", "client_sdk/interpolation.py", "client_sdk/linked.py", "client_sdk/links.py",
+    "client_sdk/orders.py", "client_sdk/picture.py", "client_sdk/play.py", "client_sdk/prediction.py",
+    "client_sdk/replica.py", "client_sdk/smoothing.py", "client_sdk/stats.py",
+    "server/counters.py", "server/delivery.py", "server/door.py", "server/game.py", "server/gateway.py",
+    "server/interest.py", "server/orders.py", "server/pacing.py", "server/replication.py", "server/roster.py",
+    "server/session.py", "server/sight.py",
+    "shared/edits.py", "shared/inputs.py", "shared/messages.py", "shared/ring.py", "shared/snapshot.py",
+    "tests/match.py",
+)  # fmt: skip
+"""What a tick of a server and of a client goes through. Classes in here cannot be derived from by other programs, so
+rules, policies and transports are none of it."""
+
+
+def built() -> Path:
+    """The folder with the compiled copy of the sources as they are now.
+
+    Raises:
+        SystemExit: they cannot be compiled.
+    """
+    digest = hashlib.sha256(sys.version.encode())
+    for file in sources():
+        digest.update(f"{file.relative_to(ROOT)}\0".encode() + file.read_bytes())
+    place = BUILT / digest.hexdigest()[:16]
+    if not place.exists():
+        print("compiling the sources for this machine, once: a minute or two ... ", end="", file=sys.stderr, flush=True)
+        started = time.perf_counter()
+        shutil.rmtree(BUILT, ignore_errors=True)
+        build(BUILT / "raw")
+        (BUILT / "raw").rename(place)
+        print(f"done in {time.perf_counter() - started:.0f} s", file=sys.stderr, flush=True)
+    return place
+
+
+def sources() -> list[Path]:
+    """All that a program of the repository may need."""
+    files = (file for folder in SOURCES for file in (ROOT / folder).rglob("*") if "__pycache__" not in file.parts)
+    return [ROOT / "pyproject.toml", *sorted(file for file in files if file.is_file())]
+
+
+def build(place: Path, optimise: int = 3) -> None:
+    """Copies the sources to a new folder, and compiles them there.
+
+    Raises:
+        SystemExit: they cannot be compiled.
+    """
+    for file in sources():
+        copy = place / file.relative_to(ROOT)
+        copy.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy2(file, copy)
+    command = (sys.executable, str(ROOT / "scripts" / "_native_build.py"), str(optimise), *MODULES)
+    environment = os.environ | {"PYTHONPATH": str(place)}
+    done = subprocess.run(command, cwd=place, env=environment, capture_output=True, text=True, check=False)
+    if done.returncode:
+        sys.exit(f"failed\n{done.stdout[-2000:]}{done.stderr[-2000:]}\nAre a C compiler and Python's headers there?")
+
+
+def main(arguments: list[str]) -> int:
+    if not arguments or arguments[0] in ("-h", "--help"):
+        print(__doc__)
+        return int(not arguments)
+    if Path(sys.executable) != ensure(DEV):
+        return subprocess.run((str(PYTHON), __file__, *arguments), check=False).returncode
+    place = built()
+    if arguments[0] == "-m":
+        command = ["-P", *arguments]  # not from the folder that one is in
+    else:
+        script = Path(arguments[0]).resolve()
+        if not script.is_relative_to(ROOT):
+            sys.exit(f"{arguments[0]}: is no program of {ROOT}")
+        command = [str(place / script.relative_to(ROOT)), *arguments[1:]]
+    path = os.pathsep.join(filter(None, (str(place), os.environ.get("PYTHONPATH"))))
+    return subprocess.run((sys.executable, *command), env=os.environ | {"PYTHONPATH": path}, check=False).returncode
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
