@@ -5,7 +5,7 @@
     python scripts/native.py -m server --scene hills
 
 Needs a C compiler and Python's headers. A copy of the sources is compiled in `build/native`, once for each state of
-them (a minute), and the program runs there; without this script nothing knows of it.
+them (a minute, 30 MB), and the program runs there; without this script nothing knows of it.
 """
 
 from __future__ import annotations
@@ -50,9 +50,9 @@ def built() -> Path:
     if not place.exists():
         print("compiling the sources for this machine, once: a minute or two ... ", end="", file=sys.stderr, flush=True)
         started = time.perf_counter()
-        shutil.rmtree(BUILT, ignore_errors=True)
-        build(BUILT / "raw")
-        (BUILT / "raw").rename(place)
+        raw = BUILT / f"unfinished-{os.getpid()}"
+        build(raw)
+        raw.rename(place)
         print(f"done in {time.perf_counter() - started:.0f} s", file=sys.stderr, flush=True)
     return place
 
@@ -77,15 +77,17 @@ def build(place: Path, optimise: int = 3) -> None:
     environment = os.environ | {"PYTHONPATH": str(place)}
     done = subprocess.run(command, cwd=place, env=environment, capture_output=True, text=True, check=False)
     if done.returncode:
+        shutil.rmtree(place)
         sys.exit(f"failed\n{done.stdout[-2000:]}{done.stderr[-2000:]}\nAre a C compiler and Python's headers there?")
+    shutil.rmtree(place / "build")  # in C
 
 
-def main(arguments: list[str]) -> int:
+def main(arguments: list[str]) -> None:
     if not arguments or arguments[0] in ("-h", "--help"):
         print(__doc__)
-        return int(not arguments)
+        sys.exit(not arguments)
     if Path(sys.executable) != ensure(DEV):
-        return subprocess.run((str(PYTHON), __file__, *arguments), check=False).returncode
+        os.execv(PYTHON, (str(PYTHON), __file__, *arguments))
     place = built()
     if arguments[0] == "-m":
         command = ["-P", *arguments]  # not from the folder that one is in
@@ -95,8 +97,9 @@ def main(arguments: list[str]) -> int:
             sys.exit(f"{arguments[0]}: is no program of {ROOT}")
         command = [str(place / script.relative_to(ROOT)), *arguments[1:]]
     path = os.pathsep.join(filter(None, (str(place), os.environ.get("PYTHONPATH"))))
-    return subprocess.run((sys.executable, *command), env=os.environ | {"PYTHONPATH": path}, check=False).returncode
+    # In the place of this one, so that what ends it ends the program.
+    os.execve(sys.executable, (sys.executable, *command), os.environ | {"PYTHONPATH": path})
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    main(sys.argv[1:])
