@@ -76,8 +76,6 @@ class Core:
         self._open = False
         self._filled: Replica | None = None
         """What the server's messages go into: after a return not yet what is played in."""
-        self._world: Replica | None = None
-        """What is played in, or is going to be."""
         self._play: Play | None = None
         self._orders = Orders()
         self._out: list[bytes] = []
@@ -106,6 +104,11 @@ class Core:
     def timeline(self) -> Timeline | None:
         """The own time; None before it has `Joined`."""
         return self._play.timeline if self._play else None
+
+    @property
+    def _world(self) -> Replica | None:
+        """What is played in, or is going to be."""
+        return self._play.world if self._play else self._filled
 
     @property
     def appetite(self) -> int:
@@ -278,8 +281,6 @@ class Core:
         elif self._play:
             self._events += self._orders.give_up()
         self._filled = world
-        if self._play is None:
-            self._world = world
 
     def _welcomed(self, message: messages.Message) -> Replica:
         if self._filled is None:
@@ -307,7 +308,6 @@ class Core:
         else:
             play = old
             play.world = world
-        self._world = world
         world.prediction.ahead = self._delay
         play.restart(now)
         self.state = "playing"

@@ -12,7 +12,6 @@ import math
 
 from client_sdk.core import Core
 from client_sdk.links import Agenda, Path, Weather, Wire, named
-from shared.scene import Scene
 
 LOST = b""
 """Stands for the loss of the connection among the messages; an empty one is not taken."""
@@ -28,24 +27,10 @@ class LinkedCore(Core):
     """
 
     seed = 1
-
-    def __init__(
-        self,
-        name: str = "",
-        scene: Scene | None = None,
-        *,
-        token: str = "",
-        patience_s: float = 0.0,
-        compiled: bool | None = None,
-        neighbours: bool = True,
-    ) -> None:
-        super().__init__(name, scene, token=token, patience_s=patience_s, compiled=compiled, neighbours=neighbours)
-        self._link: Path | None = None
-        self._line: _Line | None = None
-        self._now = 0.0
-        self._opened = False
-        self._ready: list[bytes] = []
-        self._losses: list[tuple[int, str]] = []
+    _link: Path | None = None
+    _line: "_Line | None" = None
+    _now = 0.0
+    _opened = False
 
     @property
     def link(self) -> Path | None:
@@ -93,14 +78,14 @@ class LinkedCore(Core):
             self._opened = False
             super().lost(code, reason, now)
         else:
-            self._losses.append((code, reason))
+            line.losses.append((code, reason))
             line.down.send(LOST)
             line.advance(now)
 
     def update(self, now: float) -> None:
         """See `Core.update`."""
         line = self._on(now)
-        if line and self._link is None and line.down.idle and line.up.idle and not self._ready:
+        if line and self._link is None and line.down.idle and line.up.idle and not line.ready:
             self._off()
         super().update(now)
 
@@ -117,7 +102,7 @@ class LinkedCore(Core):
         for message in out:
             line.up.send(message)
         line.advance(self._now)
-        ready, self._ready = self._ready, []
+        ready, line.ready = line.ready, []
         if self.state == "closed":  # the goodbye does not wait
             ready += line.up.waiting()
             self._off()
@@ -138,15 +123,15 @@ class LinkedCore(Core):
 
     def _off(self) -> None:
         """What is on the line is lost."""
+        if self._line is not None:
+            self._line.ready.clear()
         self._line = None
-        self._ready.clear()
-        self._losses.clear()
 
     def _arrived(self, message: bytes) -> None:
         if self._line is None:  # cut, a moment ago
             return
         if message == LOST:
-            code, reason = self._losses[0]
+            code, reason = self._line.losses[0]
             self._opened = False
             self._off()
             super().lost(code, reason, self._now)
@@ -155,7 +140,7 @@ class LinkedCore(Core):
 
     def _gone(self, message: bytes) -> None:
         if self._line is not None:
-            self._ready.append(message)
+            self._line.ready.append(message)
 
 
 class _Line:
@@ -166,6 +151,10 @@ class _Line:
         self.weather = Weather(path, seed)
         self.up = Wire(self.agenda, self.weather, seed + 1, core._gone)
         self.down = Wire(self.agenda, self.weather, seed + 2, core._arrived)
+        self.ready: list[bytes] = []
+        """What has come through on its way up."""
+        self.losses: list[tuple[int, str]] = []
+        """What the `LOST` on its way down stand for."""
         self._began = now
 
     @property

@@ -25,7 +25,7 @@ from client_sdk.confirmed import Confirmed
 from client_sdk.events import Corrected
 from shared import bulk, edits, kernels
 from shared.edits import Edit
-from shared.inputs import NEUTRAL, Input
+from shared.inputs import NEUTRAL, Input, row
 from shared.layout import COLUMNS, ID, Int64s, X
 from shared.messages import REPEATS_MAX
 from shared.ring import Ring
@@ -102,7 +102,7 @@ class Prediction:
 
     def rows_since(self, tick: int, to: int) -> bytes:
         """The own inputs after `tick`, up to `to`, as `Inputs.rows`; what was left out is what would stand in."""
-        return b"".join(bytes(part & 0xFF for part in self._wish(at)) for at in range(tick + 1, to + 1))
+        return b"".join(row(self._wish(at)) for at in range(tick + 1, to + 1))
 
     def file(self, tick: int, wish: Input) -> None:
         """The own input for a tick to come."""

@@ -82,6 +82,8 @@ KEYFRAME = -1
 """The `ago` of a part that holds everything."""
 ACTED = 4
 """Flag on the wire: the server's rules placed or threw this entity."""
+PART_MAX = 200 * 1024
+"""No field of a segment's part is longer, in bytes."""
 
 STATE_LOW = np.array([1, 0, 0, 0, 0, 0, -(1 << 30), -(1 << 30), -(1 << 30), -127, -127, 0], np.int64)
 STATE_HIGH = np.array(
@@ -289,9 +291,10 @@ def _decode_part(part: Any, corners: list[int], news: tuple[list[bytes], ...]) -
         raise ProtocolError(f"segment.ago = {shown(ago)}: not allowed")
     if not (
         type(heads) is type(tails) is type(rows) is type(gone) is type(edits) is bytes
+        and max(len(heads), len(tails), len(rows), len(gone), len(edits)) <= PART_MAX
         and len(heads) % HEAD.itemsize == len(rows) % ROW_BYTES == len(gone) % 4 == len(edits) % EDIT.itemsize == 0
     ):
-        raise ProtocolError("segment: heads, tails, rows, gone or edits are no bytes, or part of one")
+        raise ProtocolError("segment: heads, tails, rows, gone or edits are no bytes, too many, or part of one")
     if heads and ago != 1:
         raise ProtocolError(f"segment.heads of {ago} ticks: not allowed")
     all_heads, all_tails, all_rows = news
