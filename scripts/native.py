@@ -20,7 +20,7 @@ from pathlib import Path
 
 from _env import DEV, PYTHON, ROOT, ensure
 
-SOURCES = ("client_sdk", "scripts", "server", "shared", "tests")
+SOURCES = ("client_sdk", "scripts", "server", "shared", "sovereign_netcode", "tests")
 BUILT = ROOT / "build" / "native"
 MODULES = (
     "client_sdk/clock.py", "client_sdk/comeback.py", "client_sdk/confirmed.py", "client_sdk/core.py",

@@ -9,7 +9,7 @@ from server.settings import KINDS
 from tests.readme.pages import PAGES, ROOT, headings
 
 LINK = re.compile(r"\]\(([^)\s]+)\)")
-FILE = re.compile(r"(?<![\w./-])(?:client_sdk|docs|scripts|server|shared|tests)/[\w./-]*\w")
+FILE = re.compile(r"(?<![\w./-])(?:client_sdk|docs|scripts|server|shared|sovereign_netcode|tests)/[\w./-]*\w")
 FLAG = re.compile(r"(?<![\w-])--[a-z][a-z-]+")
 SOURCES = [*(ROOT / "scripts").glob("*"), *(ROOT / "server").glob("*.py")]
 

@@ -1,0 +1,187 @@
+"""Build hook of hatchling: makes the wheel's one top-level package, `sovereign_netcode`.
+
+In the repository, server/, client_sdk/ and shared/ stand at the root and import each other by these names. A wheel with
+such top-level packages would collide with a user's own `server.py` or `shared/`. So the wheel has them under
+`sovereign_netcode`, with their imports rewritten; every other file is carried as it is. Line numbers stay the same.
+
+An editable install uses the repository itself, where `sovereign_netcode` is an alias (sovereign_netcode/_checkout.py).
+Type checkers do not run that alias. For them the hook writes one stub per module, which git ignores.
+"""
+
+import ast
+import io
+import re
+import shutil
+import tempfile
+import tokenize
+from collections.abc import Collection, Iterator
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+from hatchling.builders.hooks.plugin.interface import BuildHookInterface
+
+PACKAGE = "sovereign_netcode"
+FOLDERS = ("client_sdk", "server", "shared")
+"""The folders at the repository's root that become subpackages of `PACKAGE`."""
+ALIAS = "_checkout.py"
+"""The file in the folder `PACKAGE` that is of use in a checkout only."""
+
+_NAMES = "|".join(FOLDERS)
+_IN_TEXT = re.compile(rf"(?<=`)(?=(?:{_NAMES})\.[a-z_])|(?<=python -m )(?=(?:{_NAMES})\b)")
+"""Where a docstring, comment or message names a module. Neither pattern can occur in code outside of them."""
+
+
+class RewriteError(Exception):
+    """A source uses a module's name in a way that cannot be rewritten. The text says where, and what to write."""
+
+
+class Hook(BuildHookInterface[Any]):
+    """Called by hatchling around each build of a wheel."""
+
+    PLUGIN_NAME = "custom"
+
+    def initialize(self, version: str, build_data: dict[str, Any]) -> None:
+        if version == "editable":
+            write_stubs(Path(self.root))
+            return
+        self._staged = Path(tempfile.mkdtemp(prefix=f"{PACKAGE}-"))
+        stage(Path(self.root), self._staged)
+        build_data["force_include"][str(self._staged)] = PACKAGE
+
+    def finalize(self, version: str, build_data: dict[str, Any], artifact_path: str) -> None:
+        if version != "editable":
+            shutil.rmtree(self._staged)
+
+
+def stage(root: Path, place: Path) -> None:
+    """Writes the package as the wheel has it to the folder `place`.
+
+    Raises:
+        RewriteError: a source cannot be rewritten.
+    """
+    own, modules = root / PACKAGE, frozenset(module_names(root))
+    for file, target in [
+        *((file, file.relative_to(own)) for file in files(own) if file.relative_to(own).parts[0] not in FOLDERS),
+        *((file, file.relative_to(root)) for folder in FOLDERS for file in files(root / folder)),
+    ]:
+        if target == Path(ALIAS):
+            continue
+        copy = place / target
+        copy.parent.mkdir(parents=True, exist_ok=True)
+        if file.suffix != ".py":
+            shutil.copyfile(file, copy)
+            continue
+        source = file.read_text("utf-8")
+        text = docstring_alone(source) if target == Path("__init__.py") else rewritten(source, str(target), modules)
+        copy.write_text(text, "utf-8", newline="\n")
+
+
+def files(folder: Path) -> Iterator[Path]:
+    """All files below a folder but caches, in a fixed order."""
+    for path in sorted(folder.rglob("*")):
+        if path.is_file() and "__pycache__" not in path.parts and not path.name.startswith("."):
+            yield path
+
+
+def module_names(root: Path) -> Iterator[str]:
+    """The dotted name of every module in `FOLDERS`, as the repository has it."""
+    for folder in FOLDERS:
+        for file in files(root / folder):
+            if file.suffix == ".py":
+                yield ".".join(file.relative_to(root).with_suffix("").parts).removesuffix(".__init__")
+
+
+def docstring_alone(source: str) -> str:
+    """The source of a module without all but its docstring: the wheel's package needs no alias."""
+    return f'"""{ast.get_docstring(ast.parse(source))}"""\n'
+
+
+def rewritten(source: str, name: str, modules: Collection[str]) -> str:
+    """A source that imports the modules of `FOLDERS` from within `PACKAGE`.
+
+    Args:
+        source: the text of a module.
+        name: what to call it in an error.
+        modules: the dotted names of all modules of `FOLDERS`.
+
+    Raises:
+        RewriteError: it uses a module's name in a way that cannot be rewritten.
+    """
+    tree = ast.parse(source, name)
+    lines = io.StringIO(source).readlines()
+    starts = [0]
+    for line in lines:
+        starts.append(starts[-1] + len(line))
+
+    def offset(line: int, column_bytes: int) -> int:
+        """Turns a position of the syntax tree, which counts bytes of UTF-8, to one in the text."""
+        return starts[line - 1] + len(lines[line - 1].encode()[:column_bytes].decode())
+
+    names_at = _names_after_from(source, starts)
+    inserts = {match.start() for match in _IN_TEXT.finditer(source)}
+    for node in ast.walk(tree):
+        _refuse(node, name, modules)
+        if isinstance(node, ast.Import):
+            inserts |= {offset(part.lineno, part.col_offset) for part in node.names if _is_ours(part.name)}
+        elif isinstance(node, ast.ImportFrom) and not node.level and _is_ours(node.module or ""):
+            inserts.add(names_at[offset(node.lineno, node.col_offset)])
+    parts, done = [], 0
+    for at in sorted(inserts):
+        parts += [source[done:at], f"{PACKAGE}."]
+        done = at
+    return "".join(parts) + source[done:]
+
+
+def _names_after_from(source: str, starts: list[int]) -> dict[int, int]:
+    """The place of the name after each `from`, by the place of the `from`."""
+    tokens = tokenize.generate_tokens(io.StringIO(source).readline)
+    places = [(token.string, starts[token.start[0] - 1] + token.start[1]) for token in tokens]
+    return {at: after for (text, at), (_, after) in pairwise(places) if text == "from"}
+
+
+def _is_ours(module: str) -> bool:
+    return module.partition(".")[0] in FOLDERS
+
+
+def _refuse(node: ast.AST, name: str, modules: Collection[str]) -> None:
+    """Raises if a node names a module so that the name would be wrong in the wheel."""
+    match node:
+        case ast.Import(names=names):
+            for part in names:
+                if _is_ours(part.name) and part.asname is None:
+                    package, _, rest = part.name.rpartition(".")
+                    better = f"from {package} import {rest}" if package else f"from {PACKAGE} import {rest}"
+                    raise RewriteError(f"{name}:{node.lineno}: import {part.name}: write {better}")
+        case ast.Constant(value=str(text)) if ".".join(re.split("[.:]", text)[:2]) in modules and "." in text:
+            raise RewriteError(f"{name}:{node.lineno}: {text!r}: write {PACKAGE + '.' + text!r}")
+        case (
+            ast.List(elts=elements, lineno=line)
+            | ast.Tuple(elts=elements, lineno=line)
+            | ast.Call(args=elements, lineno=line)
+        ):
+            texts = [element.value if isinstance(element, ast.Constant) else None for element in elements]
+            for flag, module in pairwise(texts):
+                if flag == "-m" and module in FOLDERS:
+                    raise RewriteError(f"{name}:{line}: '-m', {module!r}: write '-m', {f'{PACKAGE}.{module}'!r}")
+
+
+def write_stubs(root: Path) -> None:
+    """Writes a stub `sovereign_netcode/server/rules.pyi` for each module like server/rules.py, for type checkers."""
+    stubs: dict[Path, str] = {}
+    for module in module_names(root):
+        path = root / PACKAGE / module.replace(".", "/")
+        if path.name != "__main__":
+            is_package = (root / module.replace(".", "/")).is_dir()
+            stubs[path / "__init__.pyi" if is_package else path.with_suffix(".pyi")] = f"from {module} import *\n"
+    for folder in FOLDERS:
+        for stale in set((root / PACKAGE / folder).rglob("*.pyi")) - stubs.keys():
+            stale.unlink()
+    for path, text in stubs.items():
+        if not path.exists() or path.read_text("utf-8") != text:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_text(text, "utf-8")
+
+
+if __name__ == "__main__":
+    write_stubs(Path(__file__).resolve().parent)

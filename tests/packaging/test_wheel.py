@@ -1,0 +1,147 @@
+"""The distributions, and the installed package beside a user's own `server.py`, `shared/` and `client_sdk.py`.
+
+Everything runs in a bare environment outside the repository (`tests.packaging.bare`).
+"""
+
+import ast
+import email
+import subprocess
+import tarfile
+import zipfile
+from pathlib import Path
+from typing import NamedTuple
+
+import pytest
+
+from hatch_build import FOLDERS
+from tests.packaging.bare import ROOT, build, environment, run
+from tests.packaging.test_rewriting import imported
+
+pytestmark = pytest.mark.e2e
+
+PACKAGES = ("numpy", "websockets", "msgpack", "prometheus-client", "pyjwt", "structlog", "uvloop", "pettingzoo")
+"""What `sovereign-netcode[server,agents]` requires but Numba, which would compile the kernels anew."""
+
+
+class Installed(NamedTuple):
+    """A bare environment with the wheel, and a folder of a user's files."""
+
+    python: Path
+    folder: Path
+
+    def run(self, *arguments: str) -> str:
+        """Runs the environment's Python in the user's folder. Returns the output."""
+        return run(self.folder, str(self.python), *arguments)
+
+    def command(self, name: str, *arguments: str) -> str:
+        """Runs an installed command in the user's folder. Returns the output."""
+        return run(self.folder, str(self.python.parent / name), *arguments)
+
+
+@pytest.fixture(scope="module")
+def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with the wheel and the source distribution."""
+    place = tmp_path_factory.mktemp("built")
+    build(ROOT, place, "wheel", "sdist")
+    return place
+
+
+@pytest.fixture(scope="module")
+def wheel(built: Path) -> Path:
+    (found,) = built.glob("*.whl")
+    return found
+
+
+@pytest.fixture(scope="module")
+def installed(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Installed:
+    place = tmp_path_factory.mktemp("user")
+    folder = place / "game"
+    (folder / "shared").mkdir(parents=True)
+    (folder / "server.py").write_text("NAME = 'my server'\n", "utf-8")
+    (folder / "client_sdk.py").write_text("NAME = 'my client'\n", "utf-8")
+    (folder / "shared" / "__init__.py").write_text("NAME = 'my shared'\n", "utf-8")
+    return Installed(environment(place / "venv", wheel, *PACKAGES), folder)
+
+
+def names(wheel: Path) -> set[str]:
+    """All files of a wheel but its metadata, relative to the package."""
+    with zipfile.ZipFile(wheel) as archive:
+        files = {Path(name) for name in archive.namelist()}
+    assert {file.parts[0] for file in files} == {"sovereign_netcode", "sovereign_netcode-0.1.0.dist-info"}
+    return {"/".join(file.parts[1:]) for file in files if file.parts[0] == "sovereign_netcode"}
+
+
+def known_to_git(*places: str) -> set[str]:
+    """All files that git has or would take."""
+    command = ("git", "ls-files", "-z", "--cached", "--others", "--exclude-standard", "--", *places)
+    listed = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True).stdout
+    return {name for name in listed.split("\0") if name and (ROOT / name).exists()}
+
+
+def test_the_wheel_has_one_package_with_every_file_of_the_product(wheel: Path) -> None:
+    own = {name.removeprefix("sovereign_netcode/") for name in known_to_git("sovereign_netcode")}
+    missing = (known_to_git(*FOLDERS) | own - {"_checkout.py"}) - names(wheel)
+    assert missing == set()
+    assert {"py.typed", "server/live.html", "shared/scenes/hills.toml", "server/__main__.py"} <= names(wheel)
+
+
+def test_no_source_of_the_wheel_imports_a_folder(wheel: Path) -> None:
+    with zipfile.ZipFile(wheel) as archive:
+        for name in archive.namelist():
+            if name.endswith(".py"):
+                source = archive.read(name).decode()
+                ast.parse(source)
+                assert [module for module in imported(source) if module.partition(".")[0] in FOLDERS] == [], name
+
+
+def test_the_metadata_says_what_it_is(wheel: Path) -> None:
+    with zipfile.ZipFile(wheel) as archive:
+        metadata = email.message_from_bytes(archive.read("sovereign_netcode-0.1.0.dist-info/METADATA"))
+        commands = archive.read("sovereign_netcode-0.1.0.dist-info/entry_points.txt").decode()
+        licence = archive.read("sovereign_netcode-0.1.0.dist-info/licenses/LICENSE")
+    assert str(metadata.get_payload()).startswith("# Sovereign Netcode\n")
+    assert "Typing :: Typed" in metadata.get_all("Classifier", [])
+    assert metadata["License-Expression"] == "MIT"
+    assert licence == (ROOT / "LICENSE").read_bytes()
+    assert "sovereign-server = sovereign_netcode.commands:server" in commands
+
+
+def test_the_source_distribution_has_what_git_has_and_makes_the_same_wheel(
+    built: Path, wheel: Path, tmp_path: Path
+) -> None:
+    (found,) = built.glob("*.tar.gz")
+    with tarfile.open(found) as archive:
+        archive.extractall(tmp_path, filter="data")
+    (source,) = tmp_path.iterdir()
+    files = {file.relative_to(source).as_posix() for file in source.rglob("*") if file.is_file()}
+    assert files - {"PKG-INFO"} == known_to_git()
+    build(source, tmp_path / "again", "wheel")
+    assert (tmp_path / "again" / wheel.name).read_bytes() == wheel.read_bytes()
+
+
+def test_nothing_of_the_users_is_hidden_and_nothing_of_ours_hides(installed: Installed) -> None:
+    program = (
+        "import sovereign_netcode.server.game, sovereign_netcode.client_sdk, sovereign_netcode.shared.world\n"
+        "import server, shared, client_sdk\n"
+        "print(server.NAME, shared.NAME, client_sdk.NAME, sovereign_netcode.__path__)\n"
+    )
+    said = installed.run("-c", program)
+    assert said.startswith("my server my shared my client ")
+    assert str(ROOT) not in said
+
+
+def test_every_module_can_be_imported(installed: Installed) -> None:
+    program = (
+        "import importlib, pkgutil, sys, sovereign_netcode\n"
+        "for found in pkgutil.walk_packages(sovereign_netcode.__path__, 'sovereign_netcode.'):\n"
+        "    if not found.name.endswith('__main__'):\n"
+        "        importlib.import_module(found.name)\n"
+        "print(sorted({'server', 'shared', 'client_sdk', 'scripts', 'tests'} & sys.modules.keys()))\n"
+    )
+    assert installed.run("-W", "error", "-c", program) == "[]\n"
+
+
+def test_the_server_runs_as_a_module_and_as_a_command(installed: Installed) -> None:
+    said = installed.run("-m", "sovereign_netcode.server", "--list-scenes")
+    assert "hills" in said
+    assert installed.command("sovereign-server", "--list-scenes") == said
