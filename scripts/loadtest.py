@@ -196,10 +196,11 @@ def _duration(text: str) -> float:
 
 
 async def until_signal(args: argparse.Namespace, console: Console) -> int:
-    """The test; SIGTERM ends it as Ctrl-C does."""
+    """Runs the test until its end, SIGTERM or SIGINT, which a script's background process ignores otherwise."""
     task = asyncio.ensure_future(test(args, console))
     with contextlib.suppress(NotImplementedError):  # Windows
-        asyncio.get_running_loop().add_signal_handler(signal.SIGTERM, task.cancel)
+        for number in (signal.SIGINT, signal.SIGTERM):
+            asyncio.get_running_loop().add_signal_handler(number, task.cancel)
     try:
         return await task
     except CannotStartError as error:

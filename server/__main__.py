@@ -1,16 +1,17 @@
 """`python -m server`: see `--help`."""
 
 import sys
-from pathlib import Path
+
+from server.extras import ROOT, install
 
 try:
     from server.app import main
 except ModuleNotFoundError as error:
-    if (error.name or "").partition(".")[0] in ("server", "shared"):
+    if (error.name or "").partition(".")[0] in ("server", "shared", "sovereign_netcode"):
         raise
-    if (Path(__file__).parents[1] / ".venv").is_dir():
-        sys.exit(f"error: the server needs {error.name} as well, which is in .venv: . .venv/bin/activate")
-    sys.exit(f"error: the server needs {error.name} as well: pip install 'sovereign-netcode[server]'")
+    ready = (ROOT / ".venv").is_dir()
+    way = ". .venv/bin/activate (it is in .venv)" if ready else install("server")
+    sys.exit(f"error: the server needs {error.name}, which is not installed here: {way}")
 
 if __name__ == "__main__":
     sys.exit(main())

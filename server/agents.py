@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from server.extras import install
 from server.game import Game
 from server.limits import Limits
 from server.recorder import RecordedWorld
@@ -33,7 +34,7 @@ try:
     from gymnasium import spaces
     from pettingzoo import ParallelEnv
 except ImportError as missing:
-    raise ImportError("agents need PettingZoo: pip install sovereign-netcode[agents]") from missing
+    raise ImportError(f"agents need PettingZoo, which is not installed here: {install('agents')}") from missing
 
 OTHERS = 8
 """So many of the nearest entities an agent sees,"""

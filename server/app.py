@@ -23,6 +23,7 @@ from server.game import Game
 from server.gateway import Gateway
 from server.histogram import Histogram
 from server.kinds import SettingsError, nearest
+from server.listening import bracketed, reachable
 from server.live import Live
 from server.metrics import metrics_page
 from server.pages import Pages, json_page, ready_page
@@ -136,6 +137,7 @@ class Server:
             ),
             figures=settings.figures,
             origins=settings.allowed_origins,
+            hosts=(settings.host, *settings.allowed_hosts),
             closing=lambda: settings.restart_s if self.draining else None,
         )
         self.gateway = Gateway(game, self.door, self.faults)
@@ -151,7 +153,7 @@ class Server:
         loop.set_exception_handler(self._loop_failed)
         self._stop = loop.create_future()
         with on_signals(loop, lambda name: self._end(name, 0)):
-            host, port = await self._listen(tls_context(self.settings))
+            address, port = await self._listen(tls_context(self.settings))
             rate = self.game.scene.tick_rate
             if self.store is not None:
                 self.store.start(self.game.keep)
@@ -160,9 +162,10 @@ class Server:
             freeze()
             kind = type(loop).__module__.partition(".")[0]
             logger.info("started", scene=self.game.scene.name, tick_rate=rate, loop=kind, auth=self.settings.auth)
-            scheme = "ws" if self.settings.tls_cert is None else "wss"
-            shown = f"[{host}]" if ":" in host else host
-            print(f"listening on {scheme}://{shown}:{port}", flush=True)
+            secure, host = "" if self.settings.tls_cert is None else "s", self.settings.host
+            print(f"listening on ws{secure}://{bracketed(host)}:{port}", flush=True)
+            if self.settings.page and self.door.trusted(reachable(address)):
+                print(f"live page at http{secure}://{bracketed(reachable(host))}:{port}/", flush=True)
             reason, code = await self._stop
         self.watchdog.stop()
         logger.info("stopping", reason=reason, connections=len(self.gateway.connections))

@@ -8,6 +8,7 @@ import urllib.request
 from collections.abc import Mapping, Sequence
 
 from server.kinds import Parser, SettingsError
+from server.listening import bracketed, reachable
 
 TIME_OUT_S = 3.0
 
@@ -18,12 +19,13 @@ def main(arguments: Sequence[str], environment: Mapping[str, str] = os.environ) 
     Raises:
         SettingsError: the address is none.
     """
+    host = bracketed(reachable(environment.get("SOVEREIGN_HOST", "127.0.0.1").strip("[]")))
     port = environment.get("SOVEREIGN_PORT", "8765")
     scheme = "https" if "SOVEREIGN_TLS_CERT" in environment else "http"
     parser = Parser(
         prog="python -m server check", description="Exit code 0 if the server is ready for players.", allow_abbrev=False
     )
-    default = f"{scheme}://127.0.0.1:{port}/readyz"
+    default = f"{scheme}://{host}:{port}/readyz"
     parser.add_argument("--url", default=default, help=f"what to ask, or just ws://HOST:PORT (default: {default})")
     url = page(parser.flags(arguments)["url"])
     # It asks whether the server works, often by another name than the one in its certificate: nothing is kept secret.

@@ -4,10 +4,15 @@ A gateway tells `arrive` of each connection, asks `answer` what to do with its r
 gone. A request for a WebSocket that is refused gets an HTTP status and a reason; nothing has been set up for it by
 then. Pages are answered even when the server is full, so that whoever watches it does not take it for dead: `SPARE`
 connections beyond the limits get that far, and those beyond them are dropped without a word.
+
+A page in a browser may come from a name that somebody else has pointed at this machine (DNS rebinding); the browser
+then lets that page read what this server answers. So a request for a page is refused if it calls the server by a name
+that is not its own. A request for a WebSocket is judged by its origin: clients that are no browsers send none.
 """
 
 import ipaddress
 import math
+import re
 from collections import Counter
 from collections.abc import Callable
 from http import HTTPStatus
@@ -22,11 +27,19 @@ SPARE_PER_ADDRESS = 4
 """and of one address."""
 BURST_S = 2.0
 RETRY_S = "2"
+NOT_OWN = "is not a name of this server; its operator can add it to allowed_hosts"
+HOST = re.compile(r"(?:\[([^]]*)\]|([^]:%[]*))(?::\d*)?")
+"""The header `Host`: an IPv6 address in brackets, or a name or IPv4 address; and a port."""
+ANY = "*"
+"""The entry of a list of origins or host names that allows all."""
 NOBODY = ipaddress.IPv6Address("2000::")
 
 
 class Request(NamedTuple):
-    """What matters of an HTTP request. `upgrade`: it asks for a WebSocket."""
+    """What matters of an HTTP request.
+
+    `host` is the header, empty if there is none; `upgrade`: the request asks for a WebSocket.
+    """
 
     method: str
     target: str
@@ -41,6 +54,7 @@ class Door:
     Args:
         figures: whose addresses may see the private pages: none, loopback, private or all.
         origins: see `Settings.allowed_origins`.
+        hosts: names by which a page may be asked for; see `Settings.allowed_hosts`.
         closing: the seconds after which to come back once the server is going down; None while it is not.
     """
 
@@ -51,6 +65,7 @@ class Door:
         *,
         figures: str = "private",
         origins: tuple[str, ...] = (),
+        hosts: tuple[str, ...] = (),
         closing: Callable[[], float | None] = lambda: None,
     ) -> None:
         self.limits = limits or Limits()
@@ -59,6 +74,7 @@ class Door:
         self._pages = pages or Pages()
         self._figures = figures
         self._origins = frozenset(origin.rstrip("/").lower() for origin in origins)
+        self._hosts = frozenset(host.removesuffix(".").lower() for host in hosts)
         self._closing = closing
         self.total = 0
         """Connections that have come and not gone."""
@@ -90,7 +106,10 @@ class Door:
     def answer(self, request: Request, address: str, now: float) -> Page | None:
         """What to answer to a request; None: let it have its WebSocket."""
         if not request.upgrade:
-            return self._pages.get(request.method, request.target, trusted=self._trusted(address))
+            if request.host and ANY not in self._hosts and not self._own(request.host):
+                self.refused["host"] += 1
+                return line(HTTPStatus.MISDIRECTED_REQUEST, f"{request.host[:100]!r} {NOT_OWN}")
+            return self._pages.get(request.method, request.target, trusted=self.trusted(address))
         reason, page = self._refusal(request, address, now)
         if page is not None:
             self.refused[reason] += 1
@@ -125,19 +144,25 @@ class Door:
         return True
 
     def _welcome(self, request: Request) -> bool:
-        """Only browsers send an origin, and they tell the truth about it.
-
-        The own host is known by its address only: a name in `Host` may be one that somebody else has pointed here.
-        """
-        if request.origin is None or "*" in self._origins:
+        """Whether the origin, which only browsers send, is an allowed one or a page of this server itself."""
+        if request.origin is None or ANY in self._origins:
             return True
         origin, host = request.origin.lower(), request.host.lower()
-        return origin in self._origins or (_is_address(host) and origin.partition("://")[2] == host)
+        return origin in self._origins or (self._own(host) and origin.partition("://")[2] == host)
+
+    def _own(self, host: str) -> bool:
+        """Whether the header `Host`, with or without a port, is an IP address, localhost or a name of this server."""
+        found = HOST.fullmatch(host)
+        if found is None:
+            return False
+        name = (found[2] or "").removesuffix(".").lower()
+        return name == "localhost" or name in self._hosts or _parsed(found[1] or found[2] or "") != NOBODY
 
     def _limited(self, address: str) -> bool:
         return not (self.limits.loopback_exempt and is_loopback(address))
 
-    def _trusted(self, address: str) -> bool:
+    def trusted(self, address: str) -> bool:
+        """Whether an address may see the private pages."""
         match self._figures:
             case "all":
                 return True
@@ -158,12 +183,6 @@ def network_of(address: str) -> str:
     """What connections are counted by: an IPv4 address, or an IPv6 network of 64 bits, which one customer has."""
     parsed = _parsed(address)
     return str(parsed) if parsed.version == 4 else str(int(parsed) >> 64)
-
-
-def _is_address(host: str) -> bool:
-    """Whether the `Host` of a request, with or without a port, is no name; `localhost` is none."""
-    bare = host[1:].partition("]")[0] if host.startswith("[") else host.partition(":")[0]
-    return bare == "localhost" or _parsed(bare) != NOBODY
 
 
 def _parsed(address: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address:

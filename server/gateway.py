@@ -31,6 +31,7 @@ from websockets.server import ServerProtocol
 from server.door import Door, Request
 from server.faults import Faults
 from server.handshakes import Guest, Handshakes
+from server.listening import listeners
 from server.pages import Page
 from shared.messages import CLIENT_MESSAGE_MAX
 
@@ -103,32 +104,37 @@ class Gateway:
         self.door = door or Door()
         self.faults = faults or Faults()
         self.connections: set[Connection] = set()
-        self._server: asyncio.Server | Handshakes | None = None
+        self._servers: list[asyncio.Server | Handshakes] = []
         self._fewer: asyncio.Event = asyncio.Event()
         self._closing = False
 
     async def listen(self, host: str, port: int, tls: ssl.SSLContext | None = None) -> tuple[str, int]:
-        """Starts to accept, in TLS if there is a context for it; returns the address (port 0 picks one).
+        """Starts to accept on every address of a host, in TLS if there is a context for it.
+
+        Returns:
+            The first of the host's addresses, and the port (with port 0, the one that the system picked).
 
         Raises:
-            OSError: the address cannot be used.
+            OSError: see `listeners`.
         """
         loop = asyncio.get_running_loop()
-        if tls is None:
-            self._server = await loop.create_server(lambda: Connection(self, loop), host, port, backlog=ACCEPT_BACKLOG)
-        else:
-            self._server = Handshakes(lambda: Connection(self, loop), tls, self.door.limits.handshake_s)
-            await self._server.listen(host, port, ACCEPT_BACKLOG)
-        sockets = self._server.sockets
-        address = sockets[0].getsockname()
-        # A name with several addresses has a port of its own on each if the system picked them.
-        return (host if port or len(sockets) == 1 else address[0]), address[1]
+        sockets = await listeners(host, port, ACCEPT_BACKLOG)
+        address: tuple[str, int] = sockets[0].getsockname()[:2]
+        if tls is not None:
+            handshakes = Handshakes(lambda: Connection(self, loop), tls, self.door.limits.handshake_s)
+            handshakes.listen(sockets)
+            self._servers = [handshakes]
+            return address
+        for listener in sockets:
+            server = await loop.create_server(lambda: Connection(self, loop), sock=listener, backlog=ACCEPT_BACKLOG)
+            self._servers.append(server)
+        return address
 
     def stop_listening(self) -> None:
         """No new connection, and an end to those that have not become WebSockets."""
         self._closing = True
-        if self._server is not None:
-            self._server.close()
+        for server in self._servers:
+            server.close()
         for connection in list(self.connections):
             if not connection.opened:
                 connection.abort()
@@ -292,9 +298,7 @@ class Connection(Guest):
         protocol, headers = self._protocol, request.headers
         upgrade = any("websocket" in value.lower() for value in headers.get_all("Upgrade"))
         origins, hosts = headers.get_all("Origin"), headers.get_all("Host")
-        asked = Request(
-            request.method, request.path, hosts[0] if hosts else "", " ".join(origins) if origins else None, upgrade
-        )
+        asked = Request(request.method, request.path, " ".join(hosts), " ".join(origins) if origins else None, upgrade)
         page = self._gateway.door.answer(asked, self._address or "", time.monotonic())
         protocol.send_response(protocol.accept(request) if page is None else _response(page))
 

@@ -6,7 +6,6 @@ is asked first.
 """
 
 import asyncio
-import errno
 import socket
 import ssl
 from abc import abstractmethod
@@ -46,27 +45,10 @@ class Handshakes:
         self.sockets: list[socket.socket] = []
         """Those that listen."""
 
-    async def listen(self, host: str, port: int, backlog: int) -> None:
-        """Begins, on all addresses of the host (empty: of this machine) whose family this system has, as asyncio does.
-
-        Raises:
-            OSError: there is none, or one of them cannot be used.
-        """
-        found = await self._loop.getaddrinfo(host or None, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
-        try:
-            for family, _, _, _, address in dict.fromkeys(found):
-                try:
-                    self.sockets.append(socket.create_server(address, family=family, backlog=backlog))
-                except OSError as error:
-                    if error.errno != errno.EAFNOSUPPORT:
-                        raise
-        except OSError:
-            self.close()
-            raise
-        if not self.sockets:
-            raise OSError(errno.EAFNOSUPPORT, f"{host}: no address of a family that this system has")
-        for listener in self.sockets:
-            listener.setblocking(False)
+    def listen(self, sockets: list[socket.socket]) -> None:
+        """Begins to accept on sockets that listen already and do not block."""
+        self.sockets = sockets
+        for listener in sockets:
             self._keep(self._loop.create_task(self._accept(listener)))
 
     def close(self) -> None:

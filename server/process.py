@@ -3,6 +3,7 @@
 import asyncio
 import contextlib
 import gc
+import logging
 import os
 import signal
 import sys
@@ -11,11 +12,17 @@ from pathlib import Path
 from types import FrameType
 from typing import TextIO
 
+COMPILING = "compiling the physics for this machine, which takes 5 to 20 s the first time"
 
-def announce_compiling(terminal: TextIO) -> None:
-    """What whoever waits in front of a terminal should know; a log has no use for it."""
-    if terminal.isatty():
-        print("compiling the physics for this machine, which takes 5 to 20 s the first time ...", file=terminal)
+logger = logging.getLogger(__name__)
+
+
+def announce_compiling(stream: TextIO) -> None:
+    """Says why the first start takes long: on a terminal as plain text, else in the log."""
+    if stream.isatty():
+        print(f"{COMPILING} ...", file=stream, flush=True)
+    else:
+        logger.info(COMPILING)
 
 
 def freeze() -> None:
@@ -52,9 +59,14 @@ def loop_factory() -> Callable[[], asyncio.AbstractEventLoop]:
 
 
 def signals() -> list[signal.Signals]:
-    """What ends a server: SIGINT and SIGTERM, and on Windows Ctrl-Break."""
-    names = ("SIGINT", "SIGTERM", "SIGBREAK")
-    return [getattr(signal, name) for name in names if hasattr(signal, name)]
+    """The signals that end a server: SIGINT, SIGTERM, Ctrl-Break on Windows, and SIGHUP (its terminal has closed).
+
+    SIGINT counts even where the starter had it ignored, as a shell does for what a script starts in the background. An
+    ignored SIGHUP stays ignored: that is what `nohup` is for.
+    """
+    names = ("SIGINT", "SIGTERM", "SIGBREAK", "SIGHUP")
+    there = [signal.Signals(getattr(signal, name)) for name in names if hasattr(signal, name)]
+    return [each for each in there if each.name != "SIGHUP" or signal.getsignal(each) is not signal.SIG_IGN]
 
 
 def leave(number: int, frame: FrameType | None) -> None:

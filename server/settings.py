@@ -10,7 +10,7 @@ from itertools import takewhile
 from pathlib import Path
 from typing import Any
 
-from server.door import is_loopback
+from server.door import ANY, is_loopback
 from server.kinds import Kind, Parser, SettingsError, checked, kinds_of, nearest, setting, to_toml
 from server.limits import Limits
 from server.log import FORMATS
@@ -34,8 +34,8 @@ EPILOG = f"""\
 Other commands: `python -m server token --help` (issue tokens), `python -m server check --help` (is it ready?).
 Each setting can also come from the environment ({ENV_PREFIX}PORT=9000) or from a TOML file (port = 9000; see
 --print-config). A flag wins over the environment, that over the file, and that over the default.
-The server prints one line, "listening on ws://HOST:PORT", when it is ready, and answers GET /healthz, /readyz,
-/stats and /metrics on the same port, and / with a live page. SIGTERM or SIGINT: clients are told, exit code 0.
+The server prints "listening on ws://HOST:PORT" when it is ready, then the address of its live page. It answers GET
+/healthz, /readyz, /stats and /metrics on the same port. SIGTERM, SIGINT or SIGHUP: clients are told, exit code 0.
 A bad setting: exit code 2.
 """
 
@@ -74,6 +74,15 @@ class Settings:
             "ORIGIN,...",
         ),
     )
+    allowed_hosts: tuple[str, ...] = setting(
+        (),
+        Kind(
+            tuple,
+            "names by which pages (/stats, /healthz, ...) may be asked for, besides IP addresses, localhost and the "
+            "name in host; * for all",
+            "NAME,...",
+        ),
+    )
     restart_s: float = setting(
         2.0, Kind(float, "when it ends, clients are told to come back after so long", "S", 0, 3600)
     )
@@ -106,7 +115,7 @@ class Settings:
 
 GROUPS = {
     "what is played": ("scene", "game", "seed", "tick_rate", "reach"),
-    "where it listens": ("host", "port", "tls_cert", "tls_key", "allowed_origins"),
+    "where it listens": ("host", "port", "tls_cert", "tls_key", "allowed_origins", "allowed_hosts"),
     "who may play": ("auth", "auth_key_file"),
     "what is kept": ("data", "durability", "checkpoint_s", "record"),
     "what is told": ("log_level", "log_format", "figures", "restart_s"),
@@ -151,6 +160,8 @@ def load(flags: Mapping[str, str], environment: Mapping[str, str], config: str |
             take(name, environment[variable], variable)
     for name, value in flags.items():
         take(name, value, "--" + name.replace("_", "-"))
+    if "host" in values:
+        values["host"] = values["host"].removeprefix("[").removesuffix("]")  # an IPv6 address as it stands in a URL
     limits = Limits(**{name: values.pop(name) for name in SECTIONS["limits"] if name in values})
     settings = Settings(**values, limits=limits, origins=origins)
     _check_together(settings)
@@ -169,6 +180,12 @@ def _check_together(settings: Settings) -> None:
         raise SettingsError(
             f"auth = {settings.auth!r} (from {settings.origins['auth']}): must be none, token, or MODULE:NAME"
         )
+    for name in settings.allowed_hosts:
+        if any(sign in name for sign in ":/[]*") and name != ANY:
+            raise SettingsError(
+                f"allowed_hosts = {name!r} (from {settings.origins['allowed_hosts']}): must be a host name, without "
+                f"scheme and port, or {ANY} for all"
+            )
     if (settings.tls_cert is None) != (settings.tls_key is None):
         given, missing = ("tls_cert", "tls_key") if settings.tls_key is None else ("tls_key", "tls_cert")
         raise SettingsError(f"{given} (from {settings.origins[given]}): needs {missing} as well")

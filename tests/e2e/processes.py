@@ -4,6 +4,7 @@ import json
 import os
 import queue
 import re
+import signal
 import subprocess
 import sys
 import threading
@@ -13,6 +14,8 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
+
+from server.process import COMPILING
 
 ROOT = Path(__file__).resolve().parents[2]
 START_S = 90.0
@@ -74,9 +77,9 @@ class ServerProcess:
         return code
 
     def log(self, *, but: str = "") -> list[dict[str, Any]]:
-        """What it has logged so far, but for what is of one level."""
+        """Its log so far, without the entries of one level, and without the one of a start that compiles."""
         entries = [json.loads(line) for line in self.errors]
-        return [entry for entry in entries if entry["level"] != but]
+        return [entry for entry in entries if entry["level"] != but and entry["event"] != COMPILING]
 
     def rest(self) -> list[str]:
         """The lines on stdout that nobody has read yet."""
@@ -92,6 +95,17 @@ class ServerProcess:
         for stream in (self.process.stdout, self.process.stderr):
             assert stream is not None
             stream.close()
+
+
+@contextmanager
+def ignoring(*signals: int) -> Iterator[None]:
+    """What is started meanwhile ignores these signals from its beginning."""
+    before = {number: signal.signal(number, signal.SIG_IGN) for number in signals}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 @contextmanager

@@ -6,11 +6,13 @@ import signal
 import subprocess
 import sys
 from collections.abc import Iterator
+from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
 
 from tests.client_sdk.servers import real_server
+from tests.e2e.processes import ignoring
 
 pytestmark = pytest.mark.e2e
 needs_linux = pytest.mark.skipif(sys.platform != "linux", reason="looks for processes in /proc")
@@ -87,10 +89,12 @@ def test_a_broken_scene_is_one_clear_line() -> None:
 
 
 @pytest.fixture
-def playing() -> Iterator[tuple["subprocess.Popen[str]", dict[int, str]]]:
+def playing(request: pytest.FixtureRequest) -> Iterator[tuple["subprocess.Popen[str]", dict[int, str]]]:
     """A load test in the midst of it: its process, and those that it has started, with their commands."""
     command = [sys.executable, "-u", "scripts/loadtest.py", "--clients", "4", "--processes", "2", "--seconds", "60"]
-    with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True) as process:
+    with ExitStack() as stack:
+        with ignoring(*getattr(request, "param", ())):
+            process = stack.enter_context(subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True))
         try:
             assert process.stdout is not None
             for line in process.stdout:
@@ -111,6 +115,7 @@ def playing() -> Iterator[tuple["subprocess.Popen[str]", dict[int, str]]]:
 
 @needs_linux
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("playing", [(), (signal.SIGINT,)], ids=["", "in a script's background"], indirect=True)
 def test_a_signal_leaves_nothing_behind(
     playing: tuple["subprocess.Popen[str]", dict[int, str]], number: signal.Signals
 ) -> None:

@@ -21,7 +21,7 @@ from client_sdk.client import Client
 from client_sdk.transports.connection import ConnectError
 from server.tokens import issue
 from shared.messages import UNAUTHORISED, VERSION, Bye, Hello, Inputs, Message, Welcome, decode_from_server, encode
-from tests.e2e.processes import END_S, START_S, UPGRADE, ServerProcess, other, page, running, stats, until
+from tests.e2e.processes import END_S, START_S, UPGRADE, ServerProcess, ignoring, other, page, running, stats, until
 
 pytestmark = pytest.mark.e2e
 
@@ -71,7 +71,7 @@ def test_serves_and_tells_its_clients_when_it_ends() -> None:
         assert bye.wait > 0
         assert server.end() == 0
         assert time.monotonic() - asked < 4
-        assert server.rest() == []
+        assert server.rest() == [f"live page at http://127.0.0.1:{address[1]}/\n"]
         assert [(entry["level"], entry["event"]) for entry in server.log()] == [
             ("info", "started"), ("info", "stopping"), ("info", "stopped"),
         ]  # fmt: skip
@@ -210,6 +210,33 @@ def test_a_second_signal_ends_it_at_once() -> None:
         asked = time.monotonic()
         assert server.end(signal.SIGINT) == -signal.SIGINT
         assert time.monotonic() - asked < 1
+
+
+@pytest.mark.skipif(os.name == "nt", reason="a signal ends a process there")
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_ends_it_that_its_starter_had_it_ignore(number: signal.Signals) -> None:
+    """A shell does so with SIGINT for what a script starts in the background."""
+    with ignoring(number), running("--port", "0", "--scene", "flat") as server:
+        server.address()
+        assert server.end(number) == 0
+        assert server.log()[-1]["event"] == "stopped"
+
+
+@pytest.mark.skipif(os.name == "nt", reason="there is no such signal")
+def test_a_terminal_that_closes_ends_it_in_order_and_nohup_keeps_it() -> None:
+    with running("--port", "0", "--scene", "flat") as server:
+        address = server.address()
+        with joined(address) as (link, _):
+            server.process.send_signal(signal.SIGHUP)
+            assert isinstance(last_words(link), Bye)
+        assert server.end() == 0
+    with ignoring(signal.SIGHUP), running("--port", "0", "--scene", "flat") as server:
+        address = server.address()
+        server.process.send_signal(signal.SIGHUP)
+        tick = stats(address)["tick"]
+        until(lambda: stats(address)["tick"] > tick + 5)
+        assert server.end(signal.SIGTERM) == 0
+        assert [entry["reason"] for entry in server.log() if entry["event"] == "stopping"] == ["SIGTERM"]
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="asks /proc")

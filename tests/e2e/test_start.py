@@ -1,18 +1,25 @@
 """How a server process starts, or says in one line why not; and its other commands."""
 
+import contextlib
+import http.client
 import io
+import json
 import os
+import re
+import shutil
 import signal
 import socket
 import subprocess
 import sys
+import urllib.request
 from pathlib import Path
 
 import pytest
 
-from server.process import announce_compiling
+from client_sdk.client import Client
+from server.process import COMPILING, announce_compiling
 from shared import kernels
-from tests.e2e.processes import ROOT, other, running, stats, until
+from tests.e2e.processes import ROOT, START_S, other, page, running, stats, until
 
 pytestmark = pytest.mark.e2e
 
@@ -41,14 +48,109 @@ def test_the_first_start_says_on_a_terminal_what_takes_so_long(tmp_path: Path) -
     assert on_a_terminal(tmp_path) == ["listening"]
 
 
-def test_a_log_is_not_told() -> None:
+@pytest.mark.slow
+@pytest.mark.skipif(not kernels.available(), reason="there is nothing to compile")
+def test_the_first_start_says_in_a_log_what_takes_so_long(tmp_path: Path) -> None:
+    for lines in ([COMPILING], []):
+        with running("--port", "0", "--scene", "flat", NUMBA_CACHE_DIR=str(tmp_path)) as server:
+            server.address()
+            assert server.end(signal.SIGTERM) == 0
+            assert [json.loads(line)["event"] for line in server.errors if "compiling" in line] == lines
+
+
+def test_a_terminal_gets_plain_text_and_anything_else_a_line_of_the_log(caplog: pytest.LogCaptureFixture) -> None:
     class Terminal(io.StringIO):
         def isatty(self) -> bool:
             return True
 
-    for stream, lines in ((Terminal(), 1), (io.StringIO(), 0)):
+    caplog.set_level("INFO")
+    for stream, shown, logged in ((Terminal(), f"{COMPILING} ...\n", []), (io.StringIO(), "", [COMPILING])):
         announce_compiling(stream)
-        assert stream.getvalue().count("\n") == lines
+        assert stream.getvalue() == shown
+        assert caplog.messages == logged
+
+
+PAGE_IS = [
+    ((), "http://127.0.0.1:{port}/"),
+    (("--host", "localhost"), "http://localhost:{port}/"),
+    (("--host", "0.0.0.0", "--auth", "none"), "http://127.0.0.1:{port}/"),
+    (("--host", "0.0.0.0", "--auth", "none", "--figures", "loopback"), "http://127.0.0.1:{port}/"),
+    (("--host", "::", "--auth", "none"), "http://127.0.0.1:{port}/"),
+    (("--host", "::1"), "http://[::1]:{port}/"),
+    (("--page", "false"), None),
+    (("--figures", "none"), None),
+]
+
+
+@pytest.mark.parametrize(("flags", "shown"), PAGE_IS)
+def test_it_says_where_its_live_page_is(flags: tuple[str, ...], shown: str | None) -> None:
+    if "::" in "".join(flags) and not socket.has_dualstack_ipv6():
+        pytest.skip("no IPv6")
+    with running("--port", "0", "--scene", "flat", *flags) as server:
+        host, port = server.address()
+        assert host == (flags[1] if "--host" in flags else "127.0.0.1")
+        if shown is not None:
+            line = server.out.get(timeout=START_S)
+            assert line == f"live page at {shown.format(port=port)}\n"
+            with urllib.request.urlopen(line.split()[-1], timeout=START_S) as answer:
+                assert b"<canvas" in answer.read()
+        assert server.end(signal.SIGTERM) == 0
+        assert server.rest() == []
+
+
+def test_every_interface_is_reached_by_both_families() -> None:
+    if not socket.has_dualstack_ipv6():
+        pytest.skip("no IPv6")
+    with running("--port", "0", "--scene", "flat", "--host", "::", "--auth", "none") as server:
+        _, port = server.address()
+        for host in ("127.0.0.1", "[::1]"):
+            assert page((host, port), "/healthz") == "ok\n"
+            with Client.connect(f"ws://{host}:{port}"):
+                pass
+        assert server.end(signal.SIGTERM) == 0
+
+
+def test_pages_are_refused_by_a_name_of_somebody_else_until_it_is_allowed() -> None:
+    def asked(port: int, host: str) -> int:
+        connection = http.client.HTTPConnection("127.0.0.1", port, timeout=START_S)
+        with contextlib.closing(connection):
+            connection.request("GET", "/stats", headers={"Host": host})
+            return connection.getresponse().status
+
+    with running("--port", "0", "--scene", "flat", SOVEREIGN_ALLOWED_HOSTS="game,play.example") as server:
+        port = server.address()[1]
+        hosts = ("evil.example", f"game:{port}", "play.example", "127.0.0.1", "localhost")
+        assert [asked(port, host) for host in hosts] == [421, 200, 200, 200, 200]
+        assert stats(("127.0.0.1", port))["refused_at_door"] == {"host": 1}
+        assert server.end(signal.SIGTERM) == 0
+
+
+@pytest.mark.parametrize("folder", [".venv", ""])
+def test_a_library_that_is_missing_is_named_with_a_way_that_works(tmp_path: Path, folder: str) -> None:
+    shutil.copytree(ROOT / "server", tmp_path / "server", ignore=shutil.ignore_patterns("__pycache__"))
+    (tmp_path / folder).mkdir(exist_ok=True)
+    program = "import runpy, sys; sys.modules['structlog'] = None; runpy.run_module('server', run_name='__main__')"
+    ways = {".venv": ". .venv/bin/activate (it is in .venv)", "": f"pip install '{tmp_path}[server]'"}
+    for project in (True, False):
+        if project:
+            (tmp_path / "pyproject.toml").touch()
+        else:
+            (tmp_path / "pyproject.toml").unlink()
+            ways[""] = (
+                "pip install 'PATH[server]', where PATH is the repository or the wheel that this was installed from"
+            )
+        done = subprocess.run(
+            [sys.executable, "-c", program], cwd=tmp_path, capture_output=True, text=True, check=False
+        )
+        assert done.returncode == 1
+        assert done.stderr == f"error: the server needs structlog, which is not installed here: {ways[folder]}\n"
+
+
+def test_nothing_advises_to_install_a_name_that_is_on_no_index() -> None:
+    sources = [path for path in ROOT.glob("*/**/*") if path.suffix in (".py", ".md", ".mjs", ".html", ".toml")]
+    own = [path for path in (*sources, *ROOT.glob("*.md")) if not path.relative_to(ROOT).parts[0].startswith(".")]
+    advised = re.compile(r"pip install (?:--\S+ )*'?sovereign")
+    assert [path for path in own if path != Path(__file__) and advised.search(path.read_text("utf-8"))] == []
 
 
 def broken(tmp_path: Path, text: str) -> str:

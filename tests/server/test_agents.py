@@ -227,4 +227,5 @@ def test_without_pettingzoo_it_says_what_to_install() -> None:
     )
     assert done.returncode == 1
     last = done.stderr.splitlines()[-1]
-    assert last == "ImportError: agents need PettingZoo: pip install sovereign-netcode[agents]"
+    way = f"pip install '{ROOT}[agents]'"
+    assert last == f"ImportError: agents need PettingZoo, which is not installed here: {way}"

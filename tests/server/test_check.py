@@ -25,3 +25,24 @@ def test_what_is_no_address(url: str) -> None:
     with pytest.raises(SettingsError) as error:
         check.main(["--url", url], {})
     assert str(error.value) == f"url = {url!r}: must be like ws://HOST:PORT, wss://, http:// or https://"
+
+
+@pytest.mark.parametrize(
+    ("host", "asked"),
+    [
+        (None, "127.0.0.1"),
+        ("0.0.0.0", "127.0.0.1"),
+        ("::", "127.0.0.1"),
+        ("[::]", "127.0.0.1"),
+        ("::1", "[::1]"),
+        ("10.1.2.3", "10.1.2.3"),
+        ("play.example", "play.example"),
+    ],
+)
+def test_it_asks_where_the_server_of_the_same_environment_listens(
+    host: str | None, asked: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    environment = {"SOVEREIGN_PORT": "9000", **({} if host is None else {"SOVEREIGN_HOST": host})}
+    with pytest.raises(SystemExit):
+        check.main(["--help"], environment)
+    assert f"(default: http://{asked}:9000/readyz)" in " ".join(capsys.readouterr().out.split())

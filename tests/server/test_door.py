@@ -7,7 +7,7 @@ from server.limits import Limits
 from server.pages import Page, Pages
 
 JOIN = Request("GET", "/", "play.example:8765", None, upgrade=True)
-HEALTH = Request("GET", "/healthz", "play.example:8765", None, upgrade=False)
+HEALTH = Request("GET", "/healthz", "127.0.0.1:8765", None, upgrade=False)
 
 
 def refused(page: Page | None) -> tuple[int, str]:
@@ -160,6 +160,64 @@ def test_figures_are_not_for_everyone(figures: str, seen_from: list[str]) -> Non
         "2a00::1",
         "",
     ):
-        page = door.answer(Request("GET", "/stats", "x", None, upgrade=False), address, 0.0)
+        page = door.answer(Request("GET", "/stats", "127.0.0.1", None, upgrade=False), address, 0.0)
         assert page is not None
         assert page.status == (200 if address in seen_from else 403), address
+
+
+OWN_HOSTS = [
+    "", "127.0.0.1", "127.0.0.1:8765", "[::1]", "[::1]:8765", "192.168.1.7:81", "8.8.8.8", "[2a00::1]:8765",
+    "localhost", "LocalHost:8765", "localhost.", "play.example", "PLAY.example:8765", "play.example.:8765",
+]  # fmt: skip
+OTHER_HOSTS = [
+    "evil.example", "evil.example:8765", "127.0.0.1.evil.example", "localhost.evil.example", "x.localhost", "127.1",
+    "evil.example.play.example", "play.example.evil", "play.example:8765:1", "play.example 127.0.0.1",
+    "[::1]evil.example", "[evil.example]", "[::1", "::1",
+    "127.0.0.1%.evil.example", "[]", ":8765", ".", "*", "127.0.0.1 127.0.0.1", "\xff",
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("path", ["/", "/live", "/live/0", "/stats", "/metrics", "/healthz", "/readyz", "/nothing"])
+def test_pages_are_not_given_by_a_name_that_somebody_else_has_pointed_here(path: str) -> None:
+    figures = {path: lambda: Page(200, b"figures")}
+    door = Door(pages=Pages(private=figures), hosts=("127.0.0.1", "Play.example"))
+    for host in OWN_HOSTS:
+        assert refused(door.answer(Request("GET", path, host, None, upgrade=False), "127.0.0.1", 0.0))[0] == 200, host
+    assert door.refused == {}
+    for host in OTHER_HOSTS:
+        status, text = refused(door.answer(Request("GET", path, host, None, upgrade=False), "127.0.0.1", 0.0))
+        assert (status, text) == (
+            421, f"{host!r} is not a name of this server; its operator can add it to allowed_hosts",
+        ), host  # fmt: skip
+    assert door.refused == {"host": len(OTHER_HOSTS)}
+
+
+def test_an_operator_can_allow_every_name_for_pages_but_not_for_players_from_there() -> None:
+    door = Door(hosts=("*",))
+    for host in OTHER_HOSTS:
+        assert refused(door.answer(Request("GET", "/healthz", host, None, upgrade=False), "127.0.0.1", 0.0))[0] == 200
+        if host != "*":
+            player = Request("GET", "/", host, f"http://{host}", upgrade=True)
+            assert refused(door.answer(player, "127.0.0.1", 0.0))[0] == 403, host
+
+
+def test_a_client_that_is_no_browser_may_call_the_server_as_it_likes() -> None:
+    door = Door()
+    assert door.answer(Request("GET", "/", "evil.example:8765", None, upgrade=True), "127.0.0.1", 0.0) is None
+
+
+def test_browsers_come_from_the_own_pages_by_every_own_name() -> None:
+    door = Door(hosts=("play.example",))
+    for host, origin, welcome in (
+        ("play.example:8765", "http://play.example:8765", True),
+        ("PLAY.example", "https://play.EXAMPLE", True),
+        ("play.example:8765", "http://play.example:81", False),
+        ("play.example", "http://evil.example", False),
+        ("evil.example", "http://evil.example", False),
+    ):
+        assert (door.answer(Request("GET", "/", host, origin, upgrade=True), "1.2.3.4", 0.0) is None) is welcome
+
+
+def test_a_long_name_is_cut_in_the_answer() -> None:
+    _, text = refused(Door().answer(Request("GET", "/", "x" * 9000, None, upgrade=False), "1.2.3.4", 0.0))
+    assert len(text) < 250

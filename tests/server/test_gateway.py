@@ -557,9 +557,9 @@ def test_cut_here_or_parsed_by_websockets_comes_to_the_same(frames: list[bytes |
     assert outcome(chunks, plain=True) == outcome([stream[i : i + 1] for i in range(len(stream))], plain=False)
 
 
-async def get(bench: Bench, target: str, method: str = "GET") -> tuple[int, str, str]:
+async def get(bench: Bench, target: str, method: str = "GET", host: str = "Host: 127.0.0.1") -> tuple[int, str, str]:
     """Status, content type and body."""
-    peer = await bench.connect(f"{method} {target} HTTP/1.1\r\nHost: x\r\n\r\n".encode())
+    peer = await bench.connect(f"{method} {target} HTTP/1.1\r\n{host}\r\n\r\n".encode())
     head, _, body = (await peer.end()).decode().partition("\r\n\r\n")
     headers = dict(line.split(": ", 1) for line in head.splitlines()[1:])
     assert int(headers["Content-Length"]) == len(body)
@@ -574,6 +574,22 @@ async def test_pages(bench: Bench) -> None:
         status, _, body = await get(bench, target, method)
         assert (status, len(body.splitlines())) == (expected, 1)
     assert bench.notes.opened == []
+
+
+@pytest.mark.parametrize(
+    ("host", "status"),
+    [
+        ("Host: evil.example:8765", 421),
+        ("HOST: evil.example", 421),
+        ("Host: 127.0.0.1\r\nHost: evil.example", 421),
+        ("Host: evil.example\r\nHost: 127.0.0.1", 421),
+        ("X-Forwarded-Host: 127.0.0.1\r\nHost: evil.example", 421),
+        ("X-Forwarded-Host: evil.example\r\nHost: localhost", 200),
+        ("X-No-Browser: 1", 200),
+    ],
+)
+async def test_pages_are_for_the_servers_own_names(bench: Bench, host: str, status: int) -> None:
+    assert (await get(bench, "/stats", host=host))[0] == status
 
 
 async def test_stats_that_fail_are_our_mistake(bench: Bench) -> None:

@@ -47,6 +47,12 @@ def test_each_source_wins_over_the_one_before(tmp_path: Path) -> None:
     }
 
 
+def test_an_ipv6_address_may_stand_in_brackets_as_in_a_url() -> None:
+    assert settings(["--host", "[::1]"]).host == settings(["--host", "::1"]).host == "::1"
+    with pytest.raises(SettingsError, match="host = '::'"):
+        settings(["--host", "[::]"])
+
+
 def test_the_environment_can_name_the_file_and_the_flag_wins(tmp_path: Path) -> None:
     path = config(tmp_path, "port = 7")
     assert settings([], {"SOVEREIGN_CONFIG": path}).port == 7
@@ -79,6 +85,21 @@ def test_the_environment_can_name_the_file_and_the_flag_wins(tmp_path: Path) -> 
             ["--allowed-origins", "a,,b"],
             {},
             "allowed_origins = ('a', '', 'b') (from --allowed-origins): must be a list of texts without spaces",
+        ),
+        (
+            ["--allowed-hosts", "play.example,http://play.example"],
+            {},
+            "allowed_hosts = 'http://play.example' (from --allowed-hosts): must be a host name, without scheme",
+        ),
+        (
+            ["--allowed-hosts", "play.example:8765"],
+            {},
+            "allowed_hosts = 'play.example:8765' (from --allowed-hosts): must",
+        ),
+        (
+            [],
+            {"SOVEREIGN_ALLOWED_HOSTS": "*.example"},
+            "allowed_hosts = '*.example' (from SOVEREIGN_ALLOWED_HOSTS): must",
         ),
         (
             ["--log-level", "loud"],
