@@ -16,7 +16,7 @@ from _play_window import Window, keyboard
 from client_sdk.client import Client
 from client_sdk.transports.connection import ConnectError
 
-GAME = "scripts.examples.tag:Tag"
+GAME = "sovereign_netcode.examples.tag:Tag"
 FRAMES_PER_S = 60
 SCRIPT_S = 120.0
 """A scripted session that is not through by then has failed."""

@@ -15,11 +15,11 @@ import numpy as np
 import numpy.typing as npt
 import pygame
 
-from scripts.examples.tag import LEAVES, TRUNK
 from shared.blocks import AIR, Blocks
 from shared.checks import Cell
 from shared.terrain import GRASS, SOIL, STONE, WALL
 from shared.units import SEGMENT
+from sovereign_netcode.examples.tag import LEAVES, TRUNK
 
 HALF, QUARTER, RISE = 24, 12, 26
 """Half the width and half the height of a block's top, and the height of its sides, in pixels."""

@@ -6,9 +6,9 @@ from _play_iso import FIRST_KIND
 from _play_window import Window, Wish
 from client_sdk.events import Answered, Happened
 from client_sdk.picture import View
-from scripts.examples.tag_brain import TagPlayer
 from shared.checks import Cell
 from shared.inputs import JUMP, MOVE_MAX
+from sovereign_netcode.examples.tag_brain import TagPlayer
 
 TOWER = ((2, 0), (2, -1), (2, -2))
 """Where blocks are placed, from the player; one, two and three high."""

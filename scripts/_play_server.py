@@ -13,7 +13,7 @@ from pathlib import Path
 from client_sdk.bots import Bot, Wander
 from client_sdk.core import Core
 from client_sdk.transports.aio import AsyncClient
-from scripts.examples.tag_brain import TagPlayer
+from sovereign_netcode.examples.tag_brain import TagPlayer
 
 ROOT = Path(__file__).resolve().parent.parent
 START_S = 120.0

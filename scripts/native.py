@@ -31,7 +31,7 @@ MODULES = (
     "server/interest.py", "server/orders.py", "server/pacing.py", "server/replication.py", "server/roster.py",
     "server/session.py", "server/sight.py",
     "shared/edits.py", "shared/inputs.py", "shared/messages.py", "shared/ring.py", "shared/snapshot.py",
-    "tests/match.py",
+    "sovereign_netcode/playtest/match.py",
 )  # fmt: skip
 """What a tick of a server and of a client goes through. Classes in here cannot be derived from by other programs, so
 rules, policies and transports are none of it."""

@@ -30,7 +30,7 @@ from client_sdk.events import Corrected
 from client_sdk.links import PRESETS
 from client_sdk.stats import Stats
 from shared.scene import load_scene
-from tests.match import Match, Player, wander
+from sovereign_netcode.playtest import Match, Player, wander
 
 SETTLE_S = 10.0
 """The first seconds after the last player has joined do not count."""

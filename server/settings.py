@@ -28,7 +28,7 @@ DESCRIPTION = """\
 An authoritative game server: fixed ticks, WebSocket clients, one world of blocks, and the rules of a game on top.
 
   python -m server                                    players walk, jump, dig and build on hills
-  python -m server --game scripts.examples.tag:Tag    the sample game; scripts/play opens a window on it
+  python -m server --game sovereign_netcode.examples.tag:Tag    the sample game; scripts/play opens a window on it
 """
 EPILOG = f"""\
 Other commands: `python -m server token --help` (issue tokens), `python -m server check --help` (is it ready?).

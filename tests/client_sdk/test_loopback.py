@@ -6,13 +6,13 @@ from client_sdk.client import Client
 from client_sdk.events import Answered, Disconnected, Event, Happened, Joined, Left, Resumed
 from client_sdk.links import PRESETS
 from client_sdk.transports.loopback import LEAP_S, Loopback
-from scripts.examples.freeze import Freeze
-from scripts.examples.tag import Tag
 from server.auth import AuthError
 from server.game import Game
 from server.limits import Limits
 from shared import messages
 from shared.scene import load_scene
+from sovereign_netcode.examples.freeze import Freeze
+from sovereign_netcode.examples.tag import Tag
 
 FRAMES_PER_S = 64
 

@@ -14,9 +14,9 @@ from pathlib import Path
 
 import pytest
 
-from scripts.examples.tag import Tag
-from server.journal import replay
-from shared.layout import ID
+from sovereign_netcode.examples.tag import Tag
+from sovereign_netcode.server.journal import replay
+from sovereign_netcode.shared.layout import ID
 from tests.e2e.processes import running, stats, until
 
 EXAMPLES = Path(__file__).resolve().parents[2] / "scripts" / "examples"
@@ -51,7 +51,7 @@ def installed(tmp_path: Path) -> Path:
 @pytest.mark.e2e
 def test_it_joins_walks_and_knows_exactly_where_everybody_is(installed: Path) -> None:
     record = installed / "record"
-    with running("--port", "0", "--game", "scripts.examples.tag:Tag", "--record", str(record)) as server:
+    with running("--port", "0", "--game", "sovereign_netcode.examples.tag:Tag", "--record", str(record)) as server:
         address = server.address()
         url = "ws://{}:{}".format(*address)
         done = subprocess.run(

@@ -12,9 +12,9 @@ import time
 from types import SimpleNamespace
 from typing import Any
 
-from client_sdk import AsyncClient, Client, Loopback, View, client
-from server.game import Game
-from shared.scene import load_scene
+from sovereign_netcode.client_sdk import AsyncClient, Client, Loopback, View, client
+from sovereign_netcode.server.game import Game
+from sovereign_netcode.shared.scene import load_scene
 from tests.readme import engines
 from tests.readme.pages import programs
 

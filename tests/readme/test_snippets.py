@@ -83,7 +83,7 @@ def test_agents() -> None:
 
 def test_a_game() -> None:
     """Who plays it is in tests/examples/test_freeze.py."""
-    text = (ROOT / "scripts" / "examples" / "freeze.py").read_text("utf-8")
+    text = (ROOT / "sovereign_netcode" / "examples" / "freeze.py").read_text("utf-8")
     assert len(text.splitlines()) < 30
     assert programs()[A_FILE] == text
 

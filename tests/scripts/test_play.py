@@ -29,7 +29,7 @@ import pygame  # noqa: E402
 
 import _play_iso as iso  # noqa: E402
 from _play_window import SIZE, Window, keyboard  # noqa: E402
-from scripts.examples.tag import Tag  # noqa: E402
+from sovereign_netcode.examples.tag import Tag  # noqa: E402
 
 
 @pytest.fixture(autouse=True)

@@ -18,11 +18,11 @@ with warnings.catch_warnings(action="ignore", category=DeprecationWarning):  # o
 from client_sdk.bots import POLICIES, Bot, Builder, Policy, Wander
 from client_sdk.core import Core
 from client_sdk.transports.aio import AsyncClient
-from scripts.examples.tag import Tag
 from server.agents import NO_BLOCK, OTHERS, Arena, Observation
 from server.rules import Rules
 from server.session import Player
 from shared.messages import DONE, OUT_OF_REACH
+from sovereign_netcode.examples.tag import Tag
 from tests.client_sdk.servers import real_server
 from tests.worlds import scene
 

@@ -1,0 +1,1 @@
+"""Example games: freeze tag, and tag with bots."""

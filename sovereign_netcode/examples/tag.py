@@ -1,0 +1,114 @@
+"""Tag: whoever is "it" is a little faster, and hands it over by touching. Who is it for the least time wins the round.
+
+    sovereign-server --game sovereign_netcode.examples.tag:Tag
+
+Nothing is remembered in variables, so a saved game goes on where it was: who is "it" is a template (clients predict
+its speed), scores and the like are attributes, the end of the round is a shared value.
+"""
+
+import contextlib
+
+from sovereign_netcode.examples.tag_brain import wish
+from sovereign_netcode.server.rules import Rules
+from sovereign_netcode.server.session import Player
+from sovereign_netcode.shared.scene import Scene
+from sovereign_netcode.shared.units import SEGMENT
+from sovereign_netcode.shared.world import OverlapError
+
+THINK_TICKS = 4
+TRUNK, LEAVES = 5, 6
+NAMES = ("Ada", "Bo", "Cleo", "Dag", "Elif", "Finn", "Gus", "Hana", "Ivo", "Juno")
+
+
+class Tag(Rules):
+    """Attributes: "name", "score" (seconds of not being it), "safe" (cannot be tagged before that tick).
+
+    Shared: "ends" (the tick at which the round ends). Events: "tagged" with {"by", "who"}, "round" with {"winner"}.
+    """
+
+    scene = "meadow"
+    players_min = 6
+    """So many play at least: runners of the server fill up."""
+    round_s = 120.0
+    safe_s = 2.0
+
+    def prepare(self, scene: Scene) -> Scene:
+        return scene.with_template("it", walk_speed=5.75)
+
+    def on_start(self) -> None:
+        self._plant_trees(12)
+
+    def on_join(self, player: Player) -> None:
+        self.game.set(player.entity, "score", 0)
+
+    def on_tick(self) -> None:
+        game = self.game
+        self._fill_up()
+        everybody = game.entities()
+        if everybody and not game.entities("it"):
+            game.change(game.random.choice(everybody), "it")
+        for it in game.entities("it"):
+            for other in game.touching(it):
+                if game.tick >= game.get(other, "safe", 0):
+                    self._hand_over(it, other)
+                    break
+        if game.tick >= game.shared.get("ends", 0):
+            self._next_round(everybody)
+        if game.tick % game.ticks(1) == 0:
+            for entity in game.entities("player"):
+                game.set(entity, "score", game.get(entity, "score", 0) + 1)
+        if game.tick % THINK_TICKS == 0:
+            self._steer()
+
+    def _hand_over(self, it: int, other: int) -> None:
+        game = self.game
+        game.change(it, "player")
+        game.change(other, "it")
+        game.set(it, "safe", game.tick + game.ticks(self.safe_s))
+        game.send("tagged", {"by": it, "who": other})
+
+    def _next_round(self, everybody: list[int]) -> None:
+        game = self.game
+        if "ends" in game.shared and everybody:
+            game.send("round", {"winner": max(everybody, key=lambda entity: game.get(entity, "score", 0))})
+        game.share("ends", game.tick + game.ticks(self.round_s))
+        for entity in everybody:
+            game.set(entity, "score", 0)
+
+    def _fill_up(self) -> None:
+        """Keeps as many runners as players are missing."""
+        game = self.game
+        runners = [entity for entity in game.entities() if entity not in game.players]
+        for entity in runners[max(self.players_min - len(game.players), 0) :]:
+            game.remove(entity)
+        for _ in range(self.players_min - len(game.players) - len(runners)):
+            place = game.random.choice(game.scene.spawns)
+            free = [name for name in NAMES if name not in [game.get(entity, "name") for entity in game.entities()]]
+            with contextlib.suppress(OverlapError):  # somebody falls just there: in the next tick, then
+                game.spawn("player", place, name=game.random.choice(free or NAMES), score=0)
+
+    def _steer(self) -> None:
+        game = self.game
+        places = {entity: game.position(entity) for entity in game.entities()}
+        its = game.entities("it")
+        safe = {entity for entity in places if game.tick < game.get(entity, "safe", 0)}
+        for entity in places:
+            if entity not in game.players:
+                x, y, jump = wish(game.scene, entity, game.tick, places, game.velocity(entity), its, safe)
+                game.steer(entity, x, y, jump=jump)
+
+    def _plant_trees(self, count: int) -> None:
+        game = self.game
+        low, high = game.scene.origin[2] * SEGMENT, (game.scene.origin[2] + game.scene.size[2]) * SEGMENT
+        for _ in range(count):
+            x, y = (int(part) + game.random.randrange(-22, 23) for part in game.random.choice(game.scene.spawns)[:2])
+            ground = next((z for z in range(high - 8, low, -1) if game.block(x, y, z)), high) + 1
+            if game.block(x, y, ground - 1) == LEAVES:
+                continue
+            for z in range(ground, ground + 4):
+                game.set_block(x, y, z, TRUNK)
+            for i in range(-1, 2):
+                for j in range(-1, 2):
+                    for k in range(3, 6 if i * j == 0 else 5):
+                        if not game.block(x + i, y + j, ground + k):
+                            game.set_block(x + i, y + j, ground + k, LEAVES)

@@ -1,0 +1,11 @@
+"""Plays a game to test it: the real server and real clients in simulated time, with bots and bad connections.
+
+    from sovereign_netcode.playtest import Match, Path, bot
+
+Nothing sleeps and nothing depends on the machine. One seed reproduces a match, message by message.
+"""
+
+from client_sdk.links import PRESETS, Path
+from sovereign_netcode.playtest.match import Match, Player, Policy, bot, wander
+
+__all__ = ["PRESETS", "Match", "Path", "Player", "Policy", "bot", "wander"]

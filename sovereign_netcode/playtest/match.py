@@ -1,0 +1,239 @@
+"""A match in simulated time: the real server core and real SDK cores, one `now`, one seed.
+
+Nothing sleeps and nothing depends on the machine: every delivery, tick and frame is an entry in one queue, ordered
+by simulated time. The wires are those of `client_sdk.links`: TCP, nothing lost or reordered, but sometimes late.
+"""
+
+import math
+import random
+from collections.abc import Callable
+from heapq import heappop, heappush
+from itertools import count
+
+from client_sdk import bots
+from client_sdk.core import Core
+from client_sdk.events import Event
+from client_sdk.links import Path as Path
+from client_sdk.links import Weather, Wire
+from server.game import Game
+from server.limits import Limits
+from server.rules import Rules
+from server.session import Session
+from shared.inputs import Input
+from shared.scene import Scene
+
+Policy = Callable[[Core, random.Random], Input]
+
+
+class Player:
+    """One client: its core, its clock, its policy, its two wires. It is the server's `Link`, too."""
+
+    def __init__(self, match: "Match", core: Core, path: Path, policy: Policy, seed: int) -> None:
+        self.match, self.core, self.policy = match, core, policy
+        self.rng = random.Random(seed)
+        self.drift = self.rng.uniform(-200e-6, 200e-6)
+        self.clock_start = self.rng.uniform(0, 1e5)
+        self.events: list[Event] = []
+        self.closed: tuple[int, str] | None = None
+        self.session: Session | None = None
+        self.weather = Weather(path, seed + 3)
+        self._seed = seed
+        self._connect_wires()
+        self._acted = -1
+        self.frame_s = 0.0
+        """The program draws, reads and updates only so often; 0: at once when something is due."""
+        self._inbox: list[bytes] = []
+        self._away = False
+
+    @property
+    def local(self) -> float:
+        """The time on the client's own clock."""
+        return self.clock_start + self.match.now * (1 + self.drift)
+
+    def _connect_wires(self) -> None:
+        self.up = Wire(self.match, self.weather, self._seed + 1, self._at_server)
+        self.down = Wire(self.match, self.weather, self._seed + 2, self._at_client)
+        self._seed += 10
+
+    def connect(self) -> None:
+        """Opens the connection."""
+        self.session = self.match.game.open(self, self.match.now)
+        self.core.open(self.local)
+        self._update()
+
+    def disconnect(self) -> None:
+        """Pulls the plug: what is on the way is lost. The client comes back if it has the patience."""
+        assert self.session is not None
+        self.match.game.lost(self.session, self.match.now)
+        self.session = None
+        self._inbox.clear()
+        self.up.cut()
+        self.down.cut()
+        self._connect_wires()
+        self.core.lost(1006, "gone", self.local)
+        self._update()
+
+    def suspend(self, seconds: float) -> None:
+        """The program stands still; what comes in meanwhile waits."""
+        self._away = True
+        self.match.at(self.match.now + seconds, self._resume)
+
+    def _resume(self) -> None:
+        self._away = False
+        self._read()
+        self._update()
+
+    # As the server's link:
+
+    def send(self, message: bytes) -> None:
+        self.down.send(message)
+
+    def outstanding(self) -> int:
+        return self.down.outstanding()
+
+    def close(self, code: int, reason: str) -> None:
+        self.closed = (code, reason)
+        assert self.session is not None
+        self.match.game.lost(self.session, self.match.now)
+
+    def _at_server(self, message: bytes) -> None:
+        if self.session is not None:
+            self.match.game.receive(self.session, message, self.match.now)
+
+    def _at_client(self, message: bytes) -> None:
+        self._inbox.append(message)
+        if self._away or self.frame_s:
+            return
+        waiting = self.core.state == "joining"
+        self._read()
+        if waiting:
+            self._update()
+
+    def _read(self) -> None:
+        core, now = self.core, self.local
+        for message in self._inbox:
+            core.receive(message, now)
+        self._inbox.clear()
+        self._flush()
+
+    def _update(self) -> None:
+        core = self.core
+        if self._away:
+            return
+        if self.frame_s:
+            self._read()
+        if core.state == "playing" and (prediction := core.prediction) and prediction.predicted.tick != self._acted:
+            self._acted = prediction.predicted.tick
+            core.set_input(self.policy(core, self.rng))
+        now = self.local
+        core.update(now)
+        if self.session is None and core.state == "away" and now >= core.comeback.retry_at:
+            core.comeback.trying()
+            self.connect()
+            return
+        self._flush()
+        if self.frame_s:
+            self.match.at(self.match.now + self.frame_s, self._update, key=self)
+        elif core.state != "closed":
+            due = core.next_update(now)
+            if due < math.inf:
+                when = self.match.now + max(due - now, 1e-4) / (1 + self.drift)
+                self.match.at(when, self._update, key=self)
+
+    def _flush(self) -> None:
+        core = self.core
+        for message in core.outgoing():
+            self.up.send(message)
+        self.events += core.events()
+        if core.close_request and self.closed is None:
+            self.close(*core.close_request)
+
+
+class Match:
+    """A server, its players and the time.
+
+    Args:
+        scene: the rules.
+        seed: everything random comes from it.
+        rules: what is played; they prepare the scene.
+    """
+
+    def __init__(self, scene: Scene, seed: int, *, limits: Limits | None = None, rules: Rules | None = None) -> None:
+        self.game = Game(scene if rules is None else rules.prepare(scene), limits=limits, rules=rules, seed=seed)
+        self.seed = seed
+        self.now = 0.0
+        self.players: list[Player] = []
+        self._queue: list[tuple[float, int, Callable[[], None], object]] = []
+        self._latest: dict[object, int] = {}
+        self._number = count()
+        self._started = 0
+        self._tick_s = 1.0 / scene.tick_rate
+        self.on_tick: list[Callable[[], None]] = []
+        self.at(0.0, self._tick)
+
+    def join(self, policy: Policy, path: Path | None = None, core: Core | None = None) -> Player:
+        """A further player."""
+        seed = self.seed * 1_000_003 + len(self.players) * 7919
+        player = Player(self, core or Core(f"player {len(self.players)}"), path or Path(), policy, seed)
+        self.players.append(player)
+        self.at(self.now, player.connect)
+        return player
+
+    def at(self, when: float, act: Callable[[], None], key: object = None) -> None:
+        """Files something for a time; a later entry with the same key replaces an earlier one."""
+        number = next(self._number)
+        if key is not None:
+            self._latest[key] = number
+        heappush(self._queue, (when, number, act, key))
+
+    def run(self, seconds: float) -> None:
+        """Lets time pass."""
+        until = self.now + seconds
+        self._advance(until)
+        self.now = until
+
+    def run_until(self, condition: Callable[[], bool], seconds: float) -> None:
+        """Lets time pass until a condition holds; fails if it does not within so many simulated seconds."""
+        if not self._advance(self.now + seconds, condition):
+            raise AssertionError(f"seed {self.seed}: not within {seconds} simulated seconds")
+
+    def _advance(self, until: float, condition: Callable[[], bool] | None = None) -> bool:
+        """Does all that comes up to `until`, or until a condition holds; whether it does."""
+        queue, latest = self._queue, self._latest
+        while queue and queue[0][0] <= until:
+            when, number, act, key = heappop(queue)
+            if key is None or latest[key] == number:
+                if when > self.now:
+                    self.now = when
+                act()
+                if condition is not None and condition():
+                    return True
+        return False
+
+    def _tick(self) -> None:
+        self.game.tick(self.now, self.now)
+        for act in self.on_tick:
+            act()
+        self._started += 1
+        self.at(self._started * self._tick_s, self._tick)
+
+
+def bot(policy: bots.Policy) -> Policy:
+    """A policy of `client_sdk.bots`, or of one's own, for a player of a match."""
+    drive = bots.Bot(policy)
+
+    def plays(core: Core, rng: random.Random) -> Input:
+        drive(core)
+        return core.wish
+
+    return plays
+
+
+def wander(core: Core, rng: random.Random) -> Input:
+    """Walks about, jumps and stops, changing its mind about once a second."""
+    if rng.random() < 0.04:
+        angle = rng.choice(
+            [(127, 0), (-127, 0), (0, 127), (0, -127), (90, 90), (-90, 90), (90, -90), (-90, -90), (0, 0)]
+        )
+        return Input(*angle, int(rng.random() < 0.5))
+    return core.wish
