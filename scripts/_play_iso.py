@@ -96,7 +96,7 @@ class Ground:
         for segment in self.pictures.keys() - blocks.rows.keys():
             del self.pictures[segment], self._seen[segment]
         for segment in sorted(blocks, key=_depth):
-            seen = tuple(blocks.digest(other) if other in blocks else -1 for other in _neighbours(segment))
+            seen = tuple(blocks.version(other) if other in blocks else -1 for other in _neighbours(segment))
             if seen == self._seen.get(segment):
                 continue
             kinds = _surroundings(blocks, segment)

@@ -1,22 +1,35 @@
 """A world as it was at the end of a tick, taken while it goes on, and a world from what was taken."""
 
 import threading
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from typing import NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
+from server import former
 from server.journal import checked_states
 from server.recorder import RecordedWorld
 from shared import terrain
-from shared.blocks import Kinds, digest_of, pack, unpack
+from shared.blocks import DIGEST_BYTES, Kinds, digest_of, pack, unpack
 from shared.checks import Cell
-from shared.layout import FALLING, FLAGS, ID
+from shared.layout import FALLING, FLAGS, ID, Int64s
 from shared.scene import Scene
 from shared.world import STATES, World, hash_of
 
-Segment = tuple[int, int, int, bytes | None, int]
-"""Index of a loaded segment, its packed blocks (None: as the generator makes them), and their digest."""
+Segment = tuple[int, int, int, bytes | None]
+"""Index of a loaded segment, and its packed blocks (None: as the generator makes them)."""
+
+
+class Known(NamedTuple):
+    """A segment as a checkpoint holds it: the version of its blocks in this process, and their digest."""
+
+    version: int
+    digest: bytes
+
+
+Saved = Mapping[Cell, Known | None]
+"""The segments of the checkpoint before; None: it is not known what it holds of that one."""
 
 
 class Checkpoint(NamedTuple):
@@ -39,9 +52,10 @@ class Checkpoint(NamedTuple):
 class Copy:
     """Takes a world at this instant; the blocks follow piece by piece.
 
-    What the kernel writes to is copied at once: a row of 128 bytes per entity. Of the segments only the digests are
-    copied at once; `pieces` copies and packs those that have changed, one after the other, in another thread. The world
-    may go on meanwhile, if only it says `touch` ahead of every change: then that segment is copied just before.
+    What the kernel writes to is copied at once: a row of 128 bytes per entity. Of the segments only the versions are
+    copied at once; `pieces` copies and packs those that were touched since the checkpoint before, one after the other,
+    in another thread. The world may go on meanwhile if it calls `touch` ahead of every change: then that segment is
+    copied just before.
 
     Args:
         world: between two ticks.
@@ -53,10 +67,9 @@ class Copy:
         self.tick, self._next_id, self._kept = world.tick, world.next_id, kept
         self._entities = world.matrix.copy()
         self._rows = dict(blocks.rows)
-        self._segments = blocks.segments[: blocks.count].copy()
-        self._digests = blocks.digests[: blocks.count].copy()
-        self.digests: dict[Cell, int] = {}
-        """Those of all segments, once the checkpoint is there."""
+        self._versions = blocks.versions[: blocks.count].copy()
+        self.saved: dict[Cell, Known | None] = {}
+        """All segments as the checkpoint holds them, once `pieces` is done."""
         self._blocks = blocks
         self._lock = threading.Lock()  # held for the copying of one segment at most, some 5 us
         self._taken: dict[Cell, Kinds | None] = {}  # None: it has been fetched, nobody needs it any more
@@ -67,27 +80,29 @@ class Copy:
             if segment in self._rows and segment not in self._taken:
                 self._taken[segment] = self._blocks.segment(segment).copy()
 
-    def pieces(self, saved: Mapping[Cell, int]) -> Iterator[Checkpoint | None]:
-        """Does the work in pieces of a millisecond or so; None after each, and the checkpoint in the end.
+    def pieces(self, saved: Saved) -> Iterator[Checkpoint | None]:
+        """Does the work in pieces of a millisecond or so; yields None after each, and the checkpoint in the end.
 
         Args:
-            saved: the digests of the segments in the checkpoint before.
+            saved: the segments of the checkpoint before.
         """
         states = self._entities[:, :STATES]
         states = states[states[:, ID] != 0]
         states = states[np.argsort(states[:, ID])]
         states[:, FLAGS] &= FALLING
         yield None
-        rows = list(self._rows.values())
-        self.digests = dict(zip(self._rows, self._digests[rows].tolist(), strict=True))
-        checked = hash_of(self.tick, self._segments[rows], self._digests[rows], states)
-        yield None
         segments: list[Segment] = []
-        for cell, digest in self.digests.items():
-            if saved.get(cell) != digest:
-                segments.append((*cell, pack(self._fetch(cell)), digest))
+        for cell, row in self._rows.items():
+            known, version = saved.get(cell), int(self._versions[row])
+            if known is None or known.version != version:
+                kinds = self._fetch(cell)
+                known = Known(version, digest_of(kinds))
+                segments.append((*cell, pack(kinds)))
                 yield None
-        gone = [cell for cell in saved if cell not in self.digests]
+            self.saved[cell] = known
+        checked = hash_of(self.tick, *_parts(self.saved), states)
+        yield None
+        gone = [cell for cell in saved if cell not in self.saved]
         packed = states.astype("<i8", copy=False).tobytes()
         yield Checkpoint(self.tick, self._next_id, packed, checked, self._kept, segments, gone)
 
@@ -104,7 +119,7 @@ def generated(scene: Scene, *, compiled: bool | None = None) -> tuple[RecordedWo
     """A new world of a scene with all its terrain, and its checkpoint."""
     world = RecordedWorld(scene, compiled=compiled)
     world.load_terrain()
-    segments: list[Segment] = [(*cell, None, world.blocks.digest(cell)) for cell in world.blocks]
+    segments: list[Segment] = [(*cell, None) for cell in world.blocks]
     return world, Checkpoint(world.tick, world.next_id, b"", world.state_hash(), NOTHING, segments, [])
 
 
@@ -116,12 +131,10 @@ def restored(scene: Scene, checkpoint: Checkpoint, *, compiled: bool | None = No
     """
     loaded = {
         (x, y, z): terrain.generate(scene.terrain, (x, y, z)) if packed is None else unpack(packed)
-        for x, y, z, packed, _ in checkpoint.segments
+        for x, y, z, packed in checkpoint.segments
     }
     states = checked_states(scene, np.frombuffer(checkpoint.states, "<i8").astype(np.int64))
-    digests = np.array([digest_of(kinds) for kinds in loaded.values()], np.uint64)
-    cells = np.array(list(loaded), np.int64).reshape(-1, 3)
-    if hash_of(checkpoint.tick, cells, digests, states) != checkpoint.hash:  # ahead of the kernel: it trusts its rows
+    if _hash(checkpoint, loaded, states) != checkpoint.hash:  # ahead of the kernel: it trusts its rows
         raise ValueError(f"the world of tick {checkpoint.tick} is not the one that was saved")
     world = RecordedWorld(scene, compiled=compiled)
     for cell, kinds in loaded.items():
@@ -130,6 +143,30 @@ def restored(scene: Scene, checkpoint: Checkpoint, *, compiled: bool | None = No
     world.next_id = checkpoint.next_id
     world.rebase(checkpoint.tick)
     return world
+
+
+def saved_of(world: World) -> dict[Cell, Known | None]:
+    """The segments of a world that is as its checkpoint, for the next one."""
+    blocks = world.blocks
+    return {cell: Known(blocks.version(cell), blocks.digest(cell)) for cell in blocks}
+
+
+def _hash(checkpoint: Checkpoint, loaded: Mapping[Cell, Kinds], states: Int64s) -> bytes:
+    """The hash of what a checkpoint holds, of the kind that it has."""
+    cells = np.array(list(loaded), np.int64).reshape(-1, 3)
+    if len(checkpoint.hash) == former.HASH_BYTES:
+        return former.hash_of(checkpoint.tick, cells, list(loaded.values()), states)
+    return hash_of(checkpoint.tick, cells, _digests(map(digest_of, loaded.values())), states)
+
+
+def _parts(saved: Saved) -> tuple[Int64s, npt.NDArray[np.uint8]]:
+    """Indices and digests of segments, as `hash_of` wants them."""
+    cells = np.array(list(saved), np.int64).reshape(-1, 3)
+    return cells, _digests(known.digest for known in saved.values() if known is not None)
+
+
+def _digests(digests: Iterable[bytes]) -> npt.NDArray[np.uint8]:
+    return np.frombuffer(b"".join(digests), np.uint8).reshape(-1, DIGEST_BYTES)
 
 
 NOTHING = b"\xc0"

@@ -5,22 +5,28 @@
     log        what each tick since then was told: the record that a recording has for it (`server.journal`)
 
 `chain` is the CRC-32 of a record, begun with the one before (the first one: with the checkpoint's), so no record can
-be lost, doubled or changed in between. `seal` is a BLAKE2b of the checkpoint's columns but for the states: those and
-the segments are what `hash`, the world's own, is about; and but for the game, which may get another name. While a
-server runs, anyone may read the file with SQLite.
+be lost, doubled or changed in between. That nothing is lost at the end is what `server.mark` and `server.wal` are for.
+`seal` is a BLAKE2b of the checkpoint's columns but for the states: those and the segments are what `hash`, the world's
+own, is about; and but for the game, which may get another name. While a server runs, anyone may read the file with
+SQLite.
 """
 
 import contextlib
 import hashlib
+import logging
 import sqlite3
 import struct
 import zlib
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
+from server import mark, wal
 from server.checkpoint import Checkpoint
+from server.mark import Mark
 from shared.checks import Cell
+
+logger = logging.getLogger(__name__)
 
 APPLICATION_ID = 0x534E5731
 """The bytes "SNW1" in the header of the file."""
@@ -38,6 +44,13 @@ MIGRATIONS: list[tuple[str, ...]] = [
         f"PRAGMA application_id = {APPLICATION_ID}",
     ),
     ("ALTER TABLE world ADD COLUMN game TEXT",),
+    (  # without the column `digest`; and `hash` is of another kind from here on, which its length tells
+        """CREATE TABLE segments (
+            x INTEGER NOT NULL, y INTEGER NOT NULL, z INTEGER NOT NULL, kinds BLOB, PRIMARY KEY (x, y, z))""",
+        "INSERT INTO segments SELECT x, y, z, kinds FROM segment",
+        "DROP TABLE segment",
+        "ALTER TABLE segments RENAME TO segment",
+    ),
 ]
 """Entry n takes schema version n to n + 1; version 0 is an empty file."""
 
@@ -60,6 +73,7 @@ def chained(record: bytes, chain: int) -> int:
 
 
 def damaged(path: Path, reason: object) -> StoreError:
+    """The error of a file that is not as it was written."""
     return StoreError(
         f"{path}: damaged ({reason}). It has been left as it is: put a backup of its directory in its place, or move "
         "it away to begin a new world"
@@ -76,17 +90,23 @@ class Saved(NamedTuple):
     log: list[Record]
 
 
+def mark_of(path: Path) -> Path:
+    """The file with the mark of a world's file."""
+    return path.with_suffix(".mark")
+
+
 def version_of(path: Path) -> int:
     """The schema version of a file; 0 if there is nothing in it.
 
     Raises:
         StoreError: it is not a saved world, of a newer version, or damaged.
     """
-    beside = path.with_name(path.name + "-wal")
+    for beside in (path.with_name(path.name + "-wal"), mark_of(path)):
+        if beside.exists() and not (path.exists() and path.stat().st_size):
+            raise damaged(path, f"it is {'empty' if path.exists() else 'missing'}, and {beside.name} is there")
     if not path.exists():
-        if beside.exists():
-            raise damaged(path, f"it is missing, and {beside.name} is there")
         return 0
+    promised = _promised(path)
     with _reading(path) as connection:
         (application,) = connection.execute("PRAGMA application_id").fetchone()
         (version,) = connection.execute("PRAGMA user_version").fetchone()
@@ -103,6 +123,9 @@ def version_of(path: Path) -> int:
         (found,) = connection.execute("PRAGMA quick_check(1)").fetchone()
         if found != "ok":
             raise damaged(path, found)
+        reason = wal.damage(path) if promised is None or promised.binding else ""
+        if reason:
+            raise damaged(path, reason)
         return int(version)
 
 
@@ -115,7 +138,7 @@ def read(path: Path) -> Saved | None:
     with _reading(path) as connection:
         columns = "tick, next_id, states, hash, kept, chain, scene, seal, game"
         row = connection.execute(f"SELECT {columns} FROM world").fetchone()
-        segments = connection.execute("SELECT x, y, z, kinds, digest FROM segment ORDER BY z, y, x").fetchall()
+        segments = connection.execute("SELECT x, y, z, kinds FROM segment ORDER BY z, y, x").fetchall()
         log = [Record(*each) for each in connection.execute("SELECT tick, record, chain FROM log ORDER BY tick")]
         if row is None:
             if segments or log:
@@ -123,14 +146,16 @@ def read(path: Path) -> Saved | None:
             return None
         tick, next_id, states, checked, kept, chain, scene, seal, game = row
         checkpoint = Checkpoint(tick, next_id, states, checked, kept, segments, [])
-        if seal != _seal(checkpoint, scene, chain):
+        if seal != seal_of(checkpoint, scene, chain):
             raise damaged(path, "the checkpoint does not match its seal")
         found = chain
         for record in log:
             found = chained(record.record, found)
             if found != record.chain:
                 raise damaged(path, f"tick {record.tick} of the log does not match its check")
-        return Saved(checkpoint, scene, game, chain, log)
+        saved = Saved(checkpoint, scene, game, chain, log)
+    _check_end(path, saved)
+    return saved
 
 
 class Database:
@@ -144,6 +169,7 @@ class Database:
     """
 
     def __init__(self, path: Path, *, power: bool = True) -> None:
+        self._mark = mark.MarkFile(mark_of(path), power=power)
         self._connection = sqlite3.connect(path, isolation_level=None, check_same_thread=False)
         try:
             self._run("PRAGMA journal_mode = WAL", "PRAGMA wal_autocheckpoint = 0", "PRAGMA busy_timeout = 100")
@@ -156,35 +182,40 @@ class Database:
             self.close()
             raise
 
-    def digests(self) -> dict[Cell, int]:
-        """The digest of every segment that is saved."""
-        rows = self._connection.execute("SELECT x, y, z, digest FROM segment").fetchall()
-        return {(x, y, z): digest % (1 << 64) for x, y, z, digest in rows}
+    def seal(self) -> bytes:
+        """The seal of the checkpoint; empty if there is none."""
+        row = self._connection.execute("SELECT seal FROM world").fetchone()
+        return b"" if row is None else bytes(row[0])
 
-    def append(self, records: Iterable[Record]) -> None:
+    def segments(self) -> list[Cell]:
+        """The index of every segment that is saved."""
+        return self._connection.execute("SELECT x, y, z FROM segment").fetchall()
+
+    def append(self, records: Sequence[Record]) -> None:
         """Adds to the log, all or nothing."""
         with self._transaction():
             self._connection.executemany("INSERT INTO log VALUES (?, ?, ?)", records)
+        self._mark.write(records[-1].tick, records[-1].chain)
 
     def save(self, checkpoint: Checkpoint, scene: bytes, chain: int, game: str) -> None:
         """Replaces the checkpoint, and drops the log up to it, all or nothing."""
-        seal = _seal(checkpoint, scene, chain)
+        seal = seal_of(checkpoint, scene, chain)
         with self._transaction():
             self._connection.execute(
                 "INSERT OR REPLACE INTO world VALUES (1, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
                 (*checkpoint[:5], chain, scene, seal, game),
             )
-            self._connection.executemany(
-                "INSERT OR REPLACE INTO segment VALUES (?, ?, ?, ?, ?)",
-                [(*segment[:4], _signed(segment[4])) for segment in checkpoint.segments],
-            )
+            self._connection.executemany("INSERT OR REPLACE INTO segment VALUES (?, ?, ?, ?)", checkpoint.segments)
             self._connection.executemany("DELETE FROM segment WHERE x = ? AND y = ? AND z = ?", checkpoint.gone)
             self._connection.execute("DELETE FROM log WHERE tick <= ?", (checkpoint.tick,))
+            newest = self._connection.execute("SELECT tick, chain FROM log ORDER BY tick DESC LIMIT 1").fetchone()
+        self._mark.write(*(newest or (checkpoint.tick, chain)))
         # The -wal file is emptied: it does not grow on, and the other file is whole without it. A reader puts that off.
         self._connection.execute("PRAGMA wal_checkpoint(TRUNCATE)").fetchone()
 
     def close(self) -> None:
         """Closes it; what has been written, is."""
+        self._mark.close()
         with contextlib.suppress(sqlite3.Error):
             self._connection.close()
 
@@ -203,6 +234,35 @@ class Database:
                 with contextlib.suppress(sqlite3.Error):
                     self._connection.execute("ROLLBACK")
             raise
+
+
+def _promised(path: Path) -> Mark | None:
+    """The mark beside a file; None if there is none.
+
+    Raises:
+        StoreError: it cannot be read, or holds nothing.
+    """
+    beside = mark_of(path)
+    try:
+        return mark.read(beside)
+    except OSError as error:
+        raise StoreError(f"{beside}: cannot be read ({error.strerror or error})") from error
+    except ValueError as error:
+        raise damaged(beside, error) from error
+
+
+def _check_end(path: Path, saved: Saved) -> None:
+    """Raises `StoreError` if a file does not hold what its mark has promised."""
+    promised = _promised(path)
+    if promised is None:
+        logger.warning("%s: has no %s, so nobody can tell whether its end is missing", path, mark_of(path).name)
+        return
+    chains = {record.tick: record.chain for record in saved.log} | {saved.checkpoint.tick: saved.chain}
+    reason = promised.against(max(chains), chains)
+    if reason and promised.binding:
+        raise damaged(path, f"{reason} by {mark_of(path).name}")
+    if reason:
+        logger.warning("%s: %s; the machine was started anew since, and durability was 'process'", path, reason)
 
 
 @contextlib.contextmanager
@@ -226,12 +286,8 @@ def _reading(path: Path) -> Iterator[sqlite3.Connection]:
         raise damaged(path, error) from error
 
 
-def _signed(digest: int) -> int:
-    """64 bits as SQLite holds them."""
-    return digest - (digest >> 63 << 64)
-
-
-def _seal(checkpoint: Checkpoint, scene: bytes, chain: int) -> bytes:
+def seal_of(checkpoint: Checkpoint, scene: bytes, chain: int) -> bytes:
+    """The seal of a checkpoint, of the rules it was made under and of the chain at its tick."""
     digest = hashlib.blake2b(struct.pack("<qqQ", checkpoint.tick, checkpoint.next_id, chain), digest_size=16)
     for part in (checkpoint.hash, checkpoint.kept, scene):
         digest.update(struct.pack("<Q", len(part)))

@@ -3,12 +3,13 @@
 file      8 bytes "\\x89SNJ\\r\\n\\x1a\\n"   u16 format version   records
 record    u32 length   u32 check of the length   u32 check of the payload   payload (MessagePack)
           each check is the CRC-32 of its bytes, begun with the payload check of the record before
+          (the first one: with the CRC-32 of the 10 bytes ahead of it; in formats 1 and 2 with 0)
 start     [scene, tick, next_id, states, segments]         the first record
           scene: its table   states: n * 12 int64   segments: [x, y, z, packed kinds or nil for as generated]
 tick      [inputs, calls, mark] or, every 32 ticks, [inputs, calls, mark, hash]
           calls, in order, ahead of the step   inputs: [id, move_x, move_y, buttons, id, ...] that differ from the
           ones before   mark: CRC-32 of the states that the tick changed (nil in the first tick, which has a hash)
-          hash: 16 bytes, the world's after the step
+          hash: 20 bytes, the world's after the step (16 in formats 1 and 2: `server.former`)
 end       [nil, calls, nil, hash]                           the last record, if the recording was ended
 
 call      [PUT, 12 numbers per state ...]   [REMOVE, id]   [FILL, x0, y0, z0, x1, y1, z1, kind, push]
@@ -32,6 +33,7 @@ from typing import Any, BinaryIO, NamedTuple
 import msgpack
 import numpy as np
 
+from server import former
 from shared import terrain
 from shared.blocks import unpack
 from shared.checks import SceneError
@@ -42,7 +44,9 @@ from shared.units import BLOCK, RANGE_BLOCKS
 from shared.world import ID_MAX, STATES, World
 
 MAGIC = b"\x89SNJ\r\n\x1a\n"
-VERSION = 2
+VERSION = 3
+UNCHECKED_HEAD = 2
+"""Up to this format no check is over the head of the file."""
 HASH_TICKS = 32
 """A full hash so often, in ticks."""
 FRAME = struct.Struct("<III")
@@ -112,6 +116,8 @@ class Recording:
         (version,) = struct.unpack("<H", head[len(MAGIC) :])
         if not 1 <= version <= VERSION:
             raise JournalError(f"a recording in format {version}: this program reads formats up to {VERSION}")
+        if version > UNCHECKED_HEAD:
+            self._chain = zlib.crc32(head)
         start = self._read()
         if start is None:
             raise JournalError("a recording that broke off before its start was written")
@@ -204,9 +210,14 @@ def redo(world: World, record: list[Any]) -> Moment:
         world.step(news)
         if marked is not None and mark(world) != marked:
             raise DivergedError(world.tick, "the entities that changed are not the recorded ones")
-    if hashes and world.state_hash() != hashes[0]:
+    if hashes and not has_hash(world, hashes[0]):
         raise DivergedError(world.tick, "the world is not the recorded one")
     return Moment(world, news, calls, bool(hashes), inputs is None)
+
+
+def has_hash(world: World, recorded: bytes) -> bool:
+    """Whether a world has a recorded hash, of today's kind or of the former one."""
+    return (former.state_hash(world) if len(recorded) == former.HASH_BYTES else world.state_hash()) == recorded
 
 
 def checked_states(scene: Scene, numbers: Int64s) -> Int64s:

@@ -36,6 +36,8 @@ SHOWN_MAX = 1000
 """So many players at most are told of, and about as many other entities."""
 SIDE_MAX = 512
 """The map has at most so many cells along a side, each the column of one block in `step` along both axes."""
+VERSION_BYTES = 6
+"""Bytes of a tile's version: JavaScript holds no whole number of eight."""
 TILE = 64
 """Cells along a side of a tile."""
 FIGURES = (
@@ -63,11 +65,13 @@ class Relief:
 
     def versions(self) -> list[int]:
         """A number for each tile, row by row from the south-west: another one once anything in it has changed."""
+        self._blocks.freshen()
         table = self._table()
         return [self._version(self._part(table, number)) for number in range(self.columns * self.rows)]
 
     def tile(self, number: int) -> bytes:
         """One tile as it is sent. A height counts from the lowest block of the world, 0 is a hole."""
+        self._blocks.freshen()
         rows = self._part(self._table(), number)
         version = self._version(rows)
         if self._packed.get(number, (-1, b""))[0] != version:
@@ -113,7 +117,7 @@ class Relief:
         return part
 
     def _version(self, rows: Int64s) -> int:
-        return zlib.crc32(self._blocks.digests[rows].tobytes())
+        return int.from_bytes(hashlib.sha256(self._blocks.digests[rows].tobytes()).digest()[:VERSION_BYTES])
 
 
 class Live:

@@ -8,9 +8,11 @@ from typing import Any, BinaryIO, NamedTuple
 import msgpack
 
 from server import checkpoint, database
+from server.checkpoint import Known
 from server.database import Database, Saved, StoreError
 from server.journal import NOTE, DivergedError, redo
 from server.recorder import RecordedWorld
+from shared.checks import Cell
 from shared.scene import Scene
 
 logger = logging.getLogger(__name__)
@@ -34,6 +36,8 @@ class Loaded(NamedTuple):
     checkpoint_tick: int
     chain: int
     log_bytes: int
+    saved: dict[Cell, Known | None]
+    """The segments of the checkpoint."""
 
 
 def load(path: Path, scene: Scene, game: str = "", *, compiled: bool | None = None) -> Loaded:
@@ -86,11 +90,12 @@ def _new(path: Path, scene: Scene, game: str, compiled: bool | None) -> Loaded:
         file.save(first, msgpack.packb(scene.to_table()), 0, game)
     finally:
         file.close()
-    return Loaded(world, None, [], world.tick, 0, 0)
+    return Loaded(world, None, [], world.tick, 0, 0, checkpoint.saved_of(world))
 
 
 def _replayed(scene: Scene, saved: Saved, compiled: bool | None) -> Loaded:
     world = checkpoint.restored(scene, saved.checkpoint, compiled=compiled)
+    known = checkpoint.saved_of(world)  # ahead of the log: what it touches belongs into the next checkpoint
     notes: list[Note] = []
     chain = saved.chain
     for tick, record, chain in saved.log:  # noqa: B007 - the last one is what goes on
@@ -101,7 +106,7 @@ def _replayed(scene: Scene, saved: Saved, compiled: bool | None) -> Loaded:
         notes += [Note(tick, msgpack.unpackb(value, strict_map_key=False)) for value in packed]
     kept = msgpack.unpackb(saved.checkpoint.kept, strict_map_key=False)
     size = sum(len(record.record) for record in saved.log)
-    return Loaded(world, kept, notes, saved.checkpoint.tick, chain, size)
+    return Loaded(world, kept, notes, saved.checkpoint.tick, chain, size, known)
 
 
 def claimed(directory: Path) -> BinaryIO:

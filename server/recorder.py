@@ -4,6 +4,7 @@ import math
 import struct
 import zlib
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
 from typing import Any, Protocol
 
 import msgpack
@@ -27,11 +28,14 @@ from server.journal import (
     mark,
 )
 from shared import terrain
-from shared.blocks import Kinds, digest_of, pack, segment_of
+from shared.blocks import Kinds, pack, segment_of
 from shared.checks import Cell, SceneError
 from shared.inputs import Input
 from shared.layout import FALLING, FLAGS, ID, Int64s
 from shared.world import STATES, OverlapError, World
+
+FRESHENED_PER_TICK = 1
+"""Digests of changed segments that are computed after each step, so that no later tick has to compute many at once."""
 
 
 class Sink(Protocol):
@@ -69,13 +73,14 @@ class Pen:
     Args:
         first: what was written ahead of the first tick may be among its changes without a call, so it has no mark.
         hashed_max: no hash of a world with more entities (it takes the step 2 ms with 10,000); every tick has its mark.
+        stale_max: nor of one in which more segments wait for their digests (40 us each).
     """
 
-    def __init__(self, *, first: bool = True, hashed_max: float = math.inf) -> None:
+    def __init__(self, *, first: bool = True, hashed_max: float = math.inf, stale_max: float = math.inf) -> None:
         self.calls: list[Call] = []
         self._held: dict[int, Input] = {}
         self._first = first
-        self._hashed_max = hashed_max
+        self._hashed_max, self._stale_max = hashed_max, stale_max
 
     def forget(self, entities: list[int]) -> None:
         """The inputs of these entities are not known any more."""
@@ -100,7 +105,8 @@ class Pen:
                 news += map(int, (entity, *wish))
         first, self._first = self._first, False
         parts: list[Any] = [news, calls, None if first else mark(world)]
-        if first or (world.tick % HASH_TICKS == 0 and len(world) <= self._hashed_max):
+        due = world.tick % HASH_TICKS == 0 and len(world) <= self._hashed_max
+        if first or (due and world.blocks.stale <= self._stale_max):
             parts.append(world.state_hash())
         return parts
 
@@ -231,6 +237,7 @@ class RecordedWorld(World):
 
     def step(self, inputs: Mapping[int, Input] | None = None) -> None:
         super().step(inputs)
+        self.blocks.freshen(FRESHENED_PER_TICK)
         for pen in self._pens:
             pen.tick(self, inputs or {})
 
@@ -263,6 +270,7 @@ class _FilePen(Pen):
         segments = [[*index, packed(world, index)] for index in sorted(world.blocks)]
         states = world.states().astype("<i8").tobytes()
         head = MAGIC + struct.pack("<H", VERSION)
+        self._chain = zlib.crc32(head)
         self._record([world.scene.to_table(), world.tick, world.next_id, states, segments], head)
 
     def tick(self, world: World, inputs: Mapping[int, Input]) -> None:
@@ -287,11 +295,11 @@ class _FilePen(Pen):
 
 def packed(world: World, index: Cell) -> bytes | None:
     """A loaded segment for the file; None if it is as the generator left it."""
-    try:
-        generated = digest_of(terrain.generate(world.scene.terrain, index))
-    except SceneError:
-        generated = -1
-    return None if generated == world.blocks.digest(index) else pack(world.blocks.segment(index))
+    kinds = world.blocks.segment(index)
+    with suppress(SceneError):
+        if np.array_equal(terrain.generate(world.scene.terrain, index), kinds.reshape(-1)):
+            return None
+    return pack(kinds)
 
 
 def _reraise(error: OSError) -> None:

@@ -194,13 +194,13 @@ class ChangeLog:
 
     def packed(self, segment: Cell) -> bytes | None:
         """A segment's blocks as they are, packed; None: that has to wait for another tick."""
-        digest = self._world.blocks.digest(segment)
+        version = self._world.blocks.version(segment)
         known = self._packed.get(segment)
-        if known is None or known[0] != digest:
+        if known is None or known[0] != version:
             if not self._packs_left:
                 return None
             self._packs_left -= 1
-            known = self._packed[segment] = (digest, pack(self._world.blocks.segment(segment)))
+            known = self._packed[segment] = (version, pack(self._world.blocks.segment(segment)))
         return known[1]
 
     def _keyframe(self, segment: Cell) -> bytes:

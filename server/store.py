@@ -8,15 +8,16 @@ larger, not the ticks longer. `durable_tick` is the newest tick that is on disk.
 it promises: the verdict on a command, and the welcome with the token to come back with. A client that was told "done"
 finds it done after any crash. What others see of it in their snapshots meanwhile is news, not a promise.
 `server.loading` puts the world together again: checkpoint, then every record, each compared with the marks and hashes
-in it; it is the same world at the same tick, or an error. What belongs to the game and is not in the world goes the
-same way: `keep` for the checkpoint, `RecordedWorld.note` for the log.
+in it; it is the same world at the same tick, or an error. `server.mark` knows how far the log must reach. What belongs
+to the game and is not in the world goes the same way: `keep` for the checkpoint, `RecordedWorld.note` for the log.
 
 A tick in which nothing was told, nothing moved and nothing changed is quiet. Quiet ticks are written once a second; the
 loss of some is the loss of nothing, so they count as durable as soon as everything before them is.
 
-Every `checkpoint_s` seconds the world is copied (`server.checkpoint`: entities at once, changed segments piece by piece
-and in the thread), packed between the transactions of the log, and saved in one transaction, which also drops the log
-up to there. Until it is complete the old checkpoint and its log are. The ticks wait for none of it.
+Every `checkpoint_s` seconds the world is copied (`server.checkpoint`: entities at once, the segments touched since the
+checkpoint before piece by piece and in the thread), packed between the transactions of the log, and saved in one
+transaction, which also drops the log up to there. Until it is complete the old checkpoint and its log are. The ticks
+wait for none of it.
 
 When the disk takes no more, or does not keep up by more than `BEHIND_S`, there is a gap: `trouble` says why, records
 are dropped, and the game refuses commands (`messages.UNSAVED`) while players move on. What was told "done" before is on
@@ -39,8 +40,8 @@ from typing import Any
 
 import msgpack
 
-from server.checkpoint import Checkpoint, Copy
-from server.database import Database, Record, StoreError, chained
+from server.checkpoint import Checkpoint, Copy, Saved
+from server.database import Database, Record, StoreError, chained, seal_of
 from server.histogram import Histogram
 from server.loading import claimed, load
 from server.recorder import Pen
@@ -53,6 +54,8 @@ LOG_BYTES_MAX = 32 << 20
 """A log that has grown to this is cut by a checkpoint ahead of time."""
 HASHED_MAX = 1000
 """In larger worlds, whole hashes are left to the checkpoints: no tick should pay for one."""
+STALE_MAX = 16
+"""So are those of worlds in which more segments wait for their digests, 40 us each."""
 QUIET_S = 1.0
 """Ticks in which nothing happened wait so long for company."""
 BEHIND_S = 10.0
@@ -97,7 +100,7 @@ class Store(Pen):
         checkpoint_s: float = 60.0,
         compiled: bool | None = None,
     ) -> None:
-        super().__init__(first=False, hashed_max=HASHED_MAX)
+        super().__init__(first=False, hashed_max=HASHED_MAX, stale_max=STALE_MAX)
         self._path = Path(directory) / "world.db"
         self._rules, self._game = msgpack.packb(scene.to_table()), game
         self._power = power
@@ -121,7 +124,8 @@ class Store(Pen):
         try:
             loaded = load(self._path, scene, game, compiled=compiled)
             self._file: Database | None = Database(self._path, power=power)
-            self._saved = self._file.digests()
+            self._saved: Saved = loaded.saved
+            self._seals: dict[bytes, Saved] = {self._file.seal(): loaded.saved}
         except sqlite3.Error as error:
             self._claim.close()
             raise StoreError(f"{self._path}: cannot be written ({error})") from error
@@ -284,8 +288,10 @@ class Store(Pen):
 
     def _save(self, file: Database, copy: Copy, checkpoint: Checkpoint, chain: int) -> None:
         """Puts a checkpoint on disk; the gap before it, if there was one, is closed."""
+        seal = seal_of(checkpoint, self._rules, chain)
+        self._seals[seal] = copy.saved
         file.save(checkpoint, self._rules, chain, self._game)
-        self._saved = copy.digests
+        self._saved, self._seals = copy.saved, {seal: copy.saved}
         self._written = max(self._written, copy.tick)
         self._log_bytes = 0
         self.checkpoint_s.record(time.monotonic() - self._began)
@@ -309,7 +315,9 @@ class Store(Pen):
         self._began = time.monotonic()
         file = Database(self._path, power=self._power)
         try:
-            self._saved = file.digests()
+            seal = file.seal()  # an attempt that failed may have been carried out all the same
+            self._saved = self._seals.get(seal) or dict.fromkeys(file.segments())
+            self._seals = {seal: self._saved}
             for checkpoint in copy.pieces(self._saved):
                 if checkpoint is not None and self._copy is copy:
                     self._save(file, copy, checkpoint, self._chain)

@@ -39,7 +39,7 @@ import msgpack
 
 from shared.blocks import PACKED_MAX
 
-VERSION = 2
+VERSION = 3
 
 MESSAGE_MAX = 256 * 1024
 """No message of the server is longer, in bytes."""

@@ -25,7 +25,7 @@ changed its segment, is sent whole, as is all that something has happened to in 
 """
 
 import functools
-import zlib
+import hashlib
 from collections.abc import Collection, Sequence
 from typing import Any, NamedTuple
 
@@ -213,13 +213,17 @@ def join_part(
 
 
 def checksum(world: World, segment: Cell) -> int:
-    """A number from 1 on for all of a loaded segment as it is: entities and blocks."""
+    """The check of a loaded segment as it is, entities and blocks: 1 to 2^32 - 1.
+
+    It is the first 4 bytes, little-endian, of a SHA-256: over the segment's digest and the rows of its entities.
+    """
     kernel = kernels.of(bulk, world.compiled)
     keys, packed = np.empty(len(world), np.int64), np.empty(len(world) * ROW_BYTES, np.uint8)
     mine = kernels.lent(keys, world.compiled), kernels.lent(packed, world.compiled)
     end = kernel.muster(world.arrays.entities, world.arrays.heads, *mine, world.blocks.rows[segment])
-    blocks = zlib.crc32(world.blocks.digest(segment).to_bytes(8, "little"))
-    return zlib.crc32(packed[:end].data, blocks) or 1
+    whole = hashlib.sha256(world.blocks.digest(segment))
+    whole.update(packed[:end].data)
+    return int.from_bytes(whole.digest()[:4], "little") or 1
 
 
 def decode_parts(

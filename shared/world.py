@@ -26,6 +26,8 @@ from shared.units import BLOCK, SEGMENT, SPEED, to_position, to_positions, to_ve
 
 STATES = layout.CELL
 """Columns of an entity's state: id, template, flags, x, y, z, vx, vy, vz, move_x, move_y, buttons."""
+HASH_BYTES = 20
+"""Bytes of a world's hash."""
 ID_MAX = (1 << 31) - 1
 COLLECT_MAX = 1024
 """Up to so many rows, the kernel sorts states by insertion: 1 us for some ten, instead of 9."""
@@ -195,14 +197,15 @@ class World:
         return rows[np.argsort(rows[:, ID])]
 
     def state_hash(self, entities: Iterable[int] | None = None) -> bytes:
-        """16 bytes over the tick, all blocks and all entities (or just some, and then no blocks)."""
+        """20 bytes over the tick, all blocks and all entities (or just some, and then no blocks)."""
         if entities is None:
+            self.blocks.freshen()
             rows = list(self.blocks.rows.values())
             return hash_of(self.tick, self.blocks.segments[rows], self.blocks.digests[rows], self.states())
-        nothing = np.zeros((0, 3), np.int64)
+        cells, digests = np.zeros((0, 3), np.int64), np.zeros((0, blocks.DIGEST_BYTES), np.uint8)
         states = self.rows(sorted(entities))[:, :STATES]
         states[:, FLAGS] &= FALLING
-        return hash_of(self.tick, nothing, nothing[:, 0].astype(np.uint64), states)
+        return hash_of(self.tick, cells, digests, states)
 
     # -- blocks --------------------------------------------------------------------------------------------
 
@@ -616,14 +619,19 @@ class World:
         self._kernel.wake_on(self._arrays, row, box[0], box[1], box[3], box[4], box[5])
 
 
-def hash_of(tick: int, segments: layout.Int64s, digests: npt.NDArray[np.uint64], states: layout.Int64s) -> bytes:
-    """The hash of a world from its parts: segments [n, 3] and their digests [n] in any order, states [n, 12] by id."""
+def hash_of(tick: int, segments: layout.Int64s, digests: npt.NDArray[np.uint8], states: layout.Int64s) -> bytes:
+    """The hash of a world from its parts.
+
+    Args:
+        tick: the tick it has reached.
+        segments: [n, 3], the indices of its segments in any order.
+        digests: [n, 16], the digests of those segments.
+        states: [m, 12], the states of its entities, ascending by id.
+    """
     order = np.lexsort((segments[:, 2], segments[:, 1], segments[:, 0]))
-    blocks = np.empty((len(order), 4), "<i8")
-    blocks[:, :3] = segments[order]
-    blocks[:, 3] = digests[order].view(np.int64)
-    digest = hashlib.blake2b(struct.pack("<q", tick), digest_size=16)
-    digest.update(blocks.tobytes())
+    digest = hashlib.blake2b(struct.pack("<qqq", tick, len(segments), len(states)), digest_size=HASH_BYTES)
+    digest.update(segments[order].astype("<i8").tobytes())
+    digest.update(digests[order].tobytes())
     digest.update(states.astype("<i8").tobytes())
     return digest.digest()
 

@@ -27,7 +27,7 @@ const ints = (bin, ...offsets) => offsets.map(offset => bin.readInt32LE(offset))
 const reader = (bin, at = 0) => ({ i8: () => bin.readInt8(at++), i32: () => bin.readInt32LE((at += 4) - 4) });
 function* records(size, bin = []) { for (let at = 0; at < bin.length; at += size) yield bin.subarray(at, at + size); }
 
-socket.on("open", () => send(HELLO, 2, {}, "node", "", new Uint8Array(0)));
+socket.on("open", () => send(HELLO, 3, {}, "node", "", new Uint8Array(0)));
 socket.on("message", data => {
   const [kind, ...fields] = decode(data); // each bin in it is a Buffer, as `data` is
   if (kind === WELCOME) welcome(...fields);

@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from server import app
+from server import app, former
 from server.journal import FILL, MAGIC, NOTE, PUT, REMOVE, DivergedError, JournalError, Moment, Recording, redo, replay
 from server.kinds import SettingsError
 from server.recorder import Pen, RecordedWorld
@@ -20,6 +20,8 @@ from shared.inputs import Input
 from shared.world import OverlapError, World
 from tests import worlds
 
+FORMER = Path(__file__).parent.parent / "golden" / "former"
+"""What the program of 2db46f5 has written: a recording in format 2, and a saved world in schema version 2."""
 FLOOR = [worlds.floor(0)]
 
 
@@ -260,8 +262,16 @@ def test_another_file_and_a_newer_one_are_named() -> None:
     data = file.getvalue()
     with pytest.raises(JournalError, match="not a recording"):
         read(b"SQLite format 3\0")
-    with pytest.raises(JournalError, match=r"format 3: this program reads formats up to 2"):
-        read(MAGIC + struct.pack("<H", 3) + data[10:])
+    with pytest.raises(JournalError, match=r"format 4: this program reads formats up to 3"):
+        read(MAGIC + struct.pack("<H", 4) + data[10:])
+
+
+def test_a_recording_of_the_former_format_is_replayed_to_its_own_hashes() -> None:
+    data = (FORMER / "recording.snj").read_bytes()
+    moments, recording = read(data)
+    assert data[8:10] == b"\2\0"
+    assert sum(moment.hashed for moment in moments) == 3
+    assert former.state_hash(recording.world).hex() == "1af78ad868c6022ecba396acb5ad1d7b"
     read(MAGIC + struct.pack("<H", 1) + data[10:])
 
 
@@ -295,7 +305,7 @@ def test_a_flipped_bit_is_found_wherever_it_is(at: int) -> None:
 )
 def test_a_number_that_no_world_can_hold_is_no_recording(record: list[Any], why: str) -> None:
     start = DATA[: 22 + struct.unpack_from("<I", DATA, 10)[0]]
-    payload, chain = msgpack.packb(record), zlib.crc32(start[22:])
+    payload, chain = msgpack.packb(record), zlib.crc32(start[22:], zlib.crc32(start[:10]))
     length = struct.pack("<I", len(payload))
     checks = struct.pack("<II", zlib.crc32(length, chain), zlib.crc32(payload, chain))
     with pytest.raises(JournalError, match=rf"what was recorded cannot be done .*{why}"):
