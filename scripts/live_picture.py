@@ -8,9 +8,9 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
-from _processes import own_server
 from client_sdk.bots import POLICIES, Bot
 from client_sdk.transports.aio import AsyncClient
+from sovereign_netcode.loadtest.processes import own_server
 from tests.chromium import chromium, installed
 
 NAMES = "Ada Alan Barbara Chen Donald Edsger Frances Grace Hedy Ivan Joan Ken Leslie Margaret Niklaus Radia".split()

@@ -29,11 +29,11 @@ from typing import Any
 from rich.console import Console
 from rich.progress import Progress
 
-from _processes import CannotStartError, stats
 from _soakers import Cells, Honest
 from server.store import Store
 from shared.scene import load_scene
 from shared.world import World
+from sovereign_netcode.loadtest.processes import CannotStartError, stats
 
 ROOT = Path(__file__).resolve().parent.parent
 SCENE = "hills"

@@ -3,8 +3,7 @@
 import importlib
 import sys
 
-DISTRIBUTIONS = {"pygame": "pygame-ce"}
-"""What to install for a module, where that has another name."""
+from server.extras import install
 
 
 def server() -> int:
@@ -12,11 +11,34 @@ def server() -> int:
     return _run("sovereign_netcode.server.__main__")
 
 
-def _run(module: str) -> int:
+def loadtest() -> int:
+    """Runs `sovereign-loadtest`, which is `python -m sovereign_netcode.loadtest`. Returns the exit code."""
+    return _run("sovereign_netcode.loadtest.app", "tools")
+
+
+def new_game() -> int:
+    """Runs `sovereign-new-game`, which is `python -m sovereign_netcode.new_game`. Returns the exit code."""
+    return _run("sovereign_netcode.new_game")
+
+
+def play() -> int:
+    """Runs `sovereign-play`, which is `python -m sovereign_netcode.play`. Returns the exit code."""
+    return _run("sovereign_netcode.play.app", "play")
+
+
+def replay() -> int:
+    """Runs `sovereign-replay`, which is `python -m sovereign_netcode.replay`. Returns the exit code."""
+    return _run("sovereign_netcode.replay", "tools")
+
+
+def _run(module: str, extra: str = "") -> int:
     """Calls a module's `main`, in the conditions of `python -m`: modules in the current folder can be imported.
 
+    Args:
+        extra: of `pyproject.toml`, with what the module needs.
+
     Raises:
-        SystemExit: a package that the command needs is not installed.
+        SystemExit: a package that the module needs is not installed.
     """
     if "" not in sys.path:
         sys.path.insert(0, "")
@@ -24,7 +46,7 @@ def _run(module: str) -> int:
         main = importlib.import_module(module).main
     except ModuleNotFoundError as error:
         missing = (error.name or "").partition(".")[0]
-        if not missing or missing == "sovereign_netcode":
+        if not extra or missing in ("sovereign_netcode", "client_sdk", "server", "shared"):
             raise
-        sys.exit(f"error: this command needs {missing} as well: pip install {DISTRIBUTIONS.get(missing, missing)}")
+        sys.exit(f"error: this command needs {missing}, which is not installed here: {install(extra)}")
     return int(main())

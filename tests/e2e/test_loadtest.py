@@ -102,7 +102,7 @@ def playing(request: pytest.FixtureRequest) -> Iterator[tuple["subprocess.Popen[
                     break
             pids = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()
             started = {int(pid): Path(f"/proc/{pid}/cmdline").read_text() for pid in pids}
-            assert sorted("_swarm.py" in command for command in started.values()) == [False, True, True]
+            assert sorted("loadtest.swarm" in command for command in started.values()) == [False, True, True]
             yield process, started
         finally:
             if process.poll() is None:
@@ -125,7 +125,9 @@ def test_a_signal_leaves_nothing_behind(
 
 
 @needs_linux
-@pytest.mark.parametrize(("killed", "name"), [("_swarm.py\0", "a process of bots"), ("-m\0server\0", "the server")])
+@pytest.mark.parametrize(
+    ("killed", "name"), [("loadtest.swarm\0", "a process of bots"), ("sovereign_netcode.server\0", "the server")]
+)
 def test_the_death_of_a_process_ends_it_at_once_with_nothing_left_behind(
     playing: tuple["subprocess.Popen[str]", dict[int, str]], killed: str, name: str
 ) -> None:

@@ -4,10 +4,13 @@ Everything runs in a bare environment outside the repository (`tests.packaging.b
 """
 
 import ast
+import contextlib
 import email
+import shutil
 import subprocess
 import tarfile
 import zipfile
+from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
@@ -16,11 +19,19 @@ import pytest
 from hatch_build import FOLDERS
 from tests.packaging.bare import ROOT, build, environment, run
 from tests.packaging.test_rewriting import imported
+from tests.readme.pages import programs
+from tests.readme.run_snippet import LOOP
+from tests.readme.test_snippets import A_FILE, ALONE, ENGINES, ON_A_SERVER
 
 pytestmark = pytest.mark.e2e
 
-PACKAGES = ("numpy", "websockets", "msgpack", "prometheus-client", "pyjwt", "structlog", "uvloop", "pettingzoo")
-"""What `sovereign-netcode[server,agents]` requires but Numba, which would compile the kernels anew."""
+PACKAGES = (
+    *("numpy", "websockets", "msgpack"),
+    *("prometheus-client", "pyjwt", "structlog", "uvloop", "pettingzoo", "pygame-ce", "rich"),
+    *("mypy", "pytest"),
+)
+"""What the package requires with all its extras but Numba, which would compile the kernels anew; and tools of users."""
+COMMANDS = ("loadtest", "new-game", "play", "replay", "server")
 
 
 class Installed(NamedTuple):
@@ -60,7 +71,27 @@ def installed(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Installe
     (folder / "server.py").write_text("NAME = 'my server'\n", "utf-8")
     (folder / "client_sdk.py").write_text("NAME = 'my client'\n", "utf-8")
     (folder / "shared" / "__init__.py").write_text("NAME = 'my shared'\n", "utf-8")
+    # The pages and what runs their programs, which is no part of the package.
+    shutil.copytree(ROOT / "tests" / "readme", folder / "tests" / "readme")
+    shutil.copytree(ROOT / "docs", folder / "docs")
+    shutil.copy(ROOT / "README.md", folder)
     return Installed(environment(place / "venv", wheel, *PACKAGES), folder)
+
+
+@contextlib.contextmanager
+def served(installed: Installed, *flags: str) -> Iterator[str]:
+    """The URL of an installed server, which has to end well."""
+    command = [str(installed.python.parent / "sovereign-server"), "--port", "0", "--log-level", "warning", *flags]
+    with subprocess.Popen(command, cwd=installed.folder, stdout=subprocess.PIPE, text=True) as process:
+        try:
+            assert process.stdout is not None
+            line = process.stdout.readline()
+            assert line.startswith("listening on "), "the server did not start"
+            yield line.split()[-1]
+            process.terminate()
+            assert process.wait(10) == 0
+        finally:
+            process.kill()
 
 
 def names(wheel: Path) -> set[str]:
@@ -103,7 +134,7 @@ def test_the_metadata_says_what_it_is(wheel: Path) -> None:
     assert "Typing :: Typed" in metadata.get_all("Classifier", [])
     assert metadata["License-Expression"] == "MIT"
     assert licence == (ROOT / "LICENSE").read_bytes()
-    assert "sovereign-server = sovereign_netcode.commands:server" in commands
+    assert all(f"sovereign-{name} = sovereign_netcode.commands:" in commands for name in COMMANDS)
 
 
 def test_the_source_distribution_has_what_git_has_and_makes_the_same_wheel(
@@ -141,7 +172,91 @@ def test_every_module_can_be_imported(installed: Installed) -> None:
     assert installed.run("-W", "error", "-c", program) == "[]\n"
 
 
-def test_the_server_runs_as_a_module_and_as_a_command(installed: Installed) -> None:
-    said = installed.run("-m", "sovereign_netcode.server", "--list-scenes")
-    assert "hills" in said
-    assert installed.command("sovereign-server", "--list-scenes") == said
+@pytest.mark.parametrize("name", COMMANDS)
+def test_a_command_runs_as_a_module_too(installed: Installed, name: str) -> None:
+    said = installed.command(f"sovereign-{name}", "--help")
+    assert "usage: " in said
+    assert installed.run("-m", f"sovereign_netcode.{name.replace('-', '_')}", "--help") == said
+
+
+def test_a_command_says_what_it_lacks(wheel: Path, tmp_path: Path) -> None:
+    alone = Installed(environment(tmp_path / "venv", wheel, "numpy", "websockets", "msgpack"), tmp_path)
+    for name, module, extra in (
+        ("loadtest", "rich", "tools"),
+        ("play", "pygame", "play"),
+        ("server", "structlog", "server"),
+    ):
+        done = subprocess.run(
+            [alone.python.parent / f"sovereign-{name}"], cwd=tmp_path, capture_output=True, text=True, check=False
+        )
+        assert done.returncode == 1
+        assert f"needs {module}, which is not installed here: pip install 'PATH[{extra}]'" in done.stderr, done.stderr
+
+
+def test_a_game_is_begun_tested_and_served(installed: Installed) -> None:
+    said = installed.command("sovereign-new-game", "king_of_the_hill")
+    assert "sovereign_netcode.server --game king_of_the_hill:KingOfTheHill" in said
+    assert "3 passed" in installed.run("-m", "pytest", "-q", "test_king_of_the_hill.py")
+    with served(installed, "--game", "king_of_the_hill:KingOfTheHill", "--record", "session"):
+        pass
+    assert "ticks as recorded" in installed.command("sovereign-replay", "session")
+
+
+@pytest.mark.slow
+def test_a_game_is_played_in_the_window(installed: Installed) -> None:
+    said = installed.command("sovereign-play", "--script-demo", "picture.png")
+    assert "the script has ended" in said
+    assert (installed.folder / "picture.png").stat().st_size > 10_000
+
+
+def test_a_match(installed: Installed) -> None:
+    program = "from tests.readme.pages import programs; exec(programs()['Testing it']); print('over:', match.now)"
+    assert "over: 30" in installed.run("-c", program)
+
+
+@pytest.mark.parametrize(
+    "name", [LOOP, ENGINES[0], *(pytest.param(name, marks=pytest.mark.slow) for name in ENGINES[1:])]
+)
+def test_a_program_with_a_loop(installed: Installed, name: str) -> None:
+    assert "walked" in installed.run("-m", "tests.readme.run_snippet", name)
+
+
+@pytest.mark.slow
+def test_the_other_programs(installed: Installed) -> None:
+    with served(installed, "--scene", "flat") as url:
+        for name in ON_A_SERVER:
+            assert "walked" in installed.run("-m", "tests.readme.run_snippet", name, url)
+    for name in ALONE:
+        installed.run("-c", f"from tests.readme.pages import programs; exec(programs()[{name!r}])")
+    assert len(programs()) == len([LOOP, A_FILE, *ENGINES, *ON_A_SERVER, *ALONE])
+
+
+def test_five_bots(installed: Installed) -> None:
+    said = installed.command("sovereign-loadtest", "--clients", "5", "--seconds", "3", "--scene", "flat", "--verdict")
+    assert "failed:" not in said
+
+
+def test_types_are_checked(installed: Installed) -> None:
+    (installed.folder / "mine.py").write_text(
+        "import server\n"
+        "from sovereign_netcode.client_sdk import Client\n"
+        "from sovereign_netcode.playtest import Match\n"
+        "from sovereign_netcode.server.rules import Rules\n"
+        "class Mine(Rules):\n"
+        "    def on_start(self) -> int:\n"
+        "        return 1\n"
+        "reveal_type(Client.connect(server.NAME).view())\n"
+        "reveal_type(Match.run)\n",
+        "utf-8",
+    )
+    done = subprocess.run(
+        [installed.python, "-m", "mypy", "--strict", "mine.py"],
+        cwd=installed.folder,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    said = done.stdout.splitlines()
+    assert said[0].startswith('mine.py:6: error: Return type "int" of "on_start" incompatible with return type "None"')
+    assert 'mine.py:8: note: Revealed type is "sovereign_netcode.client_sdk.picture.View"' in said
+    assert said[-1] == "Found 1 error in 1 file (checked 1 source file)"

@@ -2,18 +2,14 @@
 
 import io
 import random
-import sys
 from itertools import chain
-from pathlib import Path
 from typing import Any
 
 import pytest
 from rich.console import Console
 
-sys.path.insert(0, str(Path(__file__).parents[2] / "scripts"))
-import _figures
-import _glance
 from server.histogram import Histogram, between
+from sovereign_netcode.loadtest import figures, glance
 
 Figures = dict[str, Any]
 
@@ -56,8 +52,8 @@ def test_three_processes_have_the_figures_of_one_with_all_their_bots() -> None:
     clients, rng = [client(number) for number in range(12)], random.Random(1)
     parts = [[rng.expovariate(1000) for _ in range(n)] for n in (50, 400, 30)]
     parts[2] = [0.2 + value for value in parts[2]]  # all that is late is in one of them
-    whole = _figures.figures([result(clients, [*chain(*parts)], 6.0)], 10.0, {}, {}, [])
-    several = _figures.figures(
+    whole = figures.figures([result(clients, [*chain(*parts)], 6.0)], 10.0, {}, {}, [])
+    several = figures.figures(
         [result(clients[4 * i : 4 * i + 4], part, 2.0) for i, part in enumerate(parts)], 10.0, {}, {}, []
     )
     assert several | {"bots": None} == whole | {"bots": None}
@@ -79,11 +75,11 @@ def test_three_processes_have_the_figures_of_one_with_all_their_bots() -> None:
 )
 def test_one_process_of_four_that_cannot_keep_up_is_told(lags_s: list[float], cpu_s: float, said: str) -> None:
     good = [result([client(number)], [0.0005] * 500, 1.0) for number in range(3)]
-    found = _figures.figures([*good, result([client(3)], lags_s, cpu_s)], 10.0, {}, {}, [])
-    told = _figures.bottleneck(found)
+    found = figures.figures([*good, result([client(3)], lags_s, cpu_s)], 10.0, {}, {}, [])
+    told = figures.bottleneck(found)
     assert said in told
     assert bool(told) == bool(said)
-    assert (told in [judgement.text for judgement in _figures.verdict(found)]) == bool(said)
+    assert (told in [judgement.text for judgement in figures.verdict(found)]) == bool(said)
 
 
 def bots(at: float, **more: Any) -> Figures:
@@ -95,8 +91,8 @@ def test_a_glance_is_of_what_happened_since_the_last_one() -> None:
     server = {"ticks": 100, "uptime_s": 50.0, "cpu_s": 4.0, "tick_lateness_counts": [[100, 90], [9000, 10]]}
     later = {"ticks": 164, "uptime_s": 52.0, "cpu_s": 4.5, "tick_lateness_counts": [[100, 153], [9000, 11]]}
     # Each process has spoken at a moment of its own, and they are of different age.
-    before = _glance.Look(server, [bots(7.0, bytes_down=10_000), bots(900.0, inputs_late=3)])
-    now = _glance.Look(
+    before = glance.Look(server, [bots(7.0, bytes_down=10_000), bots(900.0, inputs_late=3)])
+    now = glance.Look(
         later,
         [
             bots(9.0, bytes_down=30_000, bytes_up=4_000, inputs_sent=320, corrections=2, lag_counts=[[500, 100]]),
@@ -104,7 +100,7 @@ def test_a_glance_is_of_what_happened_since_the_last_one() -> None:
             | {"playing": 4, "ended": [{"code": 0, "reason": "gone"}]},
         ],
     )
-    assert dict(_glance.rows(before, now)) == {
+    assert dict(glance.rows(before, now)) == {
         "clients": "9, 1 gone",
         "ticks": "32.0 /s",
         "ticks late": "0.1 / 9.0 / 9.0 ms",
@@ -120,16 +116,16 @@ def test_a_glance_is_of_what_happened_since_the_last_one() -> None:
 
 def test_a_glance_does_without_what_nobody_tells() -> None:
     joining, begun = {"playing": 2, "ended": []}, bots(7.0)
-    assert _glance.rows(_glance.Look({}, [joining]), _glance.Look({}, [begun])) == [("clients", "5")]
-    both = _glance.Look({}, [joining, begun])
-    assert _glance.rows(both, both) == [("clients", "7"), ("bots silent", "2 of 2 processes")]
+    assert glance.rows(glance.Look({}, [joining]), glance.Look({}, [begun])) == [("clients", "5")]
+    both = glance.Look({}, [joining, begun])
+    assert glance.rows(both, both) == [("clients", "7"), ("bots silent", "2 of 2 processes")]
 
 
 @pytest.mark.parametrize("terminal", [False, True])
 def test_figures_are_lines_of_their_own_but_on_a_terminal(terminal: bool) -> None:
     out = io.StringIO()
     console = Console(file=out, force_terminal=terminal, width=60, height=30)
-    with _glance.Stage(console) as stage:
+    with glance.Stage(console) as stage:
         stage.begin("5 play", 10.0)
         stage.at(3.0)
         stage.show(3.0, [("clients", "5"), ("ticks", "32.0 /s")])

@@ -1,42 +1,30 @@
 """The skeleton of a game: it works as it is written, and nothing of anybody's is overwritten."""
 
-import importlib.machinery
-import importlib.util
 import subprocess
 import sys
 from pathlib import Path
-from types import ModuleType
 
 import pytest
 
+from sovereign_netcode import new_game
 from tests.e2e.processes import running
 
 ROOT = Path(__file__).resolve().parents[2]
-sys.path.insert(0, str(ROOT / "scripts"))
 
 
-@pytest.fixture
-def script(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> ModuleType:
-    loader = importlib.machinery.SourceFileLoader("new_game", str(ROOT / "scripts" / "new-game"))
-    spec = importlib.util.spec_from_loader("new_game", loader)
-    assert spec is not None
-    module = importlib.util.module_from_spec(spec)
-    loader.exec_module(module)
-    monkeypatch.setattr(module, "ensure", lambda requirements: None)
+@pytest.fixture(autouse=True)
+def _in_a_folder_of_ones_own(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.chdir(tmp_path)
-    return module
 
 
-def run(script: ModuleType, monkeypatch: pytest.MonkeyPatch, name: str) -> int:
-    monkeypatch.setattr(sys, "argv", ["new-game", name])
-    return int(script.main())
+def run(monkeypatch: pytest.MonkeyPatch, name: str) -> int:
+    monkeypatch.setattr(sys, "argv", ["sovereign-new-game", name])
+    return new_game.main()
 
 
 @pytest.mark.e2e
-def test_its_tests_pass_and_the_server_plays_it(
-    script: ModuleType, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    assert run(script, monkeypatch, "my_first_game") == 0
+def test_its_tests_pass_and_the_server_plays_it(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    assert run(monkeypatch, "my_first_game") == 0
     config = ("-c", str(ROOT / "pyproject.toml"), "-p", "no:cacheprovider")
     tests = subprocess.run(
         [sys.executable, "-m", "pytest", "-q", *config, str(tmp_path / "test_my_first_game.py")],
@@ -57,22 +45,19 @@ def test_its_tests_pass_and_the_server_plays_it(
 
 @pytest.mark.parametrize("mine", ["mine.py", "test_mine.py"])
 def test_nothing_is_overwritten(
-    script: ModuleType,
     monkeypatch: pytest.MonkeyPatch,
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
     mine: str,
 ) -> None:
     (tmp_path / mine).write_text("precious")
-    assert run(script, monkeypatch, "mine") == 2
+    assert run(monkeypatch, "mine") == 2
     assert [path.name for path in tmp_path.iterdir()] == [mine]
     assert (tmp_path / mine).read_text() == "precious"
     assert mine in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("name", ["server", "json", "class", "My", "a-b", "2fast", ""])
-def test_a_name_that_cannot_be_imported_is_refused(
-    script: ModuleType, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, name: str
-) -> None:
-    assert run(script, monkeypatch, name) == 2
+def test_a_name_that_cannot_be_imported_is_refused(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, name: str) -> None:
+    assert run(monkeypatch, name) == 2
     assert list(tmp_path.iterdir()) == []

@@ -27,9 +27,9 @@ os.environ["PYGAME_HIDE_SUPPORT_PROMPT"] = "1"
 
 import pygame  # noqa: E402
 
-import _play_iso as iso  # noqa: E402
-from _play_window import SIZE, Window, keyboard  # noqa: E402
 from sovereign_netcode.examples.tag import Tag  # noqa: E402
+from sovereign_netcode.play import iso  # noqa: E402
+from sovereign_netcode.play.window import SIZE, Window, keyboard  # noqa: E402
 
 
 @pytest.fixture(autouse=True)
@@ -222,7 +222,7 @@ def test_the_latency_of_the_keys_is_as_much_as_they_say() -> None:
 @pytest.mark.skipif(not kernels.available(), reason="with plain Python the bots take all the time there is")
 def test_a_scripted_session_walks_jumps_builds_and_sees_a_hand_over(tmp_path: Path) -> None:
     out = tmp_path / "out.png"
-    command = [sys.executable, "scripts/_play.py", "--script-demo", str(out)]
+    command = [sys.executable, "-m", "sovereign_netcode.play", "--script-demo", str(out)]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
     assert "Traceback" not in done.stderr

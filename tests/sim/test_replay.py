@@ -1,10 +1,8 @@
 """A whole match is recorded and replayed to the same hashes: joins, leaves, falls into the void and edits included."""
 
-import importlib.util
 import io
 import random
 from pathlib import Path as File
-from types import ModuleType
 
 import pytest
 
@@ -15,9 +13,8 @@ from server.recorder import RecordedWorld
 from shared.inputs import Input
 from shared.scene import load_scene
 from shared.world import World
-from tests.match import Match, Path, wander
-
-ROOT = File(__file__).resolve().parents[2]
+from sovereign_netcode import replay
+from sovereign_netcode.playtest import Match, Path, wander
 
 
 def to_the_pit(core: Core, rng: random.Random) -> Input:
@@ -120,34 +117,22 @@ def test_a_flipped_bit_anywhere_is_found(played: Played) -> None:
 # -- the script ----------------------------------------------------------------------------------------------
 
 
-@pytest.fixture(scope="module")
-def script() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("replay_script", ROOT / "scripts" / "replay.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
 def test_the_script_says_that_all_is_as_recorded(
-    played: Played, script: ModuleType, tmp_path: File, capsys: pytest.CaptureFixture[str]
+    played: Played, tmp_path: File, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = tmp_path / "match"
     path.write_bytes(played.data)
-    assert script.main([str(path)]) == 0
+    assert replay.main([str(path)]) == 0
     said = capsys.readouterr().out
     last = max(played.hashes)
     assert f"{last:,} ticks as recorded, to tick {last}" in said
     assert played.hashes[last].hex() in said
     path.write_bytes(played.data[: played.ends[-1] - 1])
-    assert script.main([str(path)]) == 0
+    assert replay.main([str(path)]) == 0
     assert f"breaks off after tick {last - 1}" in capsys.readouterr().out
 
 
-def test_the_script_shows_a_neighbourhood(
-    played: Played, script: ModuleType, tmp_path: File, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_script_shows_a_neighbourhood(played: Played, tmp_path: File, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "match"
     path.write_bytes(played.data)
     recording = Recording(io.BytesIO(played.data))
@@ -156,9 +141,9 @@ def test_the_script_shows_a_neighbourhood(
         for moment in recording
         if moment.world.tick > 100
         for entity in moment.world.entities["id"].tolist()
-        if any("#" in text for text in script.contacts(moment.world, entity))
+        if any("#" in text for text in replay.contacts(moment.world, entity))
     )
-    assert script.main([str(path), "--tick", str(met[0]), "--entity", str(met[1]), "--around", "2"]) == 0
+    assert replay.main([str(path), "--tick", str(met[0]), "--entity", str(met[1]), "--around", "2"]) == 0
     said = capsys.readouterr().out
     for text in (
         f"around entity {met[1]}",
@@ -168,15 +153,14 @@ def test_the_script_shows_a_neighbourhood(
         *map(str, range(met[0] - 2, met[0] + 3)),
     ):
         assert text in said
-    assert script.main([str(path), "--tick", str(met[0]), "--around", "0"]) == 0
+    assert replay.main([str(path), "--tick", str(met[0]), "--around", "0"]) == 0
     assert "around entity" in capsys.readouterr().out
-    assert script.main([str(path), "--tick", "999999"]) == 2
+    assert replay.main([str(path), "--tick", "999999"]) == 2
     assert "tick 999999 is not in this recording" in capsys.readouterr().err
 
 
 def test_the_script_names_the_tick_that_differs(
     played: Played,
-    script: ModuleType,
     tmp_path: File,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
@@ -193,16 +177,14 @@ def test_the_script_names_the_tick_that_differs(
             world.put([tuple(state)])
 
     monkeypatch.setattr(World, "step", slip)
-    assert script.main([str(path)]) == 1
+    assert replay.main([str(path)]) == 1
     assert "differs at tick 33" in capsys.readouterr().out
 
 
-def test_the_script_refuses_what_is_no_recording(
-    script: ModuleType, tmp_path: File, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_script_refuses_what_is_no_recording(tmp_path: File, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "text").write_text("hello", "utf-8")
-    assert script.main([str(tmp_path / "text")]) == 2
-    assert script.main([str(tmp_path / "nowhere")]) == 2
+    assert replay.main([str(tmp_path / "text")]) == 2
+    assert replay.main([str(tmp_path / "nowhere")]) == 2
     said = capsys.readouterr().err.splitlines()
     assert "not a recording" in said[0]
     assert "No such file" in said[1]

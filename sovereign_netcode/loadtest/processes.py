@@ -7,11 +7,9 @@ import http.client
 import json
 import sys
 from collections.abc import AsyncIterator
-from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
-ROOT = Path(__file__).resolve().parent.parent
 START_S_MAX = 120.0
 """A server's first start compiles the physics."""
 END_S = 10.0
@@ -32,7 +30,7 @@ class DiedError(Exception):
 
 
 class Worker:
-    """The other end of a `_swarm.py`."""
+    """The other end of a process of bots (`sovereign_netcode.loadtest.swarm`)."""
 
     def __init__(self, process: Process) -> None:
         self.process = process
@@ -81,8 +79,7 @@ async def child(*command: str, patience_s: float = 0.0) -> AsyncIterator[Process
     At the end its input is closed, which ends bots; after `patience_s` it gets SIGTERM, which ends a server.
     """
     process = await asyncio.create_subprocess_exec(
-        *(sys.executable, *command),
-        cwd=ROOT,
+        *(sys.executable, "-P", *command),  # -P: modules in the current folder do not matter
         stdin=asyncio.subprocess.PIPE,
         stdout=asyncio.subprocess.PIPE,
         limit=LINE_BYTES_MAX,
@@ -118,7 +115,18 @@ async def own_server(args: argparse.Namespace) -> AsyncIterator[tuple[Process, s
         CannotStartError: it does not; it has said why.
     """
     rate = ("--tick-rate", str(args.tick_rate)) if args.tick_rate else ()
-    command = ("-m", "server", "--host", "127.0.0.1", "--port", "0", "--scene", args.scene, "--log-level", "warning")
+    command = (
+        "-m",
+        "sovereign_netcode.server",
+        "--host",
+        "127.0.0.1",
+        "--port",
+        "0",
+        "--scene",
+        args.scene,
+        "--log-level",
+        "warning",
+    )
     async with child(*command, *rate) as server:
         assert server.stdout is not None
         line = ""

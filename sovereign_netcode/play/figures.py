@@ -6,9 +6,9 @@ from collections.abc import Callable
 
 import pygame
 
-from _play_iso import HALF, QUARTER, RISE, Colour, Ground, Point, mixed, project
 from client_sdk.picture import Figure
 from shared.checks import Vec
+from sovereign_netcode.play.iso import HALF, QUARTER, RISE, Colour, Ground, Point, mixed, project
 
 FINE = 4
 """Figures are drawn so many times as large, and scaled down: smooth edges."""

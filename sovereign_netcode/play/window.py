@@ -7,14 +7,14 @@ from typing import Any, Protocol
 
 import pygame
 
-from _play_figures import INK, OWN, TONES, WHITE, Actor, draw_ghost, label, screen
-from _play_hud import Hud
-from _play_iso import CHOICE, FIRST_KIND, Colour, Ground, Point, colour_of, project, target_of, top_of
 from client_sdk.client import Client
 from client_sdk.events import Answered, Disconnected, Diverged, Event, Happened, Left, Resumed
 from client_sdk.links import Path
 from client_sdk.picture import Figure, View
 from shared.checks import Cell, Vec
+from sovereign_netcode.play.figures import INK, OWN, TONES, WHITE, Actor, draw_ghost, label, screen
+from sovereign_netcode.play.hud import Hud
+from sovereign_netcode.play.iso import CHOICE, FIRST_KIND, Colour, Ground, Point, colour_of, project, target_of, top_of
 
 SIZE = 1280, 800
 SKY = (122, 184, 232), (222, 240, 250)

@@ -7,8 +7,8 @@ from rich.live import Live
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
-from _figures import LATENESS, Figures
 from server.histogram import between
+from sovereign_netcode.loadtest.figures import LATENESS, Figures
 
 Row = tuple[str, str]
 

@@ -43,7 +43,7 @@ def figures(
     """The figures of the window.
 
     Args:
-        results: what each process of bots counted in the window (the last thing that `_swarm.py` says).
+        results: what each process of bots counted in the window (the last thing that a `swarm` says).
         before, after: `/stats` at its ends; empty if the server does not tell.
     """
     clients = [client for result in results for client in result["clients"]]

@@ -1,4 +1,4 @@
-"""One process full of bots, told what to do over its pipes; `loadtest.py` starts it.
+"""One process full of bots, told what to do over its pipes; the load test starts it.
 
 argument  {"url", "first", "clients", "seed", "policy", "joins_per_s"}, as JSON
 stdin     "settle": all have joined, tidy up; "measure": the window begins; "stop": it ends, say goodbye; the end of the

@@ -5,8 +5,8 @@ from collections.abc import Sequence
 
 import pygame
 
-from _play_figures import INK, IT, WHITE, Actor, font
-from _play_iso import Colour
+from sovereign_netcode.play.figures import INK, IT, WHITE, Actor, font
+from sovereign_netcode.play.iso import Colour
 
 KEYS = (
     "WASD / arrows: walk    Space: jump    left / right mouse: dig / place    1-6: colour    "

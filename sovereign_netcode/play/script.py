@@ -2,13 +2,13 @@
 
 import math
 
-from _play_iso import FIRST_KIND
-from _play_window import Window, Wish
 from client_sdk.events import Answered, Happened
 from client_sdk.picture import View
 from shared.checks import Cell
 from shared.inputs import JUMP, MOVE_MAX
 from sovereign_netcode.examples.tag_brain import TagPlayer
+from sovereign_netcode.play.iso import FIRST_KIND
+from sovereign_netcode.play.window import Window, Wish
 
 TOWER = ((2, 0), (2, -1), (2, -2))
 """Where blocks are placed, from the player; one, two and three high."""

@@ -10,11 +10,11 @@ os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
 
 import pygame
 
-import _play_server
-from _play_script import Script
-from _play_window import Window, keyboard
 from client_sdk.client import Client
 from client_sdk.transports.connection import ConnectError
+from sovereign_netcode.play import own_server
+from sovereign_netcode.play.script import Script
+from sovereign_netcode.play.window import Window, keyboard
 
 GAME = "sovereign_netcode.examples.tag:Tag"
 FRAMES_PER_S = 60
@@ -23,7 +23,7 @@ SCRIPT_S = 120.0
 
 
 def arguments(argv: list[str] | None = None) -> argparse.Namespace:
-    parser = argparse.ArgumentParser(prog="scripts/play", description=__doc__, allow_abbrev=False)
+    parser = argparse.ArgumentParser(prog="sovereign-play", description=__doc__, allow_abbrev=False)
     parser.add_argument("--url", metavar="ws://...", help="play on that server (default: starts one)")
     parser.add_argument("--game", default=GAME, metavar="MODULE:CLASS", help="what the own server plays (default: tag)")
     parser.add_argument("--scene", help="where (default: where the game wants to be played)")
@@ -49,9 +49,9 @@ def main(argv: list[str] | None = None) -> int:
             url = options.url
             if url is None:
                 print("starting a server ...", flush=True)
-                url = stack.enter_context(_play_server.server(options.game, options.scene))
+                url = stack.enter_context(own_server.server(options.game, options.scene))
             count = options.bots if options.bots is not None else 0 if options.url else 4
-            stack.enter_context(_play_server.bots(url, count))
+            stack.enter_context(own_server.bots(url, count))
             client = stack.enter_context(Client.connect(url, name=options.name))
             title = "Sovereign Netcode" if options.url else options.game.rpartition(":")[2]
             return play(client, options.lag / 1000, script, title)
@@ -81,7 +81,3 @@ def play(client: Client, lag_s: float, script: Script | None, title: str) -> int
         return 0
     print(*(f"{what} {much:.3g}" for what, much in script.done.items()), sep=", ")
     return 0 if "in sight" in script.done else 1
-
-
-if __name__ == "__main__":
-    sys.exit(main())

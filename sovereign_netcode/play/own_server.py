@@ -1,4 +1,4 @@
-"""What `scripts/play` needs besides the window: a server of its own, and bots on it. Both end with it."""
+"""What the window needs besides: a server of its own, and bots on it. Both end with it."""
 
 import asyncio
 import contextlib
@@ -8,14 +8,12 @@ import subprocess
 import sys
 import threading
 from collections.abc import Callable, Iterator
-from pathlib import Path
 
 from client_sdk.bots import Bot, Wander
 from client_sdk.core import Core
 from client_sdk.transports.aio import AsyncClient
 from sovereign_netcode.examples.tag_brain import TagPlayer
 
-ROOT = Path(__file__).resolve().parent.parent
 START_S = 120.0
 """The first start compiles the physics."""
 END_S = 10.0
@@ -47,7 +45,7 @@ def server(game: str, scene: str | None) -> Iterator[str]:
         RuntimeError: it does not start; it has said why on stderr.
     """
     options = ["--port", "0", "--game", game, "--log-level", "warning", *(["--scene", scene] if scene else [])]
-    with process("-m", "server", *options) as running:
+    with process("-m", "sovereign_netcode.server", *options) as running:
         lines: queue.Queue[str] = queue.Queue()
         assert running.stdout is not None
         threading.Thread(target=lambda out: lines.put(out.readline()), args=(running.stdout,), daemon=True).start()
@@ -66,7 +64,7 @@ def bots(url: str, count: int) -> Iterator[None]:
     if count == 0:
         yield
         return
-    with process(__file__, url, str(count)):
+    with process("-m", __name__, url, str(count)):
         yield
 
 
@@ -89,5 +87,4 @@ async def play(url: str, count: int) -> None:
 
 
 if __name__ == "__main__":
-    sys.path.insert(0, str(ROOT))
     asyncio.run(play(sys.argv[1], int(sys.argv[2])))

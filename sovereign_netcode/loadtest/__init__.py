@@ -1,0 +1,1 @@
+"""The load test: bots on real sockets against a real server process."""

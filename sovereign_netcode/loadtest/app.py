@@ -1,0 +1,233 @@
+"""Bots on real sockets against a real server process, and what they saw.
+
+Starts a server of its own unless --url is given. The bots are spread over --processes, each with an event loop of its
+own. While they play, it shows what has happened since the last look: clients, ticks, how late they began (p50 / p99 /
+max), bytes, late inputs, corrections, and how late the bots are themselves, in the worst of their processes (p99). The
+figures in the end are of the whole window in which all clients are playing; quantiles are of all processes' samples
+put together. Exits with 1 if a bot or a process died, a message was malformed, or the server did not end well; with 2
+if nothing could start.
+"""
+
+import argparse
+import asyncio
+import contextlib
+import json
+import os
+import signal
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+from rich.console import Console
+from rich.table import Table
+
+from client_sdk.bots import POLICIES
+from sovereign_netcode.loadtest.figures import bottleneck, failures, figures, rows, verdict
+from sovereign_netcode.loadtest.glance import Look, Stage
+from sovereign_netcode.loadtest.glance import rows as glance
+from sovereign_netcode.loadtest.processes import (
+    CannotStartError,
+    DiedError,
+    Figures,
+    Process,
+    Worker,
+    child,
+    own_server,
+    stats,
+)
+
+JOINS_PER_S = 100.0
+JOIN_S_MAX = 30.0
+"""What the joins may take beyond their pace."""
+SETTLE_S = 0.5
+"""After the last join: the bots' garbage has been collected, and what was late for its sake is over."""
+LINES_MAX = 20
+"""Lines of figures, at most, where the output is no terminal."""
+
+
+def arguments(argv: list[str] | None = None) -> argparse.Namespace:
+    parser = argparse.ArgumentParser(
+        prog="sovereign-loadtest",
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        allow_abbrev=False,
+    )
+    parser.add_argument("--clients", type=_positive, default=50, metavar="N", help="bots (default: %(default)s)")
+    parser.add_argument("--seconds", type=_duration, default=10.0, metavar="S", help="window (default: %(default)g)")
+    parser.add_argument("--url", help="a running server, like ws://localhost:8765, instead of one of its own")
+    parser.add_argument("--policy", choices=sorted(POLICIES), default="wander", help="default: %(default)s")
+    parser.add_argument("--scene", default="hills", help="of the own server (default: %(default)s)")
+    parser.add_argument("--tick-rate", type=_positive, metavar="HZ", help="of the own server, not the scene's")
+    parser.add_argument("--seed", type=int, default=1, help="of the bots (default: %(default)s)")
+    parser.add_argument("--processes", type=_positive, default=1, metavar="N", help="for the bots (default: 1)")
+    parser.add_argument("--json", type=Path, metavar="OUT", help="write all figures to this file")
+    parser.add_argument("--verdict", action="store_true", help="say in words what is good and what is not")
+    return parser.parse_args(argv)
+
+
+async def test(args: argparse.Namespace, console: Console) -> int:
+    """The whole test; returns the exit code."""
+    server: Process | None = None
+    async with contextlib.AsyncExitStack() as stack:
+        url = args.url
+        if url is None:
+            server, url = await stack.enter_async_context(own_server(args))
+        workers = [
+            Worker(await stack.enter_async_context(child(*order, patience_s=2.0))) for order in orders(args, url)
+        ]
+        for worker in workers:
+            stack.callback(worker.leave)  # all of them, before any is waited for
+        watched = {
+            "a process of bots": [worker.process for worker in workers],
+            "the server": [server] if server else [],
+        }
+        measured = await measure(args, url, workers, lambda: check(watched), console)
+    measured |= {"policy": args.policy, "scene": args.scene, "seed": args.seed, "processes": len(workers)}
+    failed = failures(measured)
+    if server is not None:
+        measured["server_exit_code"] = server.returncode
+        if server.returncode != 0 and os.name != "nt":
+            failed.append(f"the server ended with {server.returncode}")
+    measured["failures"] = failed
+    if args.json is not None:
+        args.json.write_text(json.dumps(measured, indent=2) + "\n", "utf-8")
+    show(measured, args, console)
+    return int(bool(failed))
+
+
+def check(watched: dict[str, list[Process]]) -> None:
+    """Nobody has ended.
+
+    Raises:
+        DiedError: somebody has.
+    """
+    for name, processes in watched.items():
+        for process in processes:
+            if process.returncode is not None:
+                raise DiedError(f"{name} ended in the middle, with {process.returncode}")
+
+
+async def measure(
+    args: argparse.Namespace, url: str, workers: list[Worker], check: Callable[[], None], console: Console
+) -> Figures:
+    """Waits for everybody to play, then measures.
+
+    Args:
+        check: raises if one of the processes is gone.
+    """
+    with Stage(console) as stage:
+        stage.begin(f"{args.clients} clients join", args.clients)
+        deadline = time.monotonic() + args.clients / JOINS_PER_S + JOIN_S_MAX
+        while sum(worker.told["playing"] + len(worker.told["ended"]) for worker in workers) < args.clients:
+            if time.monotonic() > deadline:
+                break
+            await asyncio.sleep(0.05)
+            check()
+            stage.at(sum(worker.told["playing"] for worker in workers))
+        playing = sum(worker.told["playing"] for worker in workers)
+        if not playing:
+            reasons = {left["reason"] for worker in workers for left in worker.told["ended"]}
+            raise CannotStartError("; ".join(sorted(reasons)) or "no client could join in time")
+
+        stage.begin(f"{playing} play", args.seconds)
+        for worker in workers:
+            await worker.tell("settle")
+        await asyncio.sleep(SETTLE_S)
+        for worker in workers:
+            await worker.tell("measure")
+        before, began = await stats(url), time.monotonic()
+        rss_mb: list[float] = []
+        looked = shown = Look(before, [worker.told for worker in workers])
+        sample, line = began + 1, began
+        while (now := time.monotonic()) < began + args.seconds:
+            check()
+            stage.at(now - began)
+            if now >= sample:
+                sample += 1
+                looked = Look(await stats(url), [worker.told for worker in workers])
+                rss_mb += [looked.server["rss_mb"]] if "rss_mb" in looked.server else []
+                if console.is_terminal or now >= line + args.seconds / LINES_MAX:
+                    line = now
+                    stage.show(now - began, glance(shown, looked))
+                    shown = looked
+            await asyncio.sleep(max(0.0, min(began + args.seconds - now, sample - now, 0.25)))
+        for worker in workers:
+            await worker.tell("stop")
+        seconds = time.monotonic() - began
+        after = await stats(url)
+        results = [await worker.result() for worker in workers]
+    return figures(results, seconds, before, after, rss_mb)
+
+
+def orders(args: argparse.Namespace, url: str) -> list[tuple[str, ...]]:
+    """The command of each process of bots."""
+    processes = min(args.processes, args.clients)
+    found: list[tuple[str, ...]] = []
+    first = 0
+    for i in range(processes):
+        clients = (args.clients - first) // (processes - i)
+        order = {"url": url, "first": first, "clients": clients, "seed": args.seed, "policy": args.policy}
+        order["joins_per_s"] = JOINS_PER_S / processes
+        found.append(("-m", "sovereign_netcode.loadtest.swarm", json.dumps(order)))
+        first += clients
+    return found
+
+
+def show(measured: Figures, args: argparse.Namespace, console: Console) -> None:
+    table = Table(title=f"{args.policy} in {args.scene}" if args.url is None else f"{args.policy} on {args.url}")
+    table.add_column("figure")
+    table.add_column("measured")
+    for row in rows(measured):
+        table.add_row(*row)
+    console.print(table)
+    if args.verdict:
+        judgements = verdict(measured)
+        for judgement in judgements:
+            mark = "[green]good[/]" if judgement.good else "[red]bad [/]"
+            console.print(f"{mark}  {judgement.text}", highlight=False, soft_wrap=True)
+        bad = sum(not judgement.good for judgement in judgements)
+        console.print("all is well" if not bad else f"{bad} of {len(judgements)} not as it should be", style="bold")
+    elif held_up := bottleneck(measured):
+        console.print(held_up, style="yellow", highlight=False, soft_wrap=True)
+    for failure in measured["failures"]:
+        console.print(f"failed: {failure}", style="red", highlight=False, soft_wrap=True)
+
+
+def _positive(text: str) -> int:
+    value = int(text)
+    if value < 1:
+        raise argparse.ArgumentTypeError("must be at least 1")
+    return value
+
+
+def _duration(text: str) -> float:
+    value = float(text)
+    if not 0.1 <= value <= 86400:
+        raise argparse.ArgumentTypeError("must be from 0.1 to 86400")
+    return value
+
+
+async def until_signal(args: argparse.Namespace, console: Console) -> int:
+    """Runs the test until its end, SIGTERM or SIGINT, which a script's background process ignores otherwise."""
+    task = asyncio.ensure_future(test(args, console))
+    with contextlib.suppress(NotImplementedError):  # Windows
+        for number in (signal.SIGINT, signal.SIGTERM):
+            asyncio.get_running_loop().add_signal_handler(number, task.cancel)
+    try:
+        return await task
+    except CannotStartError as error:
+        console.print(f"error: {error}", style="red", highlight=False, soft_wrap=True)
+        return 2
+    except DiedError as error:
+        console.print(f"failed: {error}", style="red", highlight=False, soft_wrap=True)
+        return 1
+
+
+def main(argv: list[str] | None = None) -> int:
+    args = arguments(argv)
+    try:
+        return asyncio.run(until_signal(args, Console()))
+    except (KeyboardInterrupt, asyncio.CancelledError):
+        print("stopped", file=sys.stderr)
+        return 130

@@ -1,0 +1,168 @@
+"""Begins a game: writes NAME.py (its rules) and test_NAME.py (bots play it) to the current folder."""
+
+import argparse
+import importlib.util
+import keyword
+import shutil
+import sys
+from pathlib import Path
+
+RULES = '''\
+"""{title}: a game for Sovereign Netcode.
+
+    sovereign-server --game {name}:{title}
+
+All hooks are described in `sovereign_netcode.server.rules`, and all that they may do (`self.game`) in
+`sovereign_netcode.server.stage`.
+"""
+
+from typing import Any
+
+from sovereign_netcode.server.rules import Rules
+from sovereign_netcode.server.session import Player
+from sovereign_netcode.shared.scene import Scene
+
+
+class {title}(Rules):
+    """Who touches another gets a point; who has ten is fast from then on."""
+
+    scene = "meadow"
+
+    def prepare(self, scene: Scene) -> Scene:
+        # A further kind of entity, like a player but for what is said here; clients predict it as it is.
+        return scene.with_template("runner", walk_speed=7.0)
+
+    def on_start(self) -> None:
+        # Values that all clients know: `client.shared`.
+        self.game.share("points_to_win", 10)
+
+    def on_join(self, player: Player) -> None:
+        # Attributes: what everybody sees of an entity, `Figure.attributes` in the client. Also "name", already there.
+        self.game.set(player.entity, "points", 0)
+
+    def on_contact(self, a: int, b: int) -> None:
+        for entity in (a, b):
+            points = self.game.get(entity, "points", 0) + 1
+            self.game.set(entity, "points", points)
+            if points == self.game.shared["points_to_win"]:
+                self.game.change(entity, "runner")
+                # An event: `Happened` in the client.
+                self.game.send("winner", {{"entity": entity}})
+
+    def on_command(self, player: Player, name: str, payload: Any) -> bool | None:
+        # `client.command("boost")`. What is not allowed is answered with False.
+        if name != "boost":
+            return False
+        self.game.throw(player.entity, (0.0, 0.0, 12.0))
+        return True
+
+    # def on_tick(self) -> None:
+    #     if self.game.tick % self.game.ticks(5.0) == 0:  # every five seconds
+    #         place = self.game.random.choice(self.game.scene.spawns)
+    #         self.game.steer(self.game.spawn("runner", place, name="Dash"), 1, 0)  # goes east from now on
+
+    # def on_leave(self, player: Player) -> None:
+    # def on_fell_out(self, entity: int) -> bool | None:
+    # def can_edit(self, player: Player, x: int, y: int, z: int, kind: int) -> bool:
+'''
+
+TEST = '''\
+"""{title}, played by bots in simulated time: `python -m pytest test_{name}.py`."""
+
+from {name} import {title}
+from sovereign_netcode.client_sdk.events import Happened
+from sovereign_netcode.playtest import Match, Path, bot
+from sovereign_netcode.shared.inputs import NEUTRAL, Input, make_input
+from sovereign_netcode.shared.scene import load_scene
+from sovereign_netcode.shared.world import World
+
+
+def seek(world: World, me: int) -> Input:
+    """A bot: hops to whoever else it sees first. Asked once per tick, it sees what a client predicts."""
+    others = [entity for entity in world.entities["id"].tolist() if entity != me]
+    if not others:
+        return NEUTRAL
+    (x, y, _), (to_x, to_y, _) = world.position(me), world.position(others[0])
+    return make_input(to_x - x, to_y - y, jump=True)
+
+
+def test_two_bots_play() -> None:
+    match = Match(load_scene({title}.scene), seed=1, rules={title}())
+    ann, bob = match.join(bot(seek), Path(0.05)), match.join(bot(seek), Path(0.05))  # 50 ms each way
+    match.run(20)
+
+    game = match.game.stage  # what is `self.game` in the rules
+    assert game.get(ann.core.entity, "points") == game.get(bob.core.entity, "points") > 0
+    for player in (ann, bob):
+        assert player.core.state == "playing"
+        assert player.core.stats.divergences == 0
+    assert match.game.counters.rules_failed == 0
+
+
+def test_who_has_ten_points_is_fast_and_all_are_told() -> None:
+    match = Match(load_scene({title}.scene), seed=1, rules={title}())
+    ann = match.join(bot(seek))
+    match.run(2)
+    game, entity = match.game.stage, ann.core.entity
+    game.set(entity, "points", 9)
+    x, y, z = game.position(entity)
+    other = game.spawn("player", (x + 2, y, z))  # she runs after it, and touches it
+    match.run_until(lambda: other in game.touching(entity), 10)
+    match.run(1)
+    assert game.template(entity) == "runner"
+    assert [event.data for event in ann.events if isinstance(event, Happened)] == [{{"entity": entity}}]
+
+
+def test_a_boost_goes_up() -> None:
+    match = Match(load_scene({title}.scene), seed=1, rules={title}())
+    ann = match.join(bot(seek))
+    match.run(3)
+    game, entity = match.game.stage, ann.core.entity
+    before = game.position(entity)[2]
+    ann.core.command("boost")
+    match.run(0.5)
+    assert game.position(entity)[2] > before + 2
+'''
+
+
+def main() -> int:
+    """Writes the two files and says what to do with them. Returns the exit code."""
+    parser = argparse.ArgumentParser(prog="sovereign-new-game", description=__doc__)
+    parser.add_argument("name", metavar="NAME", help="of the game: small letters, digits and _, like king_of_the_hill")
+    name = parser.parse_args().name
+    title = "".join(part.capitalize() for part in name.split("_"))
+    if not name.isidentifier() or name != name.lower() or keyword.iskeyword(name):
+        return failed(f"{name!r}: must be small letters, digits and _, like king_of_the_hill")
+    files = {Path(f"{name}.py"): RULES, Path(f"test_{name}.py"): TEST}
+    for path in files:
+        if path.exists():
+            return failed(f"{path} is there already, and stays as it is")
+    if importlib.util.find_spec(name) is not None:
+        return failed(f"{name!r}: there is a module of that name already")
+    for path, text in files.items():
+        path.write_text(text.format(name=name, title=title), encoding="utf-8")
+    print(f"Here are {' and '.join(map(str, files))}. Now try:")
+    if importlib.util.find_spec("pytest") is None:
+        print(f"  {sys.executable} -m pip install pytest")
+    print(f"  {sys.executable} -m pytest test_{name}.py")
+    print(f"  {command('play')} --game {name}:{title}")
+    print(f"  {command('server')} --game {name}:{title}")
+    return 0
+
+
+def command(name: str) -> str:
+    """One of our commands, as one can type it here: its name alone where the search path has this environment's."""
+    found = shutil.which(f"sovereign-{name}")
+    if found is not None and Path(found).parent == Path(sys.executable).parent:
+        return f"sovereign-{name}"
+    return f"{sys.executable} -m sovereign_netcode.{name}"
+
+
+def failed(why: str) -> int:
+    """Prints an error. Returns the exit code."""
+    print(f"error: {why}", file=sys.stderr)
+    return 2
+
+
+if __name__ == "__main__":
+    sys.exit(main())

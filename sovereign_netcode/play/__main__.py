@@ -1,0 +1,8 @@
+"""`python -m sovereign_netcode.play`: see `--help`."""
+
+import sys
+
+from sovereign_netcode.commands import play
+
+if __name__ == "__main__":
+    sys.exit(play())
