@@ -1,4 +1,4 @@
-"""`python -m server check`: whether a server is ready, as an exit code, for containers and service managers."""
+"""`sovereign-server check`: whether a server is ready, as an exit code, for containers and service managers."""
 
 import http.client
 import os
@@ -23,7 +23,7 @@ def main(arguments: Sequence[str], environment: Mapping[str, str] = os.environ) 
     port = environment.get("SOVEREIGN_PORT", "8765")
     scheme = "https" if "SOVEREIGN_TLS_CERT" in environment else "http"
     parser = Parser(
-        prog="python -m server check", description="Exit code 0 if the server is ready for players.", allow_abbrev=False
+        prog="sovereign-server check", description="Exit code 0 if the server is ready for players.", allow_abbrev=False
     )
     default = f"{scheme}://{host}:{port}/readyz"
     parser.add_argument("--url", default=default, help=f"what to ask, or just ws://HOST:PORT (default: {default})")

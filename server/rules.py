@@ -4,7 +4,7 @@
         def on_join(self, player: Player) -> None:
             self.game.set(player.entity, "it", False)
 
-    python -m server --game my_game:Tag
+    sovereign-server --game my_game:Tag
 
 All hooks are called within a tick, ahead of its step, in this order: `on_start`, `on_leave`, `on_join`, `on_fell_out`,
 `on_command` and `can_edit`, `on_contact`, `on_tick`. One that raises is reported and counted, and the game goes on.

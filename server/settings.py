@@ -27,11 +27,11 @@ LOG_LEVELS = ("debug", "info", "warning", "error")
 DESCRIPTION = """\
 An authoritative game server: fixed ticks, WebSocket clients, one world of blocks, and the rules of a game on top.
 
-  python -m server                                    players walk, jump, dig and build on hills
-  python -m server --game sovereign_netcode.examples.tag:Tag    the sample game; scripts/play opens a window on it
+  sovereign-server                                              players walk, jump, dig and build on hills
+  sovereign-server --game sovereign_netcode.examples.tag:Tag    the sample game; sovereign-play opens a window on it
 """
 EPILOG = f"""\
-Other commands: `python -m server token --help` (issue tokens), `python -m server check --help` (is it ready?).
+Other commands: `sovereign-server token --help` (issue tokens), `sovereign-server check --help` (is it ready?).
 Each setting can also come from the environment ({ENV_PREFIX}PORT=9000) or from a TOML file (port = 9000; see
 --print-config). A flag wins over the environment, that over the file, and that over the default.
 The server prints "listening on ws://HOST:PORT" when it is ready, then the address of its live page. It answers GET
@@ -221,7 +221,7 @@ def parse(arguments: Sequence[str], environment: Mapping[str, str] = os.environ)
         SystemExit: after `--help`.
     """
     parser = Parser(
-        prog="python -m server",
+        prog="sovereign-server",
         usage="%(prog)s [options]",
         description=DESCRIPTION,
         epilog=EPILOG,

@@ -114,13 +114,13 @@ def read_key(path: str | None, environment: Mapping[str, str]) -> bytes:
 
 
 def main(arguments: Sequence[str], environment: Mapping[str, str] = os.environ) -> int:
-    """`python -m server token`: prints a token.
+    """`sovereign-server token`: prints a token.
 
     Raises:
         SettingsError: the key or an argument cannot be used.
     """
     parser = Parser(
-        prog="python -m server token", description="Issues a token that lets a player in.", allow_abbrev=False
+        prog="sovereign-server token", description="Issues a token that lets a player in.", allow_abbrev=False
     )
     parser.add_argument("--subject", required=True, help=f"who the player is, up to {SUBJECT_MAX} characters")
     parser.add_argument("--hours", type=float, default=24.0, help="how long the token is valid (default: 24)")

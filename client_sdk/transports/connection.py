@@ -182,7 +182,7 @@ def unreachable(connection: Connection, error: OSError) -> ConnectError:
     """An error for a stream that could not be opened."""
     uri = connection.uri
     if isinstance(error, ConnectionRefusedError):
-        why = f"no server there (connection refused); start one with: python -m server --port {uri.port}"
+        why = f"no server there (connection refused); start one with: sovereign-server --port {uri.port}"
     elif isinstance(error, TimeoutError):
         why = "no answer in time; is the address right, and the port open in the firewall?"
     else:

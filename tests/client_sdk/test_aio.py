@@ -161,7 +161,7 @@ def test_a_server_that_stops_reading_is_left(run: Run) -> None:
 
 def test_nobody_there_reads_like_advice(run: Run) -> None:
     async def scene() -> None:
-        with pytest.raises(ConnectError, match="start one with: python -m server"):
+        with pytest.raises(ConnectError, match="start one with: sovereign-server"):
             await AsyncClient.connect(address)
 
     with socket.create_server(("127.0.0.1", 0)) as listener:

@@ -187,7 +187,7 @@ def test_a_shutdown_says_when_to_come_back() -> None:
 def test_nobody_there_reads_like_advice() -> None:
     with socket.create_server(("127.0.0.1", 0)) as listener:
         port = listener.getsockname()[1]
-    with pytest.raises(ConnectError, match=f"no server there .* start one with: python -m server --port {port}"):
+    with pytest.raises(ConnectError, match=f"no server there .* start one with: sovereign-server --port {port}"):
         Client.connect(f"ws://127.0.0.1:{port}")
 
 

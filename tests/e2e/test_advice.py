@@ -53,7 +53,7 @@ async def said(url: str) -> str:
 async def test_nobody_is_there() -> None:
     with socket.create_server(("127.0.0.1", 0)) as listener:
         port = listener.getsockname()[1]
-    wanted = f"URL: no server there (connection refused); start one with: python -m server --port {port}"
+    wanted = f"URL: no server there (connection refused); start one with: sovereign-server --port {port}"
     assert await said(f"ws://127.0.0.1:{port}") == wanted
 
 
