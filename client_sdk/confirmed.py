@@ -10,8 +10,9 @@ import numpy as np
 from shared.checks import Cell
 from shared.layout import FALLING, FLAGS, ID, Int64s, X
 from shared.messages import ProtocolError, Snapshot
+from shared.ring import Ring
 from shared.scene import Scene
-from shared.snapshot import ACTED, KEYFRAME, SegmentPart, checksum, decode_parts, prepare
+from shared.snapshot import ACTED, KEYFRAME, PLACED, SegmentPart, checksum, decode_parts, prepare
 from shared.units import SEGMENT, TO_SEGMENT
 from shared.world import World
 
@@ -36,6 +37,8 @@ class Confirmed:
         """Whether blocks have changed, and whether any near the own entity; whoever has seen to that takes it back."""
         self._templates = len(scene.templates)
         self._exist = frozenset(scene.segments())
+        self.placed: Ring[frozenset[int]] = Ring(FOLLOW_MAX)
+        """The entities that the server's rules placed before a snapshot and after the one before it, by its tick."""
         self._acted: set[int] = set()
         self._coming: Cell | None = None
         self._early: dict[int, int] = {}  # blocks of that one which changed since it was packed
@@ -75,9 +78,8 @@ class Confirmed:
         if drops or any(part.gone or part.ago == KEYFRAME for part in parts):
             self._take_away(parts, drops, set(states[:, ID].tolist()))
         if len(states):
-            if max(states[:, FLAGS].tolist()) >= ACTED:
-                self._acted.update(states[states[:, FLAGS] & ACTED != 0, ID].tolist())
-                states[:, FLAGS] &= FALLING
+            if max(states[:, FLAGS].tolist()) > FALLING:
+                self._act(states, snapshot.tick)
             world.put(states)
         for part in parts:
             if len(part.edits):
@@ -105,9 +107,16 @@ class Confirmed:
         return all(segment in self.world.blocks for segment in around & self._exist)
 
     def take_acted(self) -> frozenset[int]:
-        """The entities that the server's rules have moved since the last call."""
+        """The entities on which the server's rules have acted since the last call."""
         acted, self._acted = frozenset(self._acted), set()
         return acted
+
+    def _act(self, states: Int64s, tick: int) -> None:
+        """Takes the flags of the server's rules off the states of a snapshot."""
+        flags, ids = states[:, FLAGS], states[:, ID]
+        self._acted.update(ids[flags & ACTED != 0].tolist())
+        self.placed.put(tick, frozenset(ids[flags & PLACED != 0].tolist()))
+        flags &= FALLING
 
     def _edit(self, part: SegmentPart) -> None:
         """Blocks of a segment have changed."""

@@ -1,7 +1,11 @@
 """Where the others are drawn: between two confirmed snapshots, a little in the past.
 
-The delay rises at once by what was missing when a snapshot came late, and falls slowly once all is well again;
-beyond the newest snapshot motion goes on for at most 100 ms, then it holds.
+The delay rises at once by what was missing when a snapshot came late, and falls slowly once all is well again.
+
+What the rules do takes effect at the tick of the snapshot that tells of it, and no sooner: until then an entity that
+they placed is drawn where it was, one that they removed is still drawn, one that they changed looks as before, and one
+that is new is not drawn. `server.rewind` answers shots by the same rule. Beyond the newest snapshot, entities go on by
+their velocities, for less than a tick: the next one may bring anything.
 """
 
 import math
@@ -10,17 +14,18 @@ from collections import deque
 import numpy as np
 import numpy.typing as npt
 
-from shared.layout import ID, Int64s, X
-from shared.units import BLOCK
+from shared.layout import ID, VX, Int64s, X
+from shared.units import BLOCK, SPEED
 
 KEPT = 96
 EXTRAPOLATE_S = 0.1
+"""Bound on the time beyond the newest snapshot that is drawn; it is also less than one tick."""
 FALL_S_PER_S = 0.01
 CALM_S = 3.0
-TELEPORT_BLOCKS = 2.0
-"""What goes further than this in one tick is not drawn on its way."""
 
 Positions = npt.NDArray[np.float64]
+Entry = tuple[int, Int64s, frozenset[int]]
+"""The tick of a snapshot, the states at its end, and the entities placed since the one before."""
 
 
 class Interpolation:
@@ -28,13 +33,19 @@ class Interpolation:
 
     def __init__(self, rate: float) -> None:
         self._rate = rate
-        self._states: deque[tuple[int, Int64s]] = deque(maxlen=KEPT)
+        self._states: deque[Entry] = deque(maxlen=KEPT)
         self.delay_ticks = 2.0
         self._calm_since = self._at = -math.inf
 
-    def push(self, tick: int, states: Int64s) -> None:
-        """The confirmed states ([n, 12], ascending by id) at the end of a tick."""
-        self._states.append((tick, states))
+    def push(self, tick: int, states: Int64s, placed: frozenset[int] = frozenset()) -> None:
+        """Adds a snapshot to the history.
+
+        Args:
+            tick: the one that it ends.
+            states: the confirmed states, [n, 12], ascending by id.
+            placed: the entities that the rules placed since the snapshot before.
+        """
+        self._states.append((tick, states, placed))
 
     def advance(self, server_tick: float, now: float) -> None:
         """Adapts the delay to how old the newest snapshot is now."""
@@ -52,11 +63,12 @@ class Interpolation:
         self._at = now
 
     def shown(self, server_tick: float) -> float:
-        """The moment that is drawn, as a tick: no earlier than the history, at most 100 ms beyond it."""
+        """The moment that is drawn, as a tick: no earlier than the history, less than a tick beyond it."""
         at = server_tick - self.delay_ticks
         if not self._states:
             return at
-        oldest, latest = self._states[0][0], self._states[-1][0] + EXTRAPOLATE_S * self._rate
+        oldest, newest = self._states[0][0], self._states[-1][0]
+        latest = min(newest + EXTRAPOLATE_S * self._rate, math.nextafter(newest + 1, newest))
         return latest if at > latest else max(oldest, at)
 
     def sample(self, server_tick: float) -> tuple[Int64s, Positions]:
@@ -70,24 +82,24 @@ class Interpolation:
             if entry[0] <= at:
                 break
             after = entry
-        if after[0] == before[0] and len(self._states) > 1 and at > before[0]:
-            before, after = self._states[-2], self._states[-1]  # beyond the newest: go on as it went
-        return _between(before, after, at)
+        tick, states, _ = before
+        if at > tick and after is not before:
+            return _between(before, after, at)
+        return states, states[:, X : X + 3] / BLOCK + states[:, VX : VX + 3] / SPEED * ((at - tick) / self._rate)
 
 
-def _between(before: tuple[int, Int64s], after: tuple[int, Int64s], at: float) -> tuple[Int64s, Positions]:
-    states = after[1]
-    new = states[:, X : X + 3] / BLOCK
-    if after[0] == before[0]:
-        return states, new
+def _between(before: Entry, after: Entry, at: float) -> tuple[Int64s, Positions]:
+    """States and positions at a moment between two snapshots: those who are there before it, on their ways."""
     share = (at - before[0]) / (after[0] - before[0])
-    old = before[1]
-    place = np.searchsorted(old[:, ID], states[:, ID])
-    place[place == len(old)] = 0
-    known = old[place, ID] == states[:, ID] if len(old) else np.zeros(len(states), bool)
-    moved = new.copy()
-    was = old[place[known], X : X + 3] / BLOCK
-    way = new[known] - was
-    near = np.abs(way).max(axis=1) <= TELEPORT_BLOCKS * (after[0] - before[0])
-    moved[known] = np.where(near[:, None], was + way * share, new[known])
-    return states, moved
+    states, new = before[1], after[1]
+    places = states[:, X : X + 3] / BLOCK
+    if not len(new):
+        return states, places
+    place = np.searchsorted(new[:, ID], states[:, ID])
+    place[place == len(new)] = 0
+    moves = new[place, ID] == states[:, ID]
+    if after[2]:
+        moves &= ~np.isin(states[:, ID], list(after[2]))
+    was = places[moves]
+    places[moves] = was + (new[place[moves], X : X + 3] / BLOCK - was) * share
+    return states, places

@@ -70,7 +70,9 @@ class Picture:
         return self.interpolation.shown(server_tick)
 
     def smooth(self, done: Reconciled, now: float) -> None:
-        """A replay has moved things: they are shown to go there gradually (what the rules placed jumps)."""
+        """A replay has moved things: they are shown to go there gradually (what the rules acted on jumps)."""
+        for entity in done.placed:
+            self._smoothing.pop(entity, None)
         if not done.replayed:
             return
         if self._smoothing:
@@ -95,17 +97,15 @@ class Picture:
         return View(tick, self._ahead(prediction.entity, tick, now), others, self.interpolation.shown(server_tick))
 
     def _ahead(self, entity: int, tick: float, now: float) -> Figure | None:
-        """An entity between its last two predicted ticks, with what smoothing adds."""
+        """An entity between two predicted ticks, one tick behind the newest, with what smoothing adds."""
         prediction = self._prediction
         if entity not in prediction.predicted:
             return None
-        state = prediction.predicted.state(entity)
-        before = prediction.state_before(entity) or state
-        share = min(max(tick - prediction.ahead - prediction.predicted.tick, 0.0), 1.0)
-        old, new = np.array(before[X : X + 3]) / BLOCK, np.array(state[X : X + 3]) / BLOCK
+        before, after, share = prediction.around(entity, tick - prediction.ahead - 1)
+        old, new = np.array(before[X : X + 3]) / BLOCK, np.array(after[X : X + 3]) / BLOCK
         smoothing = self._smoothing.get(entity)
         place = old + (new - old) * share + (smoothing.offset(now) if smoothing else 0.0)
-        return self._figure(state, place.tolist())
+        return self._figure(after, place.tolist())
 
     def _figure(self, state: Sequence[int], place: list[float]) -> Figure:
         """A state with the position to draw it at."""

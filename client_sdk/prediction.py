@@ -17,11 +17,12 @@ A difference in the own entity is a *correction* and is counted; one in others o
 pressed a key). No tolerance: the physics is exact, so a lone player is never corrected, whatever the network does.
 """
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 
-from client_sdk.confirmed import Confirmed
+from client_sdk.confirmed import FOLLOW_MAX, Confirmed
 from client_sdk.events import Corrected
 from shared import bulk, edits, kernels
 from shared.edits import Edit
@@ -40,7 +41,11 @@ MEET_BLOCKS = 12
 NONDETERMINISM = "nondeterminism"
 """The cause that must never occur: both sides knew the same and computed something else."""
 
+LOOK_BACK = 4
+"""A drawn moment lies at most this many ticks after the kept state before it: snapshots may have been skipped."""
+
 Place = tuple[float, float, float]
+State = tuple[int, ...]
 
 
 @dataclass(frozen=True)
@@ -53,7 +58,9 @@ class Reconciled:
     offsets: dict[int, Place]
     """Where each predicted entity was, minus where it is now, in blocks."""
     acted: frozenset[int]
-    """Entities that the server's rules have moved: their pictures jump."""
+    """Entities on which the server's rules have acted: their pictures jump."""
+    placed: frozenset[int] = frozenset()
+    """Entities that the server's rules have placed: nothing is left of an earlier correction, either."""
 
 
 NOTHING = Reconciled(None, False, 0, {}, frozenset())
@@ -151,13 +158,14 @@ class Prediction:
         if tick == self._compared:
             return NOTHING
         skipped = tick - self._compared > 1
-        self._compared = tick
         acted = known.take_acted()
+        placed = self._placed(self._compared, tick)
+        self._compared = tick
         if not self.begun:
             return NOTHING
         if tick > self.predicted.tick:  # overtaken: nothing was predicted for this tick
             self._replay(tick)
-            return NOTHING
+            return Reconciled(None, False, 0, {}, acted, placed) if placed else NOTHING
         guess, truth = self._states.get(tick), self._truth()
         changed = known.terrain_changed or self._refused
         if guess is not None and not changed and self._near_equal(guess, truth):
@@ -177,11 +185,42 @@ class Prediction:
             correction = Corrected(tick, *mine, self.predicted.tick - tick, cause)
         before, now = self.predicted.states(), self.predicted.tick
         self._replay(now)
-        return Reconciled(correction, correction is None, now - tick, _offsets(before, self.predicted.states()), acted)
+        offsets = _offsets(before, self.predicted.states())
+        return Reconciled(correction, correction is None, now - tick, offsets, acted, placed)
 
-    def state_before(self, entity: int) -> tuple[int, ...] | None:
-        """The state of an entity one tick before the newest predicted one."""
-        states = self._states.get(self.predicted.tick - 1)
+    def around(self, entity: int, at: float) -> tuple[State, State, float]:
+        """Finds what to draw of an entity at a moment up to the newest predicted tick.
+
+        Returns:
+            Its states before and after the moment, and the share of the way between them that lies behind it. The two
+            are the same one where it stands: until the snapshot of the tick in which it was placed, or where nothing
+            older is kept.
+
+        Raises:
+            KeyError: it is not predicted.
+        """
+        newest = self.predicted.tick
+        tick = min(math.floor(at), newest - 1)
+        last, after = newest, self.predicted.state(entity)
+        for later in range(tick + 1, newest):
+            if (state := self._state(entity, later)) is not None:
+                last, after = later, state
+                break
+        for first in range(tick, tick - LOOK_BACK, -1):
+            if (before := self._state(entity, first)) is not None:
+                if entity in self._placed(first, last):
+                    return before, before, 0.0
+                return before, after, min(max((at - first) / (last - first), 0.0), 1.0)
+        return after, after, 0.0
+
+    def _placed(self, since: int, to: int) -> frozenset[int]:
+        """The entities that the server's rules placed after the tick `since` and up to `to`."""
+        ticks = range(max(since, to - FOLLOW_MAX) + 1, to + 1)
+        return frozenset().union(*(ids for tick in ticks if (ids := self.known.placed.get(tick))))
+
+    def _state(self, entity: int, tick: int) -> State | None:
+        """The kept state of an entity at the end of a tick."""
+        states = self._states.get(tick)
         if states is None:
             return None
         mine = states[states[:, ID] == entity]
@@ -202,6 +241,7 @@ class Prediction:
             for entity in self.predicted.states()[:, ID].tolist():
                 if entity != self.entity:
                     self.predicted.remove(entity)
+        self._states.put(self.confirmed.tick, self._truth())
         while self.predicted.tick < to:
             self.step()
 

@@ -89,7 +89,8 @@ class Replica:
         """
         self.heard = max(self.heard, snapshot.newest)
         self.wrong = self.known.apply(snapshot) or self.wrong
-        self.picture.interpolation.push(snapshot.tick, self.known.states)
+        placed = self.known.placed.get(snapshot.tick)
+        self.picture.interpolation.push(snapshot.tick, self.known.states, placed or frozenset())
 
     def take_over(self, old: "Replica") -> bool:
         """Takes the place of an earlier copy; whether the own entity is the same, so that what it does goes on."""

@@ -22,6 +22,8 @@ from shared.messages import Terrain, encode
 from shared.snapshot import VERDICT
 from shared.world import World
 
+GAPS_S = 2.0
+"""Gaps between a client's snapshots are kept for this time, in seconds: longer than lag compensation reaches back."""
 SNAPSHOT_BYTES = messages.MESSAGE_MAX // 2
 """What more there is waits for the next snapshot, however wide the path; the own segment and one more never do."""
 
@@ -108,6 +110,9 @@ class Delivery:
         message = messages.join_snapshot(header, n, parts)
         session.send(message)
         session.pacing.sent(tick)
+        if tick - session.tick > 1 and session.tick >= 0:
+            kept = tick - GAPS_S / self._tick_s
+            session.gaps = (*(gap for gap in session.gaps if gap[1] > kept), (session.tick, tick))
         session.tick = tick
         size = session.snapshot_bytes = len(message)
         self._counters.snapshots_sent += 1

@@ -43,7 +43,8 @@ class _Tick:
         self.changed: dict[Cell, list[int]] = {}  # ids of those to which something happened, by segment
         self.gone: dict[Cell, list[int]] = defaultdict(list)
         self.edited: dict[Cell, set[int]] = defaultdict(set)  # block offsets by segment
-        self.acted: set[int] = set()  # ids that the rules placed or threw
+        self.acted: set[int] = set()  # ids on which the rules acted without placing them
+        self.placed: set[int] = set()  # ids that the rules placed
         self.said: dict[Cell, set[int]] = defaultdict(set)  # ids whose attributes are news in the segment
 
     def more(self) -> set[Cell]:
@@ -120,6 +121,8 @@ class ChangeLog:
         self._news = News(world, CHECK_TICKS)
         self._latest: dict[Cell, tuple[bytes, bytes, bytes]] | None = None
         """What happened in the newest tick, packed, by segment; until something is removed."""
+        self._placed_at = -HISTORY
+        """The newest tick in which an entity was placed."""
 
     def segment(self, entity: int) -> Cell:
         """Where an entity was at the end of the latest recorded tick."""
@@ -130,7 +133,7 @@ class ChangeLog:
         self._now.edited[segment_of(x, y, z)].add(offset_of(x, y, z))
 
     def note_act(self, entity: int) -> None:
-        """The rules have placed or thrown an entity, ahead of the coming step."""
+        """Notes that the rules have acted on an entity ahead of the coming step; of placing, the world knows itself."""
         self._now.acted.add(entity)
 
     def note_attributes(self, entity: int) -> None:
@@ -151,7 +154,10 @@ class ChangeLog:
         their segment.
         """
         now, homes = self._now, self._home
-        shares, self._due = self._news.pack(now.acted)
+        now.placed = self._world.placed
+        if now.placed:
+            self._placed_at = self._world.tick
+        shares, self._due = self._news.pack(now.acted, now.placed)
         self._latest = {}
         for segment, ids, whole, packed in shares:
             now.changed[segment] = ids
@@ -209,7 +215,16 @@ class ChangeLog:
         else:
             strays = [entity for entity, home in self._home.items() if home == segment]
             rows = self._world.rows(sorted(strays))
-        return encode_part(segment, KEYFRAME, rows, attributes=self._of(rows[:, ID].tolist()))
+        placed = self._placed_lately()
+        return encode_part(segment, KEYFRAME, rows, placed=placed, attributes=self._of(rows[:, ID].tolist()))
+
+    def _placed_lately(self) -> set[int]:
+        """Returns the entities placed within the history: a client may know one of them from where it was before."""
+        newest = self._world.tick
+        if newest - self._placed_at >= HISTORY:
+            return set()
+        ticks = map(self._ticks.get, range(newest - HISTORY + 1, newest + 1))
+        return set().union(*(tick.placed for tick in ticks if tick is not None))
 
     def _changes(self, segment: Cell, since: int, known: Parts) -> bytes:
         due = segment in self._due and segment in self._world.blocks
@@ -240,8 +255,11 @@ class ChangeLog:
             return self._latest.get(segment, NO_NEWS)
         told = {entity for tick in ticks for entity in tick.changed.get(segment, ())}
         here = {entity for entity in told if self._home.get(entity) == segment}
-        acted = {entity for tick in ticks for entity in tick.acted if entity in here}
-        return b"", b"", encode_rows(self._world.rows(sorted(here)), acted)
+        acted, placed = (
+            {entity for ids in sets for entity in ids if entity in here}
+            for sets in ([tick.acted for tick in ticks], [tick.placed for tick in ticks])
+        )
+        return b"", b"", encode_rows(self._world.rows(sorted(here)), acted, placed)
 
     def _kinds(self, segment: Cell, offsets: list[int]) -> list[tuple[int, int]]:
         if not offsets:

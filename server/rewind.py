@@ -6,11 +6,15 @@ matrix that the tick changed, what they held before, and likewise the blocks. A 
 takes those back, one after the other: that costs what has changed, and nothing for what sleeps. Between two ticks it
 is computed in the same floats as `client_sdk.interpolation`, so a target is exactly where its shooter drew it. Blocks
 are those of the tick before: what is edited in a tick is there when that tick is over.
+
+What the rules do (place, remove, change, spawn) takes effect at the end of its tick: until then an entity that they
+placed is where it was. A client that was not sent every tick draws between two ticks that are further apart: its *gaps*
+say which, and the second of the two is when all that they did in between takes effect for it.
 """
 
 import math
 from collections import deque
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from fractions import Fraction
 from typing import Any, NamedTuple
 
@@ -45,10 +49,14 @@ class Hit(NamedTuple):
 
 
 class _Undo(NamedTuple):
-    """What a tick has changed, as it was before: rows of the matrix ([n, 6], each after its number), and blocks."""
+    """What a tick has changed, as it was before: rows of the matrix ([n, 6], each after its number), and blocks.
+
+    `placed`: the entities that did not move there, but were placed.
+    """
 
     rows: Int64s
     blocks: dict[Cell, int]
+    placed: set[int]
 
 
 class Rewind:
@@ -61,7 +69,9 @@ class Rewind:
     def __init__(self, world: World) -> None:
         self._world = world
         self._reach = WINDOW_S * world.scene.tick_rate
-        self._undo: deque[_Undo] = deque(maxlen=math.ceil(self._reach))
+        self._undo: deque[_Undo] = deque()
+        self._placed_at = -math.inf
+        """The newest tick in which an entity was placed."""
         self._boxes = _boxes(world.scene)
         self._tick = -1
         self._alive = 0
@@ -90,33 +100,46 @@ class Rewind:
             rows = np.concatenate((rows, np.column_stack((gone, self._now[gone]))))
             self._now[gone] = 0
             self._alive = len(world)
-        self._undo.append(_Undo(rows, world.edited))
+        self._undo.append(_Undo(rows, world.edited, world.placed))
         self._tick = world.tick
+        if world.placed:
+            self._placed_at = world.tick
+        kept = math.ceil(self._reach)
+        # Within the reach, a gap of up to that length may be drawn: it begins as much earlier.
+        if self._tick - self._placed_at <= 2 * kept:
+            kept *= 2
+        while len(self._undo) > kept:
+            self._undo.popleft()
 
-    def at(self, seen: float, own: int = 0) -> "Past":
+    def at(self, seen: float, own: int = 0, gaps: Iterable[tuple[int, int]] = ()) -> "Past":
         """The world at a moment, which need not be a whole tick; clamped to what is kept.
 
         Args:
             seen: the server's tick, as a fraction.
             own: an entity that no query finds: who asks.
+            gaps: the asking client was sent the two ticks of each, and none between.
 
         Raises:
             SceneError: `seen` is not a finite number.
         """
-        oldest = max(self._tick - self._reach, self._tick - len(self._undo))
-        seen = min(max(finite(seen, "seen"), oldest), float(self._tick))
-        first = math.floor(seen)
-        states = self._now.copy()
+        kept = self._tick - len(self._undo)
+        seen = min(max(finite(seen, "seen"), self._tick - self._reach, kept), float(self._tick))
+        tick = math.floor(seen)
+        first, last = next((gap for gap in gaps if gap[0] <= seen < gap[1]), (tick, tick + 1))
+        first = max(first, kept)
+        states = after = self._now.copy()
         blocks = dict(self._world.editing)
-        after = None
-        for back in range(self._tick - first):
-            if back == self._tick - first - 1:
+        placed: set[int] = set()
+        for undone in range(self._tick, first, -1):
+            undo = self._undo[undone - self._tick - 1]
+            if undone == last:
                 after = states.copy()
-            undo = self._undo[-1 - back]
+            if undone <= last:
+                placed |= undo.placed
             states[undo.rows[:, 0]] = undo.rows[:, 1:]
-            blocks |= undo.blocks
-        share = seen - first
-        entities = _between(states, states if after is None or not share else after, share)
+            if undone > tick:
+                blocks |= undo.blocks
+        entities = _between(states, after, (seen - first) / (last - first), placed)
         return Past(self._world, seen, entities, self._boxes, blocks, own)
 
     def _begin(self) -> None:
@@ -230,15 +253,17 @@ class Past:
         return np.flatnonzero(inside & (first <= last) & (last >= -MARGIN) & (first <= reach))
 
 
-def _between(old: Int64s, new: Int64s, share: float) -> tuple[Int64s, Floats]:
-    """Who is there in `new`, and where: on the way from `old`, or where it appears."""
-    places = new[:, 2:] / BLOCK
+def _between(old: Int64s, new: Int64s, share: float, placed: set[int]) -> tuple[Int64s, Floats]:
+    """Who is there in `old`, and where: on the way to `new`, unless it is not there any more or was `placed`."""
+    places = old[:, 2:] / BLOCK
     if share > 0:
-        known = old[:, 0] == new[:, 0]
-        was = old[known, 2:] / BLOCK
-        places[known] = was + (places[known] - was) * share
-    there = new[:, 0] != 0
-    return new[there], places[there]
+        moves = old[:, 0] == new[:, 0]
+        if placed:
+            moves &= ~np.isin(old[:, 0], list(placed))
+        was = places[moves]
+        places[moves] = was + (new[moves, 2:] / BLOCK - was) * share
+    there = old[:, 0] != 0
+    return old[there], places[there]
 
 
 def _boxes(scene: Scene) -> Any:

@@ -106,8 +106,8 @@ class Roster:
     def revive(self) -> None:
         """Those who fell out in the last tick come back."""
         for entity in self._fallen:
-            if entity in self._world and not self._stage.fell_out(entity) and self._spawns.put_back(entity):
-                self._stage.log.note_act(entity)
+            if entity in self._world and not self._stage.fell_out(entity):
+                self._spawns.put_back(entity)
         self._fallen.clear()
 
     def _make_room(self) -> None:

@@ -195,6 +195,8 @@ class Session:
         # What it has been sent:
         self.tick = -1
         self.snapshot_bytes = 0
+        self.gaps: tuple[tuple[int, int], ...] = ()
+        """Pairs of ticks that followed each other in its snapshots with others between, as long as a shot may ask."""
         self.sight = Sight()
         self.terrain_due: deque[Cell] = deque()
         self.terrain_now: tuple[Cell, bytes, int] | None = None

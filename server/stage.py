@@ -154,7 +154,6 @@ class Stage:
             OverlapError: there is none.
         """
         self._world.place(entity, position, push=True)
-        self.log.note_act(entity)
 
     def throw(self, entity: int, velocity: Vec) -> None:
         """Sets how fast an entity is; one that walks keeps only the upward part beyond the next tick."""
@@ -202,7 +201,8 @@ class Stage:
         Args:
             seen: the tick at which that client drew the others; None: what its command says, within `on_command`.
         """
-        return self._rewind.at(self._seen if seen is None else seen, player.entity)
+        gaps = player.session.gaps if player.session is not None else ()
+        return self._rewind.at(self._seen if seen is None else seen, player.entity, gaps)
 
     # -- what the players are told ---------------------------------------------------------------------------
 

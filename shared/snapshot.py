@@ -15,7 +15,8 @@
     attributes  [u32 id, {name: value}, u32 id, ...]: all that the game's rules say of an entity (its name, say), where
               that has changed, or the entity has come into the segment, since then
 
-On the wire the flags have one bit more: `ACTED` says that the server's rules moved the entity, not the physics.
+On the wire the flags have two bits more. `ACTED`: the server's rules acted on the entity (placed it, threw it, changed
+its template). `PLACED`: they placed it, so it did not move from where it was before to where it is.
 
 Theory of operation. The physics is the same on both sides, so what an entity does as long as nothing happens to it is
 not sent: whoever has its state of a tick has that of the next, by `World.follow`. What is sent is what took place in
@@ -81,13 +82,16 @@ FAR = 1 << 23
 KEYFRAME = -1
 """The `ago` of a part that holds everything."""
 ACTED = 4
-"""Flag on the wire: the server's rules placed or threw this entity."""
+"""Flag on the wire: the server's rules acted on this entity."""
+PLACED = 2
+"""Flag on the wire: the server's rules placed this entity; `ACTED` is set, too."""
 PART_MAX = 200 * 1024
 """No field of a segment's part is longer, in bytes."""
 
 STATE_LOW = np.array([1, 0, 0, 0, 0, 0, -(1 << 30), -(1 << 30), -(1 << 30), -127, -127, 0], np.int64)
 STATE_HIGH = np.array(
-    [ENTITY_MAX, 255, FALLING | ACTED, SIDE - 1, SIDE - 1, SIDE - 1, 1 << 30, 1 << 30, 1 << 30, 127, 127, 255], np.int64
+    [ENTITY_MAX, 255, FALLING | ACTED | PLACED, SIDE - 1, SIDE - 1, SIDE - 1, 1 << 30, 1 << 30, 1 << 30, 127, 127, 255],
+    np.int64,
 )
 """The bounds of a state on the wire: nothing a peer sends may take the kernel out of its tables."""
 BOUNDS = {compiled: [kernels.lent(bound, compiled) for bound in (STATE_LOW, STATE_HIGH)] for compiled in (False, True)}
@@ -105,15 +109,21 @@ class SegmentPart(NamedTuple):
     attributes: list[tuple[int, dict[str, Any]]]
 
 
-def encode_rows(rows: Int64s, acted: Collection[int] = ()) -> bytes:
-    """Entities ([n, >= 12] state columns), each in the segment of its position, as packed rows; `acted` flagged."""
+def encode_rows(rows: Int64s, acted: Collection[int] = (), placed: Collection[int] = ()) -> bytes:
+    """Packs entities ([n, >= 12] state columns), each in the segment of its position.
+
+    Args:
+        acted: ids that get the flag `ACTED`.
+        placed: ids that get `ACTED` and `PLACED`.
+    """
     packed = np.empty(len(rows), ROW_BY_SIZE)
     for columns, name in COLUMNS_BY_SIZE:
         packed[name] = rows[:, columns]
     flags = packed["kind"][:, 1]
     flags &= FALLING
-    if acted:
-        flags |= np.where(np.isin(packed["id"], list(acted)), ACTED, 0).astype(np.uint8)
+    for ids, flag in ((acted, ACTED), (placed, ACTED | PLACED)):
+        if ids:
+            flags |= np.where(np.isin(packed["id"], list(ids)), flag, 0).astype(np.uint8)
     packed["place"][:, :3] &= SIDE - 1
     return packed.tobytes()
 
@@ -144,11 +154,12 @@ class News:
             kernels.of(bulk, world.compiled).news, w.entities, w.changed, w.lengths, 0, 1, *mine
         )
 
-    def pack(self, acted: Collection[int]) -> tuple[list[Share], set[Cell]]:
+    def pack(self, acted: Collection[int], placed: Collection[int] = ()) -> tuple[list[Share], set[Cell]]:
         """What there is to tell of the entities that the latest step changed, and the segments of them that are due.
 
         Args:
-            acted: ids that the rules placed or threw.
+            acted: ids on which the rules acted.
+            placed: ids that the rules placed.
         """
         w, tick = self._world.arrays, self._world.tick
         if len(w.changed) > len(self._ids):
@@ -161,8 +172,10 @@ class News:
         for i in range(0, n_parts, 8):
             x, y, z, whole, end, heads, tails, stop = parts[i : i + 8]
             ids = self._ids[start:end].tolist()
-            for row, entity in enumerate(ids[whole - start :] if acted else ()):
-                if entity in acted:
+            for row, entity in enumerate(ids[whole - start :] if acted or placed else ()):
+                if entity in placed:
+                    self._packed[tails + row * ROW_BYTES + FLAGS_AT] |= ACTED | PLACED
+                elif entity in acted:
                     self._packed[tails + row * ROW_BYTES + FLAGS_AT] |= ACTED
             packed = self._packed[at:stop].tobytes()
             fields = packed[: heads - at], packed[heads - at : tails - at], packed[tails - at :]
@@ -187,11 +200,12 @@ def encode_part(
     edits: Sequence[tuple[int, int]] = (),
     *,
     acted: Collection[int] = (),
+    placed: Collection[int] = (),
     check: int = 0,
     attributes: Sequence[Any] = (),
 ) -> bytes:
     """One segment's part, ready to be joined into any client's snapshot."""
-    return join_part(segment, ago, (b"", b"", encode_rows(rows, acted)), gone, edits, check, attributes)
+    return join_part(segment, ago, (b"", b"", encode_rows(rows, acted, placed)), gone, edits, check, attributes)
 
 
 def join_part(
@@ -232,8 +246,8 @@ def decode_parts(
     """Checks and unpacks `Snapshot.segments`, in a scene of so many templates; `compiled` by Numba, or not.
 
     Returns:
-        The parts, the states ([n, 12], as `World.put` takes them but for `ACTED`) of all their entities, part after
-        part, and all their turns ([n, 8], as `World.follow` takes them).
+        The parts, the states ([n, 12], as `World.put` takes them but for `ACTED` and `PLACED`) of all their entities,
+        part after part, and all their turns ([n, 8], as `World.follow` takes them).
 
     Raises:
         ProtocolError: anything is not as drawn above.

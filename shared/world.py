@@ -63,6 +63,10 @@ class World:
         """The blocks changed since the latest step, and their kinds until then."""
         self.edited: dict[Cell, int] = {}
         """The blocks changed between the latest step and the one before it, and their kinds until then."""
+        self.placing: set[int] = set()
+        """The entities placed since the latest step."""
+        self.placed: set[int] = set()
+        """The entities placed between the latest step and the one before it: they did not come here by moving."""
         self._inputs = np.zeros(32, np.int64)
         self._entities = np.zeros((0, len(layout.COLUMNS)), np.int64)
         self._awake = self._next_awake = self._woken = self._later = np.zeros(0, np.int64)
@@ -266,7 +270,7 @@ class World:
             if kind == blocks.AIR:
                 face = (x * BLOCK, y * BLOCK, (x + 1) * BLOCK, (y + 1) * BLOCK, (z + 1) * BLOCK)
                 self._kernel.wake_on(self._arrays, -1, *face)
-        states = [self.state(entity) for entity in in_the_way]
+        states, placing = [self.state(entity) for entity in in_the_way], set(self.placing)
         try:
             for entity in in_the_way:
                 self.place(entity, self.position(entity), push=True)
@@ -274,6 +278,7 @@ class World:
             for cell, before in changed:
                 self.blocks.set(*cell, before)
             self.put(states)
+            self.placing = placing
             raise
         return len(changed)
 
@@ -347,6 +352,7 @@ class World:
         state = list(self.state(entity))
         state[X : X + 3] = self._free_place(row, state[TEMPLATE], position, push)
         self.put([tuple(state)])
+        self.placing.add(entity)
 
     def set_velocity(self, entity: int, velocity: tuple[float, float, float]) -> None:
         """Throws an entity, in blocks/s; upwards raises its gravity flag. Raises as `spawn` does, and `KeyError`."""
@@ -429,6 +435,7 @@ class World:
     def _rebased(self, tick: int) -> None:
         self.tick = tick
         self.editing, self.edited = {}, {}
+        self.placing, self.placed = set(), set()
         if self._limbo:
             for name, length in (("_awake", layout.N_AWAKE), ("_woken", layout.N_WOKEN)):
                 keys = getattr(self, name)[: self._lengths[length]]
@@ -457,6 +464,8 @@ class World:
             self._inputs[: len(told)] = told
         self.tick += 1
         self.edited, self.editing = self.editing, {}
+        if self.placing or self.placed:
+            self.placed, self.placing = self.placing, set()
         self._step(self._arrays, self._told, n, self.tick)
         if self._limbo:
             self._free += self._limbo
@@ -476,6 +485,7 @@ class World:
         if moved:
             self._allocate(len(other._entities))
         self.editing, self.edited = dict(other.editing), dict(other.edited)
+        self.placing, self.placed = set(other.placing), set(other.placed)
         self.tick, self._next_id, self._rows = other.tick, other._next_id, other._rows
         self._row_of, self._free, self._limbo = dict(other._row_of), list(other._free), list(other._limbo)
         n = self._rows

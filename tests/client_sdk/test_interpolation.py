@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from client_sdk.interpolation import CALM_S, EXTRAPOLATE_S, FALL_S_PER_S, KEPT, Interpolation
-from shared.layout import Int64s
-from shared.units import BLOCK
+from shared.layout import TEMPLATE, VX, Int64s
+from shared.units import BLOCK, SPEED
 
 RATE = 40.0
 
@@ -56,28 +56,95 @@ def test_a_moment_before_the_oldest_snapshot_shows_the_oldest() -> None:
     assert shown(fed((10, states(a=1)), (11, states(a=2))), 3.0) == {"a": 1}
 
 
-def test_beyond_the_newest_motion_goes_on_for_100_ms_and_then_holds() -> None:
-    interpolation = fed((10, states(a=0)), (11, states(a=1)))
-    assert EXTRAPOLATE_S * RATE == 4
-    assert shown(interpolation, 12.0) == {"a": 2}
-    assert [shown(interpolation, tick) for tick in (15.0, 500.0)] == [{"a": 5}] * 2
+def moving(blocks_per_s: float, **blocks: float) -> Int64s:
+    """As `states`, with a velocity along x."""
+    rows = states(**blocks)
+    rows[:, VX] = int(blocks_per_s * SPEED)
+    return rows
+
+
+def test_beyond_the_newest_an_entity_goes_on_by_its_velocity_for_less_than_a_tick() -> None:
+    interpolation = fed((10, moving(20, a=0)), (11, moving(20, a=0.5)))
+    assert shown(interpolation, 11.5) == {"a": 0.75}
+    for tick in (12.0, 500.0):
+        assert 0.99 < shown(interpolation, tick)["a"] < 1
+
+
+def test_beyond_the_newest_at_most_100_ms_are_drawn() -> None:
+    interpolation = Interpolation(4.0)
+    for tick in (10, 11):
+        interpolation.push(tick, moving(8, a=2.0 * tick))
+    assert EXTRAPOLATE_S == 0.1
+    assert shown(interpolation, 11.25) == {"a": 22.5}
+    assert shown(interpolation, 11.75)["a"] == pytest.approx(22.8)
+
+
+def test_an_entity_that_has_come_to_rest_does_not_go_on() -> None:
+    assert shown(fed((10, moving(40, a=0)), (11, states(a=1))), 11.75) == {"a": 1}
 
 
 def test_the_moment_shown_is_that_of_the_clamped_picture() -> None:
     interpolation = fed((10, states(a=0)), (11, states(a=1)))
-    ticks = [(3.0, 10.0), (10.0, 10.0), (10.5, 10.5), (12.0, 12.0), (15.0, 15.0), (15.5, 15.0), (500.0, 15.0)]
+    ticks = [(3.0, 10.0), (10.0, 10.0), (10.5, 10.5), (11.5, 11.5)]
     assert [interpolation.shown(tick + interpolation.delay_ticks) for tick, _ in ticks] == [at for _, at in ticks]
+    for tick in (12.0, 500.0):
+        assert 11.99 < interpolation.shown(tick + interpolation.delay_ticks) < 12
     assert Interpolation(RATE).shown(7.0) == 5.0
 
 
-def test_who_is_new_stands_where_it_is_and_who_left_is_not_drawn() -> None:
+def test_an_entity_is_drawn_from_the_tick_it_came_in_to_the_tick_it_went_in() -> None:
     interpolation = fed((10, states(a=0, c=3)), (12, states(b=7, c=5)))
-    assert shown(interpolation, 11.0) == {"b": 7, "c": 4}
+    assert shown(interpolation, 11.0) == {"a": 0, "c": 4}
+    assert shown(interpolation, 12.0) == {"b": 7, "c": 5}
 
 
 def test_snapshots_of_an_empty_world_are_no_trouble() -> None:
     interpolation = fed((10, states()), (11, states(a=1)), (12, states()))
-    assert [shown(interpolation, tick) for tick in (10.5, 11.5, 13.0)] == [{"a": 1}, {}, {}]
+    assert [shown(interpolation, tick) for tick in (10.5, 11.5, 13.0)] == [{}, {"a": 1}, {}]
+
+
+# -- what the rules placed -----------------------------------------------------------------------------------
+
+
+def acts(*snapshots: tuple[int, Int64s, str]) -> Interpolation:
+    interpolation = Interpolation(RATE)
+    for tick, rows, placed in snapshots:
+        interpolation.push(tick, rows, frozenset(ord(name) - 96 for name in placed))
+    return interpolation
+
+
+@pytest.mark.parametrize("far", [0.125, 1.75, 10, 1000])
+def test_an_entity_that_was_placed_is_drawn_where_it_was_and_then_where_it_is(far: float) -> None:
+    interpolation = acts((10, states(a=0, b=0), ""), (11, states(a=far, b=far), "a"))
+    drawn = [shown(interpolation, tick) for tick in (10.0, 10.25, 10.75, 11.0, 11.75)]
+    assert [picture["a"] for picture in drawn] == [0, 0, 0, far, far]
+    assert [picture["b"] for picture in drawn] == [0, far / 4, far * 3 / 4, far, far]
+
+
+def test_an_entity_that_was_placed_in_tick_after_tick_is_nowhere_between() -> None:
+    interpolation = acts(*[(tick, states(a=tick % 3), "a") for tick in range(10, 20)])
+    assert [shown(interpolation, tick / 4)["a"] for tick in range(40, 77)] == [tick // 4 % 3 for tick in range(40, 77)]
+
+
+def test_an_entity_that_was_placed_while_snapshots_were_skipped_is_drawn_where_it_was_until_that_is_told() -> None:
+    interpolation = acts((10, states(a=0), ""), (18, states(a=4), "a"), (19, states(a=5), ""))
+    assert [shown(interpolation, tick)["a"] for tick in (10.0, 14.0, 17.75, 18.0, 18.5)] == [0, 0, 0, 4, 4.5]
+
+
+def test_a_thing_that_is_placed_and_changed_is_drawn_as_it_was_until_then() -> None:
+    after = states(a=4)
+    after[:, TEMPLATE] = 3
+    interpolation = acts((10, states(a=0), ""), (11, after, "a"))
+    templates = [
+        interpolation.sample(tick + interpolation.delay_ticks)[0][0, TEMPLATE] for tick in (10.0, 10.5, 11.0, 11.5)
+    ]
+    assert templates == [0, 0, 3, 3]
+    assert shown(interpolation, 10.5) == {"a": 0}
+
+
+def test_a_placed_entity_that_was_not_there_before_and_one_that_is_gone_are_no_trouble() -> None:
+    interpolation = acts((10, states(a=0), "a"), (11, states(b=1), "abc"), (12, states(), "b"))
+    assert [shown(interpolation, tick) for tick in (10.5, 11.5, 12.5)] == [{"a": 0}, {"b": 1}, {}]
 
 
 def test_what_is_kept_is_bounded() -> None:

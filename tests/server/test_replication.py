@@ -16,7 +16,7 @@ from shared.inputs import Input
 from shared.layout import FALLING, FLAGS, ID
 from shared.messages import VERSION, Hello, Resync, Snapshot, Terrain, Welcome, decode_from_server, encode
 from shared.scene import Scene
-from shared.snapshot import ACTED, KEYFRAME, decode_parts
+from shared.snapshot import ACTED, KEYFRAME, PLACED, decode_parts
 from shared.units import BLOCK, SEGMENT
 from shared.world import OverlapError, World
 from tests.worlds import scene
@@ -164,6 +164,62 @@ def test_who_was_acted_upon_is_flagged_in_every_part_that_tells_of_it(told: Reco
     for since in (1, 0):
         _, states, _ = decode_parts([msgpack.unpackb(told.log.since(since)[HOME])], 255)
         assert states[states[:, FLAGS] & ACTED != 0, ID].tolist() == [1]
+
+
+def flags(told: Recorded, segment: Cell, since: int) -> dict[int, int]:
+    """The flags of the rules in a part, by entity."""
+    _, states, _ = decode_parts([msgpack.unpackb(told.log.since(since)[segment])], 255)
+    return dict(zip(states[:, ID].tolist(), (states[:, FLAGS] & ~FALLING).tolist(), strict=True))
+
+
+def test_who_was_placed_is_flagged_as_such_and_who_was_thrown_or_changed_is_not(told: Recorded) -> None:
+    for x in (5, 9, 13, 17):
+        told.world.spawn("box", (x, 5, 1))
+    told.tick()
+    told.world.place(1, (7, 5, 1))
+    for entity in (2, 3):
+        told.log.note_act(entity)
+    told.world.set_velocity(2, (0, 0, 5))
+    told.world.set_template(3, "ghost")
+    told.world.spawn("box", (21, 5, 1))
+    told.tick()
+    acts = {1: ACTED | PLACED, 2: ACTED, 3: ACTED}
+    assert flags(told, HOME, 1) == {**acts, 5: 0}
+    told.tick()
+    assert flags(told, HOME, 1) == {**acts, 5: 0}
+    assert flags(told, HOME, 0) == {**acts, 4: 0, 5: 0}
+
+
+def test_who_was_placed_out_of_a_segment_is_flagged_in_the_other_and_in_its_keyframe_for_a_while(
+    told: Recorded,
+) -> None:
+    for x in (5, 40):
+        told.world.spawn("stone", (x, 5, 1))
+    told.tick(2)
+    assert flags(told, EAST, KEYFRAME) == {2: 0}
+    told.world.place(1, (45, 5, 1))
+    told.tick()
+    for _ in range(HISTORY):
+        assert flags(told, EAST, 2 if told.world.tick - 2 <= HISTORY else 3).get(1, 0) in (0, ACTED | PLACED)
+        assert flags(told, EAST, KEYFRAME) == {1: ACTED | PLACED, 2: 0}
+        told.tick()
+    assert flags(told, EAST, KEYFRAME) == {1: 0, 2: 0}
+
+
+def test_whoever_places_an_entity_it_is_told() -> None:
+    game = Game(row_of_segments(), compiled=False)
+    world, stage = game.world, game.stage
+    thing, pushed = stage.spawn("box", (5, 5, 1)), stage.spawn("box", (9, 5, 1))
+    game.tick(0.0, 0.0)
+    stage.place(thing, (7, 5, 1))
+    world.fill((9, 5, 1), (10, 6, 2), 3, push=True)
+    assert world.placing == {thing, pushed}
+    game.tick(0.0, 0.0)
+    assert (world.placing, world.placed) == (set(), {thing, pushed})
+    with pytest.raises(OverlapError):
+        world.place(thing, (9, 5, 1))
+    game.tick(0.0, 0.0)
+    assert world.placed == set()
 
 
 def test_history_reaches_back_as_far_as_it_says_and_not_further(told: Recorded) -> None:

@@ -36,7 +36,7 @@ def rewinding(**changes: object) -> tuple[World, Rewind]:
 
 
 def crowd(seed: int, ticks: int, compiled: bool, each: Callable[[World, Rewind], None]) -> None:
-    """Entities that walk, come, go and are moved by hand; `each` is called after every tick."""
+    """Entities that walk, come, go, change and are placed; `each` is called after every tick."""
     rng = random.Random(seed)
     world, rewind = rewinding(tick_rate=rng.choice((30, 32, 60)), compiled=compiled)
     for _ in range(ticks):
@@ -49,6 +49,13 @@ def crowd(seed: int, ticks: int, compiled: bool, each: Callable[[World, Rewind],
         ids = world.entities["id"].tolist()
         if rng.random() < 0.05:
             world.put([world.state(rng.choice(ids))])
+        for _ in range(2):
+            place = (rng.uniform(-20, 20), rng.uniform(-20, 20), rng.choice((0, 0, 5)))
+            if rng.random() < 0.2 and _free(world, place):
+                entity = rng.choice(ids)
+                world.place(entity, place)
+                if rng.random() < 0.5:
+                    world.set_template(entity, rng.choice(("box", "stone", "ghost")))
         x, y = rng.randrange(-25, 25), rng.randrange(-25, 25)
         if rng.random() < 0.3:
             world.set_block(x, y, rng.choice((-1, 7)), rng.choice((0, 5)))
@@ -88,25 +95,87 @@ def test_every_tick_of_the_window_is_as_it_was_with_its_blocks(seed: int, compil
     crowd(seed, 60, compiled, check)
 
 
+@pytest.mark.parametrize("skips", [0.0, 0.5, 0.8])
 @pytest.mark.parametrize("seed", range(3))
-def test_between_two_ticks_everybody_is_where_the_sdk_draws_them(seed: int, compiled: bool) -> None:
-    kept: list[tuple[int, Int64s]] = []
+def test_between_two_snapshots_everybody_is_where_the_sdk_draws_them(seed: int, skips: float, compiled: bool) -> None:
+    sent: list[tuple[int, Int64s, frozenset[int]]] = []
+    gaps: list[tuple[int, int]] = []
+    placed: set[int] = set()
     rng = random.Random(seed)
+    looks = 0
 
     def check(world: World, rewind: Rewind) -> None:
-        kept.append((world.tick, world.states()))
+        nonlocal looks
+        placed.update(world.placed)
+        if rng.random() < skips and sent:
+            return
+        if sent and world.tick - sent[-1][0] > 1:
+            gaps.append((sent[-1][0], world.tick))
+        sent.append((world.tick, world.states(), frozenset(placed)))
+        placed.clear()
         interpolation = Interpolation(world.scene.tick_rate)
-        for tick, states in kept[-12:]:
-            interpolation.push(tick, states)
+        for entry in sent:
+            interpolation.push(*entry)
         interpolation.delay_ticks = 0.0
-        seen = world.tick - rng.uniform(0, min(7, len(kept) - 1))
-        past = rewind.at(seen)
+        seen = world.tick - rng.uniform(0, min(7, world.tick - sent[0][0]))
+        past = rewind.at(seen, 0, gaps)
+        if any(since < world.tick - len(rewind._undo) and since <= seen < until for since, until in gaps):
+            return  # longer than lag compensation reaches back
         states, places = interpolation.sample(seen)
-        assert {entity: past.position(entity) for entity in states[:, 0].tolist()} == dict(
-            zip(states[:, 0].tolist(), map(tuple, places.tolist()), strict=True)
-        )
+        drawn = dict(zip(states[:, 0].tolist(), map(tuple, places.tolist()), strict=True))
+        assert {entity: past.position(entity) for entity in drawn} == drawn
+        assert past.box((-99, -99, -99), (99, 99, 99)) == sorted(drawn)
+        looks += 1
 
-    crowd(seed, 60, compiled, check)
+    crowd(seed, 120, compiled, check)
+    assert looks > 15
+
+
+def test_until_its_tick_is_over_an_entity_that_is_placed_and_changed_is_what_and_where_it_was() -> None:
+    world, rewind = rewinding()
+    thing = world.spawn("stone", (0, 0, 0))
+    for _ in range(4):
+        world.step()
+        rewind.record()
+    world.place(thing, (9, 0, 0))
+    world.set_template(thing, "slab")  # 4 blocks wide
+    world.step()
+    rewind.record()
+    for seen, ids in ((3.5, [thing]), (4.0, [thing]), (4.75, [thing]), (5.0, [])):
+        past = rewind.at(seen)
+        assert past.box((0, 0, 0), (0.5, 0.5, 0.5)) == ids
+        assert past.position(thing) == ((0, 0, 0) if ids else (9, 0, 0))
+        assert past.box((1, 0, 0), (9, 4, 1)) == [], "no box of the new template where it was"
+        assert past.box((12, 3, 0), (12.5, 3.5, 0.5)) == ([] if ids else [thing])
+
+
+def test_who_was_not_sent_some_ticks_saw_what_was_placed_in_them_at_the_end_of_the_gap() -> None:
+    world, rewind = rewinding(tick_rate=32)
+    thing = world.spawn("stone", (0, 0, 0))
+    for tick in range(1, 9):
+        if tick == 5:
+            world.place(thing, (9, 0, 0))
+        world.step()
+        rewind.record()
+    gap = (3, 7)
+    assert [rewind.at(seen).position(thing)[0] for seen in (4.5, 5.0, 6.75, 7.0)] == [0, 9, 9, 9]
+    assert [rewind.at(seen, 0, [gap]).position(thing)[0] for seen in (3.0, 4.5, 5.0, 6.75, 7.0)] == [0, 0, 0, 0, 9]
+    assert [rewind.at(seen, 0, [(1, 3), gap]).position(thing)[0] for seen in (1.5, 2.5, 6.0)] == [0, 0, 0]
+
+
+def test_a_gap_that_began_before_the_window_is_remembered_and_memory_is_bounded() -> None:
+    world, rewind = rewinding(tick_rate=32)
+    thing = world.spawn("stone", (0, 0, 0))
+    for tick in range(1, 41):
+        if tick == 20:
+            world.place(thing, (9, 0, 0))
+        world.step()
+        rewind.record()
+        if tick == 26:
+            assert rewind.at(19.5, 0, [(19, 25)]).position(thing)[0] == 0
+            assert rewind.at(24.5, 0, [(17, 25)]).position(thing)[0] == 0
+        assert len(rewind._undo) <= 16
+    assert len(rewind._undo) == 8, "nobody has been placed for a while"
 
 
 def test_the_moment_is_clamped_and_must_be_a_number() -> None:

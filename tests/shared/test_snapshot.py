@@ -20,6 +20,7 @@ from shared.messages import ENTITY_MAX, TICK_MAX, ProtocolError
 from shared.snapshot import (
     ACTED,
     FIELDS,
+    PLACED,
     ROW,
     SIDE,
     SegmentPart,
@@ -144,6 +145,13 @@ def test_who_was_acted_upon_is_flagged_and_nobody_else() -> None:
     _, decoded, _ = decode_parts([msgpack.unpackb(encode_part((0, 0, 0), 0, rows, acted={5, 9}))], 255)
     assert [flags & ACTED for flags in decoded[:, FLAGS].tolist()] == [0, ACTED, 0]
     assert (decoded[:, FLAGS] & FALLING).tolist() == [1, 1, 1]
+
+
+def test_who_was_placed_is_flagged_as_acted_upon_too() -> None:
+    rows = np.array([state_in((0, 0, 0), 1, 0, 0, entity) for entity in (3, 5, 8)], np.int64)
+    part = msgpack.unpackb(encode_part((0, 0, 0), 0, rows, acted={3}, placed={8, 9}))
+    _, decoded, _ = decode_parts([part], 255)
+    assert decoded[:, FLAGS].tolist() == [FALLING | ACTED, FALLING, FALLING | ACTED | PLACED]
 
 
 def test_a_checksum_is_that_of_the_blocks_and_the_rows_ascending_by_id(compiled: bool) -> None:
