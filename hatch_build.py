@@ -45,13 +45,13 @@ class Hook(BuildHookInterface[Any]):
         if version == "editable":
             write_stubs(Path(self.root))
             return
-        self._staged = Path(tempfile.mkdtemp(prefix=f"{PACKAGE}-"))
-        stage(Path(self.root), self._staged)
-        build_data["force_include"][str(self._staged)] = PACKAGE
+        self._staged = tempfile.TemporaryDirectory(prefix=f"{PACKAGE}-")
+        stage(Path(self.root), Path(self._staged.name))
+        build_data["force_include"][self._staged.name] = PACKAGE
 
     def finalize(self, version: str, build_data: dict[str, Any], artifact_path: str) -> None:
         if version != "editable":
-            shutil.rmtree(self._staged)
+            self._staged.cleanup()
 
 
 def stage(root: Path, place: Path) -> None:

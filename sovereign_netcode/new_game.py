@@ -24,20 +24,20 @@ from sovereign_netcode.shared.scene import Scene
 
 
 class {title}(Rules):
-    """Who touches another gets a point; who has ten is fast from then on."""
+    """Two players who touch each other get a point each. A player with ten points is fast from then on."""
 
     scene = "meadow"
 
     def prepare(self, scene: Scene) -> Scene:
-        # A further kind of entity, like a player but for what is said here; clients predict it as it is.
+        # Another template: like that of players, except for the fields given here. Clients predict it exactly.
         return scene.with_template("runner", walk_speed=7.0)
 
     def on_start(self) -> None:
-        # Values that all clients know: `client.shared`.
+        # Shared values are sent to all clients: `client.shared`.
         self.game.share("points_to_win", 10)
 
     def on_join(self, player: Player) -> None:
-        # Attributes: what everybody sees of an entity, `Figure.attributes` in the client. Also "name", already there.
+        # Attributes of an entity are sent to all who see it: `Figure.attributes`. "name" is there already.
         self.game.set(player.entity, "points", 0)
 
     def on_contact(self, a: int, b: int) -> None:
@@ -46,11 +46,11 @@ class {title}(Rules):
             self.game.set(entity, "points", points)
             if points == self.game.shared["points_to_win"]:
                 self.game.change(entity, "runner")
-                # An event: `Happened` in the client.
+                # The clients receive this event as `Happened`.
                 self.game.send("winner", {{"entity": entity}})
 
     def on_command(self, player: Player, name: str, payload: Any) -> bool | None:
-        # `client.command("boost")`. What is not allowed is answered with False.
+        # A client sends `client.command("boost")`. False refuses it.
         if name != "boost":
             return False
         self.game.throw(player.entity, (0.0, 0.0, 12.0))
@@ -59,7 +59,7 @@ class {title}(Rules):
     # def on_tick(self) -> None:
     #     if self.game.tick % self.game.ticks(5.0) == 0:  # every five seconds
     #         place = self.game.random.choice(self.game.scene.spawns)
-    #         self.game.steer(self.game.spawn("runner", place, name="Dash"), 1, 0)  # goes east from now on
+    #         self.game.steer(self.game.spawn("runner", place, name="Dash"), 1, 0)  # walks east
 
     # def on_leave(self, player: Player) -> None:
     # def on_fell_out(self, entity: int) -> bool | None:
@@ -78,7 +78,7 @@ from sovereign_netcode.shared.world import World
 
 
 def seek(world: World, me: int) -> Input:
-    """A bot: hops to whoever else it sees first. Asked once per tick, it sees what a client predicts."""
+    """A bot that hops to the first other entity. It is called once per tick, with its client's predicted world."""
     others = [entity for entity in world.entities["id"].tolist() if entity != me]
     if not others:
         return NEUTRAL
@@ -99,14 +99,14 @@ def test_two_bots_play() -> None:
     assert match.game.counters.rules_failed == 0
 
 
-def test_who_has_ten_points_is_fast_and_all_are_told() -> None:
+def test_ten_points_make_fast_and_are_announced() -> None:
     match = Match(load_scene({title}.scene), seed=1, rules={title}())
     ann = match.join(bot(seek))
     match.run(2)
     game, entity = match.game.stage, ann.core.entity
     game.set(entity, "points", 9)
     x, y, z = game.position(entity)
-    other = game.spawn("player", (x + 2, y, z))  # she runs after it, and touches it
+    other = game.spawn("player", (x + 2, y, z))  # Ann hops to it
     match.run_until(lambda: other in game.touching(entity), 10)
     match.run(1)
     assert game.template(entity) == "runner"
@@ -151,7 +151,7 @@ def main() -> int:
 
 
 def command(name: str) -> str:
-    """One of our commands, as one can type it here: its name alone where the search path has this environment's."""
+    """Returns how to run an installed command: by its name alone if the search path leads to this environment."""
     found = shutil.which(f"sovereign-{name}")
     if found is not None and Path(found).parent == Path(sys.executable).parent:
         return f"sovereign-{name}"
