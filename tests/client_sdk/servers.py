@@ -5,7 +5,7 @@ import socket
 import subprocess
 import sys
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 from websockets.frames import Frame
@@ -17,10 +17,12 @@ ROOT = Path(__file__).resolve().parents[2]
 
 
 @contextlib.contextmanager
-def real_server(*flags: str) -> Iterator[str]:
+def real_server(
+    *flags: str, program: Sequence[str] = (sys.executable, "-m", "server"), folder: Path = ROOT
+) -> Iterator[str]:
     """The URL of a server process, which has to end well."""
-    command = [sys.executable, "-m", "server", "--host", "127.0.0.1", "--port", "0", "--log-level", "warning", *flags]
-    with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True) as process:
+    command = [*program, "--host", "127.0.0.1", "--port", "0", "--log-level", "warning", *flags]
+    with subprocess.Popen(command, cwd=folder, stdout=subprocess.PIPE, text=True) as process:
         try:
             assert process.stdout is not None
             line = process.stdout.readline()

@@ -4,19 +4,19 @@ Everything runs in a bare environment outside the repository (`tests.packaging.b
 """
 
 import ast
-import contextlib
 import email
 import shutil
 import subprocess
 import tarfile
 import zipfile
-from collections.abc import Iterator
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import NamedTuple
 
 import pytest
 
 from hatch_build import FOLDERS
+from tests.client_sdk.servers import real_server
 from tests.packaging.bare import ROOT, build, environment, run
 from tests.packaging.test_rewriting import imported
 from tests.readme.pages import programs
@@ -48,6 +48,10 @@ class Installed(NamedTuple):
         """Runs an installed command in the user's folder. Returns the output."""
         return run(self.folder, str(self.python.parent / name), *arguments)
 
+    def served(self, *flags: str) -> AbstractContextManager[str]:
+        """The URL of an installed server in the user's folder."""
+        return real_server(*flags, program=(str(self.python.parent / "sovereign-server"),), folder=self.folder)
+
 
 @pytest.fixture(scope="module")
 def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
@@ -76,22 +80,6 @@ def installed(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Installe
     shutil.copytree(ROOT / "docs", folder / "docs")
     shutil.copy(ROOT / "README.md", folder)
     return Installed(environment(place / "venv", wheel, *PACKAGES), folder)
-
-
-@contextlib.contextmanager
-def served(installed: Installed, *flags: str) -> Iterator[str]:
-    """The URL of an installed server, which has to end well."""
-    command = [str(installed.python.parent / "sovereign-server"), "--port", "0", "--log-level", "warning", *flags]
-    with subprocess.Popen(command, cwd=installed.folder, stdout=subprocess.PIPE, text=True) as process:
-        try:
-            assert process.stdout is not None
-            line = process.stdout.readline()
-            assert line.startswith("listening on "), "the server did not start"
-            yield line.split()[-1]
-            process.terminate()
-            assert process.wait(10) == 0
-        finally:
-            process.kill()
 
 
 def names(wheel: Path) -> set[str]:
@@ -197,7 +185,7 @@ def test_a_game_is_begun_tested_and_served(installed: Installed) -> None:
     said = installed.command("sovereign-new-game", "king_of_the_hill")
     assert "sovereign_netcode.server --game king_of_the_hill:KingOfTheHill" in said
     assert "3 passed" in installed.run("-m", "pytest", "-q", "test_king_of_the_hill.py")
-    with served(installed, "--game", "king_of_the_hill:KingOfTheHill", "--record", "session"):
+    with installed.served("--game", "king_of_the_hill:KingOfTheHill", "--record", "session"):
         pass
     assert "ticks as recorded" in installed.command("sovereign-replay", "session")
 
@@ -223,7 +211,7 @@ def test_a_program_with_a_loop(installed: Installed, name: str) -> None:
 
 @pytest.mark.slow
 def test_the_other_programs(installed: Installed) -> None:
-    with served(installed, "--scene", "flat") as url:
+    with installed.served("--scene", "flat") as url:
         for name in ON_A_SERVER:
             assert "walked" in installed.run("-m", "tests.readme.run_snippet", name, url)
     for name in ALONE:
