@@ -9,6 +9,7 @@ from rich.console import Console
 from rich.table import Table
 
 import _bench_server as server
+from _env import lacking
 
 
 def run(args: argparse.Namespace, console: Console) -> tuple[dict[str, Any], int]:
@@ -18,6 +19,10 @@ def run(args: argparse.Namespace, console: Console) -> tuple[dict[str, Any], int
     bounds: list[dict[str, Any]] = []
     if args.crowd:
         return run_crowd(args, console, seconds)
+
+    without_picows = lacking("picows")
+    if without_picows:
+        console.print(f"the rows of picows are left out: {without_picows}", highlight=False, soft_wrap=True)
 
     def report(stage: dict[str, Any]) -> None:
         console.print(
@@ -45,10 +50,12 @@ def run(args: argparse.Namespace, console: Console) -> tuple[dict[str, Any], int
         with server.rig("echo", str(size), seed=number + 1) as running:
             first = most if args.quick else 1000  # more than the game holds
             echoed = server.search(running, first, seconds, resolution, 1 if args.quick else steps, report)
-        console.print("  the same on picows, which no game is played over: what another library could gain")
-        with server.rig(server.ECHO_PICOWS, str(size), seed=number + 1) as running:
-            first = most // 4 if args.quick else 1000
-            picows = server.search(running, first, seconds, resolution, 1 if args.quick else steps, report)
+        if not without_picows:
+            console.print("  the same on picows, which no game is played over: what another library could gain")
+            with server.rig(server.ECHO_PICOWS, str(size), seed=number + 1) as running:
+                first = most // 4 if args.quick else 1000
+                picows = server.search(running, first, seconds, resolution, 1 if args.quick else steps, report)
+            bounds.append({"gateway": "picows", "max_clients": None, "load_before": load, **bound(picows)})
         shares = server.profile(max(50, by["clients"] // (4 if args.quick else 2)), seconds)
         runs.append(
             {
@@ -68,7 +75,6 @@ def run(args: argparse.Namespace, console: Console) -> tuple[dict[str, Any], int
                 "echo_stages": echoed,
             }
         )
-        bounds.append({"gateway": "picows", "max_clients": None, "load_before": load, **bound(picows)})
     console.print(capacity_table(runs, bounds))
     if max(run["load_before"] for run in runs) > cores / 2:
         console.print("other processes were at work: the numbers of clients are too low, go by the CPU time")
@@ -124,7 +130,7 @@ def capacity_table(runs: list[dict[str, Any]], bounds: list[dict[str, Any]]) -> 
         ("generator_cpu_share", "{:.0%}"),
     ):
         made.add_row(name, *("" if run[name] is None else form.format(run[name]) for run in runs))
-    for name, form in (("echo_cpu_us_per_client_tick", "{:.1f}"), ("echo_clients_by_cpu", "{:,}")):
+    for name, form in (("echo_cpu_us_per_client_tick", "{:.1f}"), ("echo_clients_by_cpu", "{:,}")) if bounds else ():
         made.add_row(f"picows: {name}", *(form.format(run[name]) for run in bounds))
     made.add_section()
     for part in sorted(runs[0]["parts"], key=lambda part: -runs[0]["parts"][part]):

@@ -23,6 +23,7 @@ from pathlib import Path
 from typing import Any
 
 from server.histogram import between
+from sovereign_netcode.stderr import Stderr
 
 ROOT = Path(__file__).resolve().parent.parent
 RATE = 30
@@ -62,19 +63,24 @@ def scene_toml(capacity: int, per_segment: int = PER_SEGMENT, margin: int = 0) -
     return f"tick_rate = {RATE}\nsize = [{side + margin}, {side + margin}, 1]\nspawns = {spawns}\n{rest}\n"
 
 
+class RigError(Exception):
+    """A process of the benchmark does not do its part; the text says why."""
+
+
 class Rig:
     """A server and a generator of load, both processes of their own."""
 
     def __init__(self, kind: str, scene: Path, *more: str, seed: int = 1) -> None:
         script = ("_echo_picows.py",) if kind == ECHO_PICOWS else ("_busy_server.py", kind)
-        self._server = self._start(*script, str(scene), *more)
+        self._server, errors = self._start(*script, str(scene), *more)
         assert self._server.stdout is not None
         line = self._server.stdout.readline()
         if not line.startswith("listening on "):
-            raise RuntimeError("the server did not start")
+            self._end(self._server)
+            raise RigError(f"the server did not start: {errors.cause(self._server.returncode)}")
         self.port = int(line.rpartition(":")[2])
         order = {"port": self.port, "seed": seed, "rate": RATE, "joins_per_s": JOINS_PER_S}
-        self._generator = self._start("_generator.py", json.dumps(order))
+        self._generator, self._errors = self._start("_generator.py", json.dumps(order))
         self._said: queue.Queue[Figures] = queue.Queue()
         threading.Thread(target=self._listen, daemon=True).start()
 
@@ -143,7 +149,7 @@ class Rig:
         deadline = time.monotonic() + PATIENCE_S
         while (taken := self.stats()["full_collection_s"]) is None:
             if time.monotonic() > deadline:
-                raise RuntimeError("the server has not collected its garbage")
+                raise RigError("the server has not collected its garbage")
             time.sleep(0.05)
         return float(taken)
 
@@ -157,20 +163,31 @@ class Rig:
         for process in (self._generator, self._server):
             process.terminate()
         for process in (self._generator, self._server):
-            try:
-                process.wait(PATIENCE_S)
-            except subprocess.TimeoutExpired:
-                process.kill()
-                process.wait()
-            for pipe in (process.stdin, process.stdout):
-                if pipe is not None:
-                    with contextlib.suppress(OSError):
-                        pipe.close()
+            self._end(process)
 
     @staticmethod
-    def _start(script: str, *arguments: str) -> subprocess.Popen[str]:
-        command = (sys.executable, str(ROOT / "scripts" / script), *arguments)
-        return subprocess.Popen(command, cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+    def _end(process: subprocess.Popen[str]) -> None:
+        """Waits for a process that ends, and not for long."""
+        try:
+            process.wait(PATIENCE_S)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait()
+        for pipe in (process.stdin, process.stdout):
+            if pipe is not None:
+                with contextlib.suppress(OSError):
+                    pipe.close()
+
+    @staticmethod
+    def _start(script: str, *arguments: str) -> tuple[subprocess.Popen[str], Stderr]:
+        command, errors = (sys.executable, str(ROOT / "scripts" / script), *arguments), Stderr()
+        try:
+            process = subprocess.Popen(
+                command, cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=errors.pipe, text=True
+            )
+        finally:
+            errors.started()
+        return process, errors
 
     def _listen(self) -> None:
         assert self._generator.stdout is not None
@@ -179,7 +196,11 @@ class Rig:
                 self._said.put(json.loads(line))
 
     def _next(self) -> Figures:
-        return self._said.get(timeout=PATIENCE_S)
+        try:
+            return self._said.get(timeout=PATIENCE_S)
+        except queue.Empty:
+            cause = self._errors.cause(self._generator.poll())
+            raise RigError(f"the generator of load does not answer: {cause}") from None
 
     def _drain(self) -> Figures:
         status: Figures = {}

@@ -6,6 +6,7 @@ Interpreters older than the project supports must be able to run this file: they
 from __future__ import annotations
 
 import hashlib
+import importlib.util
 import os
 import shutil
 import subprocess
@@ -64,6 +65,13 @@ def run(title: str, *args: str) -> Step:
     started = time.perf_counter()
     status = subprocess.run([str(PYTHON), *args], cwd=ROOT, check=False).returncode
     return Step(title, status, time.perf_counter() - started)
+
+
+def lacking(module: str) -> str:
+    """What to do about a module that only the development pins hold; empty: it is installed."""
+    if importlib.util.find_spec(module) is not None:
+        return ""
+    return f"{module} is not installed here; `python scripts/test --version` sets it up, with all else for development"
 
 
 def _read_stamp() -> tuple[str, str, str]:

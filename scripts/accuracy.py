@@ -17,6 +17,7 @@ from rich.table import Table
 
 from _conclusion import Row, conclusion
 from _engines import Choice
+from _env import lacking
 from shared import kernels
 
 PRODUCT = Choice(product=True)
@@ -120,6 +121,9 @@ def main(argv: list[str] | None = None) -> int:
     console = Console()
     if not kernels.available():
         console.print("error: Numba is not installed; the variants are compiled by it")
+        return 2
+    if args.plot and (why := lacking("matplotlib")):
+        console.print(f"error: --plot: {why}", highlight=False, markup=False, soft_wrap=True)
         return 2
     with Progress(console=console, transient=True) as progress:
         rows = run(progress, quick=args.quick)

@@ -42,6 +42,7 @@ import _bench_memory as memory
 import _bench_physics as physics
 import _bench_rss as rss
 import _step_c
+from _bench_server import RigError
 from _crowds import Samples
 from shared import kernels
 
@@ -242,7 +243,11 @@ def main(argv: list[str] | None = None) -> int:
     command.add_argument("--quick", action="store_true", help="one round of 3 s each, within a minute")
     command.set_defaults(run=jitter.run)
     args = parser.parse_args(argv)
-    report, status = args.run(args, Console())
+    try:
+        report, status = args.run(args, Console())
+    except RigError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
     if args.json and report:
         args.json.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
     return int(status)

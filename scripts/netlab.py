@@ -26,6 +26,7 @@ from rich.table import Table
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
 import league
+from _env import lacking
 from client_sdk.events import Corrected
 from client_sdk.links import PRESETS
 from client_sdk.stats import Stats
@@ -150,6 +151,8 @@ def main() -> int:
     parser.add_argument("--json", type=Path)
     parser.add_argument("--plot", type=Path)
     chosen = parser.parse_args()
+    if chosen.plot and (why := lacking("matplotlib")):
+        parser.error(f"--plot: {why}")
     names = chosen.preset or list(PRESETS)
     console = Console()
     if not console.is_terminal:

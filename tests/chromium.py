@@ -108,11 +108,12 @@ def chromium(path: str) -> Iterator[Tab]:
 def _address(browser: subprocess.Popen[str]) -> str:
     """Host and port where it wants to be driven: it prints them."""
     assert browser.stderr is not None
+    line = ""
     for line in browser.stderr:
         found = re.search(r"DevTools listening on ws://([^/]+)/", line)
         if found:
             return found[1]
-    raise RuntimeError("the browser ended before it listened")
+    raise RuntimeError(f"the browser ended before it listened, with {browser.wait()}: {line.strip()}")
 
 
 def _page(address: str) -> str:

@@ -99,12 +99,15 @@ class Tag(Rules):
 
     def _plant_trees(self, count: int) -> None:
         game = self.game
-        low, high = game.scene.origin[2] * SEGMENT, (game.scene.origin[2] + game.scene.size[2]) * SEGMENT
+        west, south, low = (SEGMENT * part for part in game.scene.origin)
+        width, depth, height = (SEGMENT * part for part in game.scene.size)
         for _ in range(count):
             x, y = (int(part) + game.random.randrange(-22, 23) for part in game.random.choice(game.scene.spawns)[:2])
-            ground = next((z for z in range(high - 8, low, -1) if game.block(x, y, z)), high) + 1
-            if game.block(x, y, ground - 1) == LEAVES:
-                continue
+            x, y = min(max(x, west + 1), west + width - 2), min(max(y, south + 1), south + depth - 2)
+            top = next((z for z in range(low + height - 1, low - 1, -1) if game.block(x, y, z)), None)
+            if top is None or top > low + height - 8 or game.block(x, y, top) == LEAVES:
+                continue  # no ground, no room below the world's ceiling, or a tree
+            ground = top + 1
             for z in range(ground, ground + 4):
                 game.set_block(x, y, z, TRUNK)
             for i in range(-1, 2):

@@ -32,6 +32,7 @@ from sovereign_netcode.loadtest.processes import (
     Figures,
     Process,
     Worker,
+    cause,
     child,
     own_server,
     stats,
@@ -88,7 +89,7 @@ async def test(args: argparse.Namespace, console: Console) -> int:
     if server is not None:
         measured["server_exit_code"] = server.returncode
         if server.returncode != 0 and os.name != "nt":
-            failed.append(f"the server ended with {server.returncode}")
+            failed.append(f"the server ended with {server.returncode}: {cause(server)}")
     measured["failures"] = failed
     if args.json is not None:
         args.json.write_text(json.dumps(measured, indent=2) + "\n", "utf-8")
@@ -105,7 +106,7 @@ def check(watched: dict[str, list[Process]]) -> None:
     for name, processes in watched.items():
         for process in processes:
             if process.returncode is not None:
-                raise DiedError(f"{name} ended in the middle, with {process.returncode}")
+                raise DiedError(f"{name} ended in the middle, with {process.returncode}: {cause(process)}")
 
 
 async def measure(

@@ -9,6 +9,9 @@ import sys
 from collections.abc import AsyncIterator
 from typing import Any
 from urllib.parse import urlsplit
+from weakref import WeakKeyDictionary
+
+from sovereign_netcode.stderr import Stderr
 
 START_S_MAX = 120.0
 """A server's first start compiles the physics."""
@@ -19,6 +22,7 @@ LINE_BYTES_MAX = 1 << 24
 
 Figures = dict[str, Any]
 Process = asyncio.subprocess.Process
+_stderr: WeakKeyDictionary[Process, Stderr] = WeakKeyDictionary()
 
 
 class CannotStartError(Exception):
@@ -54,7 +58,7 @@ class Worker:
         with contextlib.suppress(TimeoutError):
             await asyncio.wait_for(self._reading, RESULT_S_MAX)
         if self._result is None:
-            raise DiedError("a process of bots has not told its figures")
+            raise DiedError(f"a process of bots has not told its figures: {cause(self.process)}")
         return self._result
 
     def leave(self) -> None:
@@ -78,13 +82,19 @@ async def child(*command: str, patience_s: float = 0.0) -> AsyncIterator[Process
 
     At the end its input is closed, which ends bots; after `patience_s` it gets SIGTERM, which ends a server.
     """
-    process = await asyncio.create_subprocess_exec(
-        *(sys.executable, "-P", *command),  # -P: modules in the current folder do not matter
-        stdin=asyncio.subprocess.PIPE,
-        stdout=asyncio.subprocess.PIPE,
-        limit=LINE_BYTES_MAX,
-        start_new_session=True,
-    )
+    errors = Stderr()
+    try:
+        process = await asyncio.create_subprocess_exec(
+            *(sys.executable, "-P", *command),  # -P: modules in the current folder do not matter
+            stdin=asyncio.subprocess.PIPE,
+            stdout=asyncio.subprocess.PIPE,
+            stderr=errors.pipe,
+            limit=LINE_BYTES_MAX,
+            start_new_session=True,
+        )
+    finally:
+        errors.started()
+    _stderr[process] = errors
     assert process.stdin is not None
     try:
         yield process
@@ -100,6 +110,11 @@ async def child(*command: str, patience_s: float = 0.0) -> AsyncIterator[Process
                 await process.wait()
 
 
+def cause(process: Process) -> str:
+    """Why a `child` failed, in its own words if it has said something."""
+    return _stderr[process].cause(process.returncode)
+
+
 async def ended(process: Process, seconds: float) -> bool:
     """Waits for a process to end, at most so long; whether it has."""
     with contextlib.suppress(TimeoutError):
@@ -112,7 +127,7 @@ async def own_server(args: argparse.Namespace) -> AsyncIterator[tuple[Process, s
     """A server on a port that the system picks, once it listens.
 
     Raises:
-        CannotStartError: it does not; it has said why.
+        CannotStartError: it does not; the text says why.
     """
     rate = ("--tick-rate", str(args.tick_rate)) if args.tick_rate else ()
     command = (
@@ -133,7 +148,8 @@ async def own_server(args: argparse.Namespace) -> AsyncIterator[tuple[Process, s
         with contextlib.suppress(TimeoutError):
             line = (await asyncio.wait_for(server.stdout.readline(), START_S_MAX)).decode()
         if not line.startswith("listening on "):
-            raise CannotStartError("the server did not start")
+            await ended(server, END_S if server.stdout.at_eof() else 0.0)
+            raise CannotStartError(f"the server did not start: {cause(server)}")
         yield server, line.removeprefix("listening on ").strip()
 
 

@@ -3,6 +3,7 @@
 import argparse
 import contextlib
 import os
+import signal
 import sys
 import time
 
@@ -14,12 +15,14 @@ from client_sdk.client import Client
 from client_sdk.transports.connection import ConnectError
 from sovereign_netcode.play import own_server
 from sovereign_netcode.play.script import Script
-from sovereign_netcode.play.window import Window, keyboard
+from sovereign_netcode.play.window import CLOSED, Window, keyboard
 
 GAME = "sovereign_netcode.examples.tag:Tag"
 FRAMES_PER_S = 60
 SCRIPT_S = 120.0
 """A scripted session that is not through by then has failed."""
+UNSEEN = ("dummy", "offscreen")
+"""The drivers of SDL that open windows nobody sees. SDL takes one of them where there is no display."""
 
 
 def arguments(argv: list[str] | None = None) -> argparse.Namespace:
@@ -44,11 +47,13 @@ def main(argv: list[str] | None = None) -> int:
     script = Script(options.script_demo) if options.script_demo else None
     if script:
         os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # as Ctrl-C: the server and the bots end as well
     try:
+        open_display(unseen=script is not None)
         with contextlib.ExitStack() as stack:
             url = options.url
             if url is None:
-                print("starting a server ...", flush=True)
+                print("starting a server (the first start on a machine takes longer) ...", flush=True)
                 url = stack.enter_context(own_server.server(options.game, options.scene))
             count = options.bots if options.bots is not None else 0 if options.url else 4
             stack.enter_context(own_server.bots(url, count))
@@ -62,9 +67,24 @@ def main(argv: list[str] | None = None) -> int:
         return 0
 
 
+def open_display(*, unseen: bool) -> None:
+    """Makes pygame ready to open a window.
+
+    Raises:
+        RuntimeError: nobody would see the window, and that is not wanted (`unseen`).
+    """
+    try:
+        pygame.display.init()
+        found = f"SDL's driver is {pygame.display.get_driver()!r}"
+        seen = pygame.display.get_driver() not in UNSEEN
+    except pygame.error as error:
+        found, seen, unseen = str(error), False, False
+    if not seen and not unseen:
+        raise RuntimeError(f"no display to open a window on ({found}); --script-demo OUT.png needs none")
+
+
 def play(client: Client, lag_s: float, script: Script | None, title: str) -> int:
-    """Until somebody ends it; the exit code."""
-    pygame.display.init()
+    """Plays until somebody ends it; returns the exit code."""
     pygame.font.init()
     window = Window(client, script or keyboard, title)
     window.lag(lag_s)
@@ -78,6 +98,6 @@ def play(client: Client, lag_s: float, script: Script | None, title: str) -> int
     pygame.quit()
     print(window.over)
     if script is None:
-        return 0
+        return int(window.over != CLOSED)
     print(*(f"{what} {much:.3g}" for what, much in script.done.items()), sep=", ")
     return 0 if "in sight" in script.done else 1

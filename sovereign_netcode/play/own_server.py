@@ -12,7 +12,9 @@ from collections.abc import Callable, Iterator
 from client_sdk.bots import Bot, Wander
 from client_sdk.core import Core
 from client_sdk.transports.aio import AsyncClient
+from client_sdk.transports.connection import ConnectError
 from sovereign_netcode.examples.tag_brain import TagPlayer
+from sovereign_netcode.stderr import Stderr
 
 START_S = 120.0
 """The first start compiles the physics."""
@@ -21,11 +23,17 @@ NAMES = ("Kim", "Lou", "Mio", "Nia", "Oz", "Pia", "Quin", "Rex", "Sol", "Tess", 
 
 
 @contextlib.contextmanager
-def process(*command: str) -> Iterator[subprocess.Popen[str]]:
+def process(*command: str) -> Iterator[tuple[subprocess.Popen[str], Stderr]]:
     """A process of this Python, whose output is read; it is told to end, and made to."""
-    running = subprocess.Popen([sys.executable, *command], stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, text=True)
+    errors = Stderr()
     try:
-        yield running
+        running = subprocess.Popen(
+            [sys.executable, *command], stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=errors.pipe, text=True
+        )
+    finally:
+        errors.started()
+    try:
+        yield running, errors
     finally:
         running.terminate()
         try:
@@ -42,19 +50,20 @@ def server(game: str, scene: str | None) -> Iterator[str]:
     """A server on a free port of this machine; its address.
 
     Raises:
-        RuntimeError: it does not start; it has said why on stderr.
+        RuntimeError: it does not start; the text says why.
     """
     options = ["--port", "0", "--game", game, "--log-level", "warning", *(["--scene", scene] if scene else [])]
-    with process("-m", "sovereign_netcode.server", *options) as running:
+    with process("-m", "sovereign_netcode.server", *options) as (running, errors):
         lines: queue.Queue[str] = queue.Queue()
         assert running.stdout is not None
         threading.Thread(target=lambda out: lines.put(out.readline()), args=(running.stdout,), daemon=True).start()
         try:
-            said = lines.get(timeout=START_S)
+            said: str | None = lines.get(timeout=START_S)
         except queue.Empty:
-            said = ""
-        if not said.startswith("listening on "):
-            raise RuntimeError("the server did not start")
+            said = None
+        if said is None or not said.startswith("listening on "):
+            code = None if said is None else running.wait(END_S)
+            raise RuntimeError(f"the server did not start: {errors.cause(code)}")
         yield said.split()[-1]
 
 
@@ -87,4 +96,7 @@ async def play(url: str, count: int) -> None:
 
 
 if __name__ == "__main__":
-    asyncio.run(play(sys.argv[1], int(sys.argv[2])))
+    try:
+        asyncio.run(play(sys.argv[1], int(sys.argv[2])))
+    except ConnectError as error:
+        sys.exit(f"error: the bots cannot play: {error}")

@@ -52,7 +52,7 @@ class Script:
             if way > WALK_BLOCKS:
                 self.done["walked"] = way
             return -0.7, 0.7, not all(view.me.velocity[:2])
-        if "jumped" not in self.done:
+        if "jumped" not in self.done and _can_jump(window):
             self._lowest = min(self._lowest, place[2])
             if place[2] - self._lowest > JUMP_BLOCKS:
                 self.done["jumped"] = place[2] - self._lowest
@@ -96,3 +96,9 @@ class Script:
             self.done["in sight"] = len(view.figures)
             window.save(self._path)
             window.over = "the script has ended"
+
+
+def _can_jump(window: Window) -> bool:
+    scene = window.core.scene
+    assert scene is not None
+    return scene.gravity > 0 and scene.templates[scene.index_of[scene.player]].jump_speed > 0

@@ -19,6 +19,8 @@ from sovereign_netcode.play.iso import CHOICE, FIRST_KIND, Colour, Ground, Point
 SIZE = 1280, 800
 SKY = (122, 184, 232), (222, 240, 250)
 LAG_STEP_S, LAG_MAX_S = 0.05, 1.0
+CLOSED = "closed by the player"
+"""Why it is over when the player has ended it."""
 Wish = tuple[float, float, bool]
 """A direction (east, north), and whether to jump."""
 KEYS: dict[int, Point] = {
@@ -119,7 +121,7 @@ class Window:
         if lag_s is not None:
             self.lag(lag_s)
         elif event.type == pygame.QUIT or (event.type == pygame.KEYDOWN and event.key == pygame.K_ESCAPE):
-            self.over = "closed by the player"
+            self.over = CLOSED
         elif event.type == pygame.KEYDOWN:
             if event.key == pygame.K_g:
                 self.ghost = not self.ghost

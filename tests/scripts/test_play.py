@@ -2,6 +2,7 @@
 
 import os
 import random
+import signal
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -12,11 +13,13 @@ import pytest
 
 from client_sdk.client import Client
 from client_sdk.linked import LinkedCore
+from server.rules import Rules
 from shared import kernels
 from shared.blocks import Blocks
 from shared.inputs import NEUTRAL, Input
-from shared.scene import load_scene
+from shared.scene import SCENES, load_scene
 from shared.world import World
+from tests.e2e.processes import END_S, START_S, until
 from tests.match import Match, Player
 from tests.match import Path as Line
 
@@ -27,8 +30,9 @@ os.environ["PYGAME_HIDE_SUPPORT_PROMPT"] = "1"
 
 import pygame  # noqa: E402
 
+from sovereign_netcode.examples.freeze import Freeze  # noqa: E402
 from sovereign_netcode.examples.tag import Tag  # noqa: E402
-from sovereign_netcode.play import iso  # noqa: E402
+from sovereign_netcode.play import app, iso, own_server  # noqa: E402
 from sovereign_netcode.play.window import SIZE, Window, keyboard  # noqa: E402
 
 
@@ -113,10 +117,10 @@ class Idle:
 
 
 class Session:
-    """A window on a player of a match of tag."""
+    """A window on a player of a match, by default of tag."""
 
-    def __init__(self, latency_s: float = 0.01) -> None:
-        self.match = Match(load_scene("meadow"), 5, rules=Tag())
+    def __init__(self, latency_s: float = 0.01, scene: str = "meadow", rules: Rules | None = None) -> None:
+        self.match = Match(load_scene(scene), 5, rules=rules or Tag())
         self.core = LinkedCore("Ann")
         self.player: Player = self.match.join(self._wish, Line(latency_s), self.core)
         self.window = Window(Client(self.core, Idle()), keyboard, "Tag")
@@ -215,6 +219,45 @@ def test_the_latency_of_the_keys_is_as_much_as_they_say() -> None:
     assert core.state == "playing"
     assert 0.22 <= core.clock.rtt_s < 0.225
     assert core.stats.corrections == 0
+
+
+@pytest.mark.parametrize("make", [Rules, Tag, Freeze])
+@pytest.mark.parametrize("scene", sorted(path.stem for path in SCENES.glob("*.toml")))
+def test_every_game_is_drawn_in_every_scene(scene: str, make: type[Rules]) -> None:
+    session = Session(scene=scene, rules=make())
+    assert session.core.state == "playing"
+    assert {actor.figure.entity for actor in session.window.actors} == set(session.match.game.stage.entities())
+    assert session.colours() > 200
+    assert session.match.game.counters.rules_failed == 0
+
+
+@pytest.mark.parametrize("driver", ["dummy", "offscreen", "no_such_driver"])
+def test_without_a_display_nothing_is_started_and_the_exit_code_says_so(
+    driver: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pygame.display.quit()
+    monkeypatch.setenv("SDL_VIDEODRIVER", driver)
+    monkeypatch.setattr(own_server, "process", lambda *command: pytest.fail(f"{command} was started"))
+    monkeypatch.setattr(signal, "signal", lambda number, handler: None)
+    assert app.main([]) == app.main(["--url", "ws://127.0.0.1:1"]) == 1
+    told = capsys.readouterr()
+    assert told.out == ""
+    assert len(told.err.splitlines()) == 2
+    assert all(line.startswith("error: no display to open a window on (") for line in told.err.splitlines())
+
+
+@pytest.mark.e2e
+@pytest.mark.skipif(sys.platform != "linux", reason="looks for processes in /proc")
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_the_end_of_the_window_is_the_end_of_its_server_and_bots(number: signal.Signals, tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "sovereign_netcode.play", "--script-demo", str(tmp_path / "out.png")]
+    with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL) as process:
+        children = Path(f"/proc/{process.pid}/task/{process.pid}/children")
+        until(lambda: len(children.read_text().split()) == 2, START_S)  # a server and a process of bots
+        started = children.read_text().split()
+        process.send_signal(number)
+        assert process.wait(END_S) == 0
+    assert not [pid for pid in started if Path(f"/proc/{pid}").exists()]
 
 
 @pytest.mark.e2e
