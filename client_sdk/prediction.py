@@ -202,7 +202,7 @@ class Prediction:
         newest = self.predicted.tick
         tick = min(math.floor(at), newest - 1)
         last, after = newest, self.predicted.state(entity)
-        for later in range(tick + 1, newest):
+        for later in range(max(tick + 1, newest - self._states.size), newest):
             if (state := self._state(entity, later)) is not None:
                 last, after = later, state
                 break
