@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from shared.bounds import bounds
 from shared.checks import Cell
 from shared.layout import FALLING, FLAGS, ID, Int64s, X
 from shared.messages import ProtocolError, Snapshot
@@ -16,8 +17,6 @@ from shared.snapshot import ACTED, KEYFRAME, PLACED, SegmentPart, checksum, deco
 from shared.units import SEGMENT, TO_SEGMENT
 from shared.world import World
 
-FOLLOW_MAX = 64
-"""After more ticks without a snapshot, everything is sent anew."""
 NEAR_BLOCKS = 5.0
 """An edit this near may explain a correction."""
 
@@ -36,8 +35,9 @@ class Confirmed:
         self.terrain_changed = self.edited_near = False
         """Whether blocks have changed, and whether any near the own entity; whoever has seen to that takes it back."""
         self._templates = len(scene.templates)
+        self.follow_max = bounds(scene.tick_rate).history  # after more ticks, everything is sent anew
         self._exist = frozenset(scene.segments())
-        self.placed: Ring[frozenset[int]] = Ring(FOLLOW_MAX)
+        self.placed: Ring[frozenset[int]] = Ring(self.follow_max)
         """The entities that the server's rules placed before a snapshot and after the one before it, by its tick."""
         self._acted: set[int] = set()
         self._coming: Cell | None = None
@@ -92,7 +92,7 @@ class Confirmed:
             if segment in world.blocks and not len(world.in_segment(segment)):
                 world.unload_segment(segment)
                 self.terrain_changed = True
-        there = world.follow(turns, min(ticks, FOLLOW_MAX), snapshot.tick)
+        there = world.follow(turns, min(ticks, self.follow_max), snapshot.tick)
         self.states = world.states()
         for part in parts:
             if part.check and part.segment in world.blocks and checksum(world, part.segment) != part.check:

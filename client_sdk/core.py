@@ -20,7 +20,7 @@ from client_sdk.comeback import Comeback
 from client_sdk.events import Disconnected, Event, Happened, Joined, Left, Resumed, SegmentLoaded
 from client_sdk.orders import Orders
 from client_sdk.picture import NOTHING, View
-from client_sdk.play import Play
+from client_sdk.play import RECONNECTED, Play
 from client_sdk.prediction import Prediction
 from client_sdk.replica import Replica
 from client_sdk.stats import Stats
@@ -195,6 +195,9 @@ class Core:
 
     def update(self, now: float) -> None:
         """Sends pings that are due, and predicts every tick whose time has come."""
+        if self._play and self.state != "closed":
+            for message in self._play.follow(now, online=self.state == "playing"):
+                self._send(message)
         if self._open and self._told_clock.due(now):
             self._send(messages.Ping(now, self.stats.corrections))
             self._pings.append(now)
@@ -247,7 +250,9 @@ class Core:
             case messages.Pong():
                 if message.sent in self._pings:  # anything else is no answer to a ping of ours
                     self._pings.remove(message.sent)
-                    self._told_clock.answered(message.sent, message.tick, now)
+                    self._stepped(self._told_clock.answered(message.sent, message.tick, now), now)
+                    if self._play:
+                        self._play.answered(message.sent)
             case messages.Terrain():
                 segment = self._welcomed(message).terrain(message)
                 if segment is not None:
@@ -298,6 +303,16 @@ class Core:
                 play.world.prediction.settle(answered.number, answered.done)
             self._events.append(answered)
         world.apply(snapshot)
+        self._stepped(world.clock.seen(snapshot.tick, now), now)
+
+    def _stepped(self, ticks: float, now: float) -> None:
+        """Follows a step of the time by which the server's messages go; 0: there was none."""
+        if not ticks:
+            return
+        self._pings.clear()  # their answers are about the time before
+        play = self._play
+        if play and play.world.clock is self._told_clock:
+            play.stepped(ticks, now)
 
     def _begin(self, world: Replica, now: float) -> None:
         """As much is known of the world as it takes to play in it: for the first time, or again."""
@@ -309,7 +324,7 @@ class Core:
             play = old
             play.world = world
         world.prediction.ahead = self._delay
-        play.restart(now)
+        play.restart(now, RECONNECTED)
         self.state = "playing"
         self.stats.reconnects += old is not None
         tick, away_s = world.prediction.predicted.tick, self.comeback.away_s(now)

@@ -93,11 +93,21 @@ class Diverged:
 
 @dataclass(frozen=True)
 class Resynchronised:
-    """Prediction was given up for a while (a long silence, a suspended program), and has begun anew at `tick`: no input
-    was sent for the ticks that it skipped."""
+    """Prediction has begun anew at `tick`, `ticks_skipped` further than it was.
+
+    For skipped ticks no input was sent; where the number is negative, inputs sent for ticks that have not come yet are
+    withdrawn and sent anew. `cause` is one of:
+
+    - "program paused": the program did not call `update` for too long;
+    - "server behind": the server's time is behind what it was: the server stood still (or this computer's clock leapt);
+    - "server ahead": the server's time is ahead of what it was: this program's clock stood still;
+    - "path changed": inputs take much more or less time to the server than before;
+    - "reconnected": the connection was lost, and play goes on.
+    """
 
     tick: int
     ticks_skipped: int
+    cause: str = ""
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,8 @@
 """Where the others are drawn: between two confirmed snapshots, a little in the past.
 
-The delay rises at once by what was missing when a snapshot came late, and falls slowly once all is well again.
+The delay rises at once by what was missing when a snapshot came late. Once all is well again it falls: slowly while it
+is short, since paths that stall do so time and again, and the faster the further it is above `LONG_S`. Motion that is
+shown late then looks up to twice as fast, but never jumps or goes back.
 
 What the rules do takes effect at the tick of the snapshot that tells of it, and no sooner: until then an entity that
 they placed is drawn where it was, one that they removed is still drawn, one that they changed looks as before, and one
@@ -17,11 +19,17 @@ import numpy.typing as npt
 from shared.layout import ID, VX, Int64s, X
 from shared.units import BLOCK, SPEED
 
-KEPT = 96
+KEPT_S, KEPT_MIN = 3.0, 16
+"""Confirmed states are kept for this long, in seconds, and at least so many."""
 EXTRAPOLATE_S = 0.1
 """Bound on the time beyond the newest snapshot that is drawn; it is also less than one tick."""
 FALL_S_PER_S = 0.01
 CALM_S = 3.0
+"""The delay begins to fall after this long without a late snapshot, in seconds."""
+LONG_S = 0.2
+"""What the delay has above this, in seconds, falls at `LONG_FALL` seconds per second, and `LONG_SHARE` of itself more,
+after `LONG_CALM_S`; at most at `FALL_MAX`."""
+LONG_FALL, LONG_SHARE, LONG_CALM_S, FALL_MAX = 0.05, 0.5, 1.0, 1.0
 
 Positions = npt.NDArray[np.float64]
 Entry = tuple[int, Int64s, frozenset[int]]
@@ -33,7 +41,7 @@ class Interpolation:
 
     def __init__(self, rate: float) -> None:
         self._rate = rate
-        self._states: deque[Entry] = deque(maxlen=KEPT)
+        self._states: deque[Entry] = deque(maxlen=max(math.ceil(KEPT_S * rate), KEPT_MIN))
         self.delay_ticks = 2.0
         self._calm_since = self._at = -math.inf
 
@@ -57,10 +65,21 @@ class Interpolation:
         if short > 0:
             self.delay_ticks += short
             self._calm_since = now
-        elif now - self._calm_since > CALM_S:
-            fall = min((now - self._at) * FALL_S_PER_S * self._rate, -short)
-            self.delay_ticks = max(1.0, self.delay_ticks - max(fall, 0.0))
+        elif (fall := self._fall(now - self._calm_since)) > 0:
+            self.delay_ticks = max(1.0, self.delay_ticks - max(min((now - self._at) * fall * self._rate, -short), 0.0))
         self._at = now
+
+    def _fall(self, calm_s: float) -> float:
+        """How fast the delay falls after so much calm, in seconds per second."""
+        long_s = self.delay_ticks / self._rate - LONG_S
+        if long_s > 0 and calm_s > LONG_CALM_S:
+            return min(LONG_FALL + LONG_SHARE * long_s, FALL_MAX)
+        return FALL_S_PER_S if calm_s > CALM_S else 0.0
+
+    def shift(self, ticks: float) -> None:
+        """The server's time has stepped by so many ticks. What is shown does not go back for it."""
+        if ticks < 0:
+            self.delay_ticks = max(self.delay_ticks + ticks, 1.0)
 
     def shown(self, server_tick: float) -> float:
         """The moment that is drawn, as a tick: no earlier than the history, less than a tick beyond it."""

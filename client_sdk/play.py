@@ -12,32 +12,35 @@ import math
 from collections import deque
 from struct import iter_unpack
 
-from client_sdk.clock import PricedLead, Timeline
+from client_sdk.clock import PricedLead, Timeline, jump_ticks
 from client_sdk.events import Diverged, Event, Resynchronised
 from client_sdk.picture import View
 from client_sdk.prediction import NONDETERMINISM, NOTHING
 from client_sdk.replica import Replica
 from client_sdk.stats import Stats
+from shared.bounds import AHEAD_S, bounds
 from shared.inputs import Input, row
 from shared.messages import (
     IDLE,
-    INPUT_ROWS_MAX,
-    MARGIN_ONE,
     MARGIN_REFUSED,
     NEUTRALISED,
     REPEATED,
     USED,
     Inputs,
     Message,
+    Restart,
     Resync,
     Snapshot,
 )
 from shared.ring import Ring
 
-TICKS_PER_UPDATE_MAX = 16
-"""A program that was away for longer does not catch up tick by tick: it begins anew. No message has more inputs."""
-UNCONFIRMED_MAX = 96
-"""So many ticks beyond the newest snapshot, prediction waits."""
+ROWS_MAX = 16
+"""Most inputs in one message."""
+LEAD_S_MAX = AHEAD_S
+"""A timeline that is certainly further ahead than this, in seconds, starts anew: the server refuses what it sends."""
+PAUSED, SILENT, BEHIND, AHEAD = "program paused", "server silent", "server behind", "server ahead"
+PATH, RECONNECTED = "path changed", "reconnected"
+"""Causes of `Resynchronised`."""
 
 
 class Play:
@@ -56,20 +59,65 @@ class Play:
         """The tick of the last view of others; of the last update, where nothing is drawn."""
         self._draws = False
         self._late = False
-        self._phases: Ring[float] = Ring(256)
+        self._silent = False
+        self._settling: float | None = None
+        self._settled = False
+        self._step = self._stepped = 0.0
+        self._bounds = bounds(world.scene.tick_rate)
+        self._phases: Ring[float] = Ring(self._bounds.predicted)
+        self._out: list[Message] = []
         self._stats, self._events = stats, events
 
-    def restart(self, now: float) -> None:
-        """Begins the prediction at the timeline's tick."""
+    def restart(self, now: float, cause: str) -> None:
+        """Begins the prediction at the timeline's tick.
+
+        Args:
+            cause: see `Resynchronised`.
+        """
         prediction = self.world.prediction
         confirmed = prediction.confirmed.tick
         # Bounded, whatever the server says of its time: all ticks since the confirmed one are replayed here.
-        tick = min(max(math.floor(self.timeline.tick(now)), confirmed, self.newest), confirmed + UNCONFIRMED_MAX)
+        end = confirmed + self._bounds.unconfirmed
+        tick = min(max(math.floor(self.timeline.tick(now)), confirmed), end)
+        if tick < self.newest and cause == RECONNECTED:
+            tick = min(self.newest, end)
+        elif tick < self.newest:
+            self._out.append(Restart(tick + 1))
+            self._phases = Ring(self._bounds.predicted)
+            self._settling = now
         if prediction.begun:
             self._stats.resyncs += 1
-            self._events.append(Resynchronised(tick, tick - self.newest))
+            self._events.append(Resynchronised(tick, tick - self.newest, cause))
         self.newest = tick
         prediction.begin(max(tick - prediction.ahead, confirmed))
+
+    def stepped(self, ticks: float, now: float) -> None:
+        """Takes notice of a step of the server's time, by so many ticks; the next update follows it.
+
+        Until a ping sent after the step is answered, margins are about inputs from before it, and teach nothing.
+        """
+        self._step += ticks
+        self._settling = now
+        self.world.picture.interpolation.shift(ticks)
+
+    def follow(self, now: float, *, online: bool) -> list[Message]:
+        """Follows the steps of the server's time since the last call. Returns what to send, ahead of any ping."""
+        ticks, self._step = self._step, 0.0
+        if not ticks:
+            return []
+        timeline = self.timeline
+        before, timeline.phase = timeline.phase, self._lead.step(self.world.clock) + timeline.own
+        self._settling = now
+        self._stepped += timeline.phase - before  # small steps in a row, of a server that stands still, come to a jump
+        if online and abs(self._stepped) > jump_ticks(timeline.rate):
+            self._stepped = 0.0
+            self.restart(now, BEHIND if ticks < 0 else AHEAD)
+        return self._outgoing()
+
+    def answered(self, sent: float) -> None:
+        """A ping sent at `sent` has been answered, so the server knows what went before it."""
+        if self._settling is not None and sent > self._settling:
+            self._settling, self._settled = None, True
 
     def update(self, now: float, wish: Input, *, online: bool) -> list[Message]:
         """Predicts every tick whose time has come, with `wish`; what to send.
@@ -91,16 +139,18 @@ class Play:
         if not online:
             return []
         # Steered only now: a tick that was due, and for which the program woke up, is not put off by a moment.
-        if self.timeline.steer(self._lead, clock, now):
-            self.restart(now)
+        if self.timeline.steer(self._lead, clock, now) or self._out_of_bounds(now):
+            self.restart(now, PATH)
+            messages += self._outgoing()
         if alarm:
             messages.insert(0, Resync())
         return messages
 
     def next_tick(self, now: float) -> float:
         """The local time at which there is one to predict; inf: not before something has come in."""
-        end, to = self.world.prediction.confirmed.tick + UNCONFIRMED_MAX, math.floor(self.timeline.tick(now))
-        waits = self.newest >= end or (to - self.newest > TICKS_PER_UPDATE_MAX and to > end)
+        limits = self._bounds
+        end, to = self.world.prediction.confirmed.tick + limits.unconfirmed, math.floor(self.timeline.tick(now))
+        waits = self.newest >= end or (to - self.newest > limits.update and to > end)
         return math.inf if waits else self.timeline.when(self.newest + 1)
 
     def view(self, now: float) -> View:
@@ -112,15 +162,19 @@ class Play:
     def learn(self, snapshot: Snapshot, now: float) -> None:
         """How the inputs fared: feeds the lead, and tells whether any of these ticks lacked its own."""
         stats, phases, margins, fates = self._stats, self._phases, snapshot.margins, snapshot.fates
+        one = self._bounds.margin_one
         for tick, (margin,) in enumerate(iter_unpack("<h", margins), snapshot.newest + 1 - len(margins) // 2):
             phase = phases.get(tick)
             if phase is None:
                 continue  # a tick that was left out
-            if margin == MARGIN_REFUSED:
+            if margin == MARGIN_REFUSED:  # it came at least so early
                 stats.inputs_refused += 1
-                continue
+                margin = math.floor(self._bounds.ahead * one)
             stats.inputs_late += margin < 0
-            self._lead.observe(tick, margin / MARGIN_ONE, phase, now)
+            if self._settling is None:
+                self._lead.observe(tick, margin / one, phase, now)
+        if self._settling is not None or self._settled:  # the server may have used inputs that are withdrawn
+            self._late, self._settled = True, False
         if fates.count(USED) == len(fates):
             return
         neutralised = fates.count(NEUTRALISED)
@@ -135,15 +189,30 @@ class Play:
     def unheard(self) -> list[Message]:
         """The inputs that the server may still want, after a lost connection."""
         prediction, newest = self.world.prediction, self.newest
-        since = max(self.world.heard, prediction.confirmed.tick, newest - INPUT_ROWS_MAX)
+        since = max(self.world.heard, prediction.confirmed.tick, newest - self._bounds.ahead)
         return [
             Inputs(
                 first + 1,
                 prediction.confirmed.tick,
-                prediction.rows_since(first, min(first + TICKS_PER_UPDATE_MAX, newest)),
+                prediction.rows_since(first, min(first + ROWS_MAX, newest)),
             )
-            for first in range(since, newest, TICKS_PER_UPDATE_MAX)
+            for first in range(since, newest, ROWS_MAX)
         ]
+
+    def _outgoing(self) -> list[Message]:
+        """What a restart has to send."""
+        out, self._out = self._out, []
+        return out
+
+    def _out_of_bounds(self, now: float) -> bool:
+        """Puts the timeline where it began if it is so far off that no input counts. Returns whether it was."""
+        clock, timeline = self.world.clock, self.timeline
+        reached = self.world.prediction.confirmed.tick - timeline.rate * now
+        if reached <= timeline.phase <= clock.phase + (LEAD_S_MAX + clock.rtt_s / 2) * timeline.rate:
+            return False
+        self._lead = PricedLead()
+        timeline.phase = max(self._lead.start(clock, now), reached + clock.rtt_s / 2 * timeline.rate) + timeline.own
+        return True
 
     def _reconcile(self, now: float) -> bool:
         """Compares the prediction with the newest snapshot, once per update, however many have come; whether the
@@ -171,24 +240,30 @@ class Play:
         """Files the wish for every tick up to now, and predicts up to there but for the input delay; what to send."""
         prediction, timeline, stats = self.world.prediction, self.timeline, self._stats
         confirmed, to = prediction.confirmed.tick, math.floor(timeline.tick(now))
-        if to - self.newest > TICKS_PER_UPDATE_MAX:
-            if to - confirmed <= UNCONFIRMED_MAX:
-                self.restart(now)
+        end = confirmed + self._bounds.unconfirmed
+        if to - self.newest > self._bounds.update:
+            if to <= end:
+                self.restart(now, SILENT if self._silent else PAUSED)
             return []
         inputs: list[Message] = []
-        to = min(to, confirmed + UNCONFIRMED_MAX)
-        first = max(self.newest, confirmed) + 1  # an input for the past would only be late
+        self._silent = to > end
+        to = min(to, end)
+        first = self.newest + 1  # an input for the past is sent, too: its margin says how much earlier it should be
         self.newest = max(to, first - 1)
         if to >= first:
             clock, phase = self.world.clock, timeline.phase
+            timeline.made(timeline.tick(now) - first, now)
             for tick in range(first, to + 1):
                 prediction.file(tick, wish)
-                self._phases.put(tick, phase)
+                # How late the program itself was with it is no need of the path.
+                self._phases.put(tick, phase - (timeline.tick(now) - tick) if timeline.own else phase)
             stats.inputs_sent += to + 1 - first
             stats.rtt_s = clock.rtt_s
             stats.lead_ticks = phase - clock.phase
             stats.lead_s = stats.lead_ticks / clock.rate
-            inputs.append(Inputs(first, confirmed, row(wish) * (to + 1 - first)))
+            inputs += [
+                Inputs(at, confirmed, row(wish) * min(to + 1 - at, ROWS_MAX)) for at in range(first, to + 1, ROWS_MAX)
+            ]
         while prediction.predicted.tick < self.newest - prediction.ahead:
             prediction.step()
         return inputs

@@ -22,19 +22,17 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from client_sdk.confirmed import FOLLOW_MAX, Confirmed
+from client_sdk.confirmed import Confirmed
 from client_sdk.events import Corrected
 from shared import bulk, edits, kernels
+from shared.bounds import bounds
 from shared.edits import Edit
 from shared.inputs import NEUTRAL, Input, row
 from shared.layout import COLUMNS, ID, Int64s, X
-from shared.messages import REPEATS_MAX
 from shared.ring import Ring
 from shared.units import BLOCK
 from shared.world import World
 
-HISTORY = 256
-"""Ticks for which predictions and inputs are kept."""
 MEET_BLOCKS = 12
 """Whoever is further away cannot be met before a replay, at the speeds that legs have."""
 
@@ -86,8 +84,10 @@ class Prediction:
         self.attributes = known.attributes
         """What the game's rules say of the entities that are seen."""
         self.begun = False
-        self._inputs: Ring[Input] = Ring(HISTORY)
-        self._states: Ring[Int64s] = Ring(HISTORY)
+        limits = bounds(known.world.scene.tick_rate)
+        self._repeats = limits.repeats
+        self._inputs: Ring[Input] = Ring(limits.predicted)
+        self._states: Ring[Int64s] = Ring(limits.predicted)
         templates = known.world.scene.templates
         compiled = known.world.compiled
         ahead = np.array([template.shown == "predicted" for template in templates], np.int64)
@@ -128,7 +128,7 @@ class Prediction:
 
     def _wish(self, tick: int) -> Input:
         """The own input of a tick; where none was sent, what the server puts in its place."""
-        for before in range(tick, tick - REPEATS_MAX - 1, -1):
+        for before in range(tick, tick - self._repeats - 1, -1):
             wish = self._inputs.get(before)
             if wish is not None:
                 return wish
@@ -215,7 +215,7 @@ class Prediction:
 
     def _placed(self, since: int, to: int) -> frozenset[int]:
         """The entities that the server's rules placed after the tick `since` and up to `to`."""
-        ticks = range(max(since, to - FOLLOW_MAX) + 1, to + 1)
+        ticks = range(max(since, to - self.known.follow_max) + 1, to + 1)
         return frozenset().union(*(ids for tick in ticks if (ids := self.known.placed.get(tick))))
 
     def _state(self, entity: int, tick: int) -> State | None:

@@ -8,10 +8,9 @@ from server.limits import Limits
 from server.rules import Rules
 from server.session import Player, Session
 from shared import edits, messages
+from shared.bounds import bounds
 from shared.messages import (
-    AHEAD_MAX,
     COMMAND_MAX,
-    FATES_MAX,
     Command,
     Hello,
     Inputs,
@@ -153,14 +152,14 @@ class House:
         )
 
     def _check(self) -> None:
-        game, limits = self.game, self.game.limits
+        game, limits, bound = self.game, self.game.limits, bounds(self.game.scene.tick_rate)
         assert game.faults.total == 0
         assert game.counters.rules_failed == 0
         assert len(game.sessions) <= self.PLAYERS
         for player in game.players.values():
             assert len(player.commands) <= limits.commands_waiting_max
-            assert len(player.inputs._waiting) <= AHEAD_MAX
-            assert max(len(player.inputs.margins), len(player.inputs.fates)) <= FATES_MAX
+            assert len(player.inputs._waiting) <= bound.ahead
+            assert max(len(player.inputs.margins), len(player.inputs.fates)) <= bound.fates
             assert len(player.verdicts) <= 32 * limits.messages_per_tick * (1 + limits.stalled_s)
             assert len(player.tokens) <= 2
         for session in game.sessions:

@@ -48,6 +48,10 @@ class Rival:
         """As for `LeadController`."""
         return phase
 
+    def step(self, clock: ServerClock) -> float:
+        """As for `LeadController`; in the league no clock steps."""
+        return clock.phase + clock.rtt_s / 2 * self.rate
+
 
 class UnityN4E(Rival):
     """Netcode for Entities, `NetworkTimeSystem.cs` and `CommandReceiveSystem.cs`: closed loop on a mean.

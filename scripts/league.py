@@ -37,7 +37,7 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from client_sdk.clock import PRICE, SAFETY, STALL_S, LeadController, PricedLead, ServerClock, Timeline
+from client_sdk.clock import PRICE_S, SAFETY_S, STALL_S, LeadController, PricedLead, ServerClock, Timeline
 from client_sdk.links import PRESETS, Weather, Wire
 from controllers import RIVALS, Rival
 
@@ -283,8 +283,10 @@ def set_to(row: Row, ours: Row, minutes: float) -> float | None:
 
 def settings(preset: str) -> list[tuple[float, float, float]]:
     """Price in ticks, safety in ticks, longest stall in seconds: what ours is tried with, from careless to careful."""
-    found = [(price, SAFETY) for price in (3.0, 10.0, 30.0, 80.0, 600.0, 2000.0)]
-    found += [(PRICE, 0.08), (PRICE, 0.15)] + [(2000.0, safety) for safety in (0.3, 0.6, 1.0, 1.5, 2.0)]
+    ticks = [(price, SAFETY_S * RATE) for price in (3.0, 10.0, 30.0, 80.0, 600.0, 2000.0)]
+    ticks += [(PRICE_S * RATE, 0.08), (PRICE_S * RATE, 0.15)]
+    ticks += [(2000.0, safety) for safety in (0.3, 0.6, 1.0, 1.5, 2.0)]
+    found = [(price / RATE, safety / RATE) for price, safety in ticks]
     stalls = (STALL_S, LONG_S) if PRESETS[preset].spike else (STALL_S,)
     return [(*one, stall_s) for one in found for stall_s in stalls]
 

@@ -96,7 +96,7 @@ class Delivery:
 
     def _send_snapshot(self, session: Session, room: int) -> None:
         tick, inputs, sight = self._world.tick, session.inputs, session.sight
-        if sight.lost_track(tick):
+        if sight.lost_track(tick, self._log.history):
             self.forget(session)
         drops = np.array(sight.drops, "<i4").tobytes() if sight.drops else b""
         n, parts = sight.take(self._log, tick, room)

@@ -16,7 +16,7 @@ from server import keeping
 from server.counters import Counters
 from server.delivery import Delivery
 from server.faults import Faults
-from server.limits import Limits
+from server.limits import Limits, catch_up_ticks
 from server.orders import Orders
 from server.recorder import RecordedWorld, Saves
 from server.rewind import Rewind
@@ -25,6 +25,7 @@ from server.rules import Rules
 from server.session import Link, Session
 from server.stage import Stage
 from shared import messages
+from shared.bounds import in_ticks
 from shared.inputs import Input
 from shared.messages import (
     INPUT_ROW_BYTES,
@@ -35,6 +36,7 @@ from shared.messages import (
     Ping,
     Pong,
     ProtocolError,
+    Restart,
     Resync,
     Welcome,
     decode_from_client,
@@ -44,10 +46,11 @@ from shared.scene import Scene
 
 RESYNC_S = 1.0
 """A client may ask for everything anew so often."""
-BURST_TICKS = 32
-"""A client may send so many ticks' worth of messages at once, and as many more as the server itself is behind."""
+BURST_S, BURST_TICKS_MIN = 1.0, 32
+"""A client may send this many seconds' (at least this many ticks') worth of messages at once, and as many more as the
+server itself is behind."""
 AWAY_S = 1.0
-"""A tick that begins so late says nothing about the clients."""
+"""After a pause between two ticks of more than this many seconds, the clients' silence is not counted against them."""
 
 
 class Game:
@@ -84,7 +87,7 @@ class Game:
             world = RecordedWorld(scene, compiled=compiled)
             world.load_terrain()
         self.world = world
-        self.rewind = Rewind(self.world)
+        self.rewind = Rewind(self.world, self.limits.rewind_s)
         self.counters = Counters()
         kept = None
         if saves is not None and self.world.tick > 0:
@@ -100,6 +103,9 @@ class Game:
         self._authenticate = authenticate
         self.orders = Orders(self.world, self.stage, self.limits, self.faults, saves)
         self._deadline: float | None = None
+        self._ticked: float | None = None
+        self._catch_up = catch_up_ticks(scene.tick_rate)
+        self._burst = in_ticks(BURST_S, scene.tick_rate, BURST_TICKS_MIN) * self.limits.messages_per_tick
         self._rules = scene.to_table()
 
     # -- what arrives is filed -----------------------------------------------------------------------------
@@ -116,7 +122,7 @@ class Game:
             return
         session.heard = now
         session.allowance -= 1
-        if session.allowance < -BURST_TICKS * self.limits.messages_per_tick and not self._owes(session, now):
+        if session.allowance < -self._burst and not self._owes(session, now):
             self._kick(session, messages.MALFORMED, "too many messages")
             return
         if len(data) > self.limits.message_bytes_max:
@@ -150,6 +156,8 @@ class Game:
                 session.resynced_at = now
                 self.counters.resyncs += 1
                 self.delivery.forget(session)
+        elif isinstance(message, Restart) and session.entity:
+            session.inputs.restart(message.tick)
         elif isinstance(message, Bye):
             self.roster.dismiss(session)
             session.close(messages.GOING_AWAY, "goodbye")
@@ -177,8 +185,8 @@ class Game:
 
     def tick(self, deadline: float, now: float) -> None:
         """One tick. `deadline`: the time it was due, by the same clock as `now`; it ends tick T at `deadline`."""
-        self._deadline = deadline
-        self._excuse(deadline, now)
+        self._excuse(now)
+        self._deadline, self._ticked = deadline, now
         self.stage.start()
         self.roster.leave(now)
         self._join()
@@ -194,12 +202,15 @@ class Game:
         self._send(now)
         self._check_clocks(now)
 
-    def _excuse(self, deadline: float, now: float) -> None:
+    def _excuse(self, now: float) -> None:
         """The time in which the server itself had no turn (it was suspended) is counted against nobody."""
-        if now - deadline > AWAY_S:
+        paused_s = 0.0 if self._ticked is None else now - self._ticked - 1 / self.scene.tick_rate
+        if paused_s > AWAY_S:
+            credit = paused_s * self.scene.tick_rate * self.limits.messages_per_tick
             for session in self.sessions:
                 session.opened = session.heard = session.sent_at = now
-            self.roster.excuse(now - deadline, now)
+                session.allowance = min(session.allowance + credit, 0.0)
+            self.roster.excuse(paused_s, now)
 
     def _join(self) -> None:
         joining = [session for session in self.sessions if session.hello is not None and not session.closed]
@@ -241,7 +252,7 @@ class Game:
         for session in tuple(self.sessions):
             if session.allowance < 0:  # what exceeds the burst has been found excusable
                 most = self.limits.messages_per_tick
-                session.allowance = min(max(session.allowance, -BURST_TICKS * most) + most, 0.0)
+                session.allowance = min(max(session.allowance, -self._burst) + most, 0.0)
             if session.entity and not session.closed:
                 try:
                     self.stage.tell(session)
@@ -279,14 +290,19 @@ class Game:
 
     def _owes(self, session: Session, now: float) -> bool:
         """Whether ticks that are late explain how much a session has sent since the latest."""
-        behind = max(-self._ticks_left(now), 0.0)
-        return session.allowance >= -(BURST_TICKS + behind) * self.limits.messages_per_tick
+        behind = 0.0 if self._ticked is None else max((now - self._ticked) * self.scene.tick_rate - 1, 0.0)
+        return session.allowance >= -self._burst - behind * self.limits.messages_per_tick
 
     def _ticks_left(self, now: float) -> float:
-        """Ticks until the next tick's deadline."""
+        """Ticks until the next tick's deadline; negative if it has passed.
+
+        Of more missed ticks than are caught up on, the schedule drops the earliest: they do not count as time here, or
+        every client would be told of a time that never comes.
+        """
         if self._deadline is None:
             return 1.0
-        return 1.0 - (now - self._deadline) * self.scene.tick_rate
+        passed = (now - self._deadline) * self.scene.tick_rate
+        return 1.0 - passed if passed < self._catch_up + 1 else 1.0 - self._catch_up - passed % 1.0
 
     def _hello(self, session: Session, hello: Hello, now: float) -> None:
         if hello.version != messages.VERSION:

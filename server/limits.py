@@ -3,9 +3,17 @@
 from dataclasses import dataclass
 
 from server.kinds import Kind, setting
+from shared.bounds import in_ticks
 from shared.messages import CLIENT_MESSAGE_MAX, INPUT_ROWS_MAX, NAME_MAX
 
 HOUR_S = 3600.0
+CATCH_UP_S, CATCH_UP_TICKS_MIN = 0.125, 4
+"""After a pause, at most this many seconds' worth of ticks (at least this many) run at once; the rest is dropped."""
+
+
+def catch_up_ticks(rate: int) -> int:
+    """Returns the most ticks that run in a row to catch up with the schedule."""
+    return in_ticks(CATCH_UP_S, rate, CATCH_UP_TICKS_MIN)
 
 
 @dataclass(frozen=True)
@@ -33,6 +41,9 @@ class Limits:
     )
     resume_s: float = setting(
         15.0, Kind(float, "a player whose connection is lost keeps the entity for so long", "S", 0.0, HOUR_S)
+    )
+    rewind_s: float = setting(
+        0.5, Kind(float, "how far back the rules may look for a shot (lag compensation)", "S", 0.05, 1.0)
     )
     message_bytes_max: int = setting(
         CLIENT_MESSAGE_MAX, Kind(int, "longest message of a client, in bytes", "BYTES", 512, CLIENT_MESSAGE_MAX)

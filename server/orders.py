@@ -11,7 +11,8 @@ from server.recorder import RecordedWorld, Saves
 from server.session import Player
 from server.stage import Stage
 from shared import edits, messages
-from shared.messages import AHEAD_MAX, Command
+from shared.bounds import bounds
+from shared.messages import Command
 
 
 class Orders:
@@ -25,6 +26,7 @@ class Orders:
         self, world: RecordedWorld, stage: Stage, limits: Limits, faults: Faults, saves: Saves | None = None
     ) -> None:
         self._world, self._stage, self._limits, self._faults, self._saves = world, stage, limits, faults, saves
+        self._ahead = bounds(world.scene.tick_rate).ahead
         self._unanswered: deque[tuple[int, Player, int, int]] = deque()
         """Verdicts that are not on disk yet: tick, player, number, verdict."""
 
@@ -45,7 +47,7 @@ class Orders:
                 player.verdicts.append((command.number, player.settled[command.number]))
             return
         player.command = command.number
-        if len(player.commands) >= self._limits.commands_waiting_max or command.tick > self._world.tick + AHEAD_MAX:
+        if len(player.commands) >= self._limits.commands_waiting_max or command.tick > self._world.tick + self._ahead:
             player.settle(command.number, messages.TOO_MANY)
         else:
             player.commands.append(command)

@@ -11,8 +11,8 @@ no queue has grown: with one, a path of 200 ms that loses 2 % of its packets get
 
 Where that holds back most snapshots for a second, it is no loss but the path that is narrow. Then the queue is of
 one's own making, and there should be none: one round trip and two ticks may be on the way when a snapshot is sent, and
-it may be as large as the path carries in four ticks. So a client gets small snapshots often, its own segment in each,
-instead of large ones rarely: at 30 kb/s for a view of 90, they are 0.28 s old instead of 0.56.
+it may be as large as the path carries in an eighth of a second. So a client gets small snapshots often, its own segment
+in each, instead of large ones rarely: at 30 kb/s for a view of 90, they are 0.28 s old instead of 0.56.
 
 The round trip is measured of snapshots before which nothing was on the way. Where that never happens because the
 path is full, sending pauses once a minute until it is empty, or a queue of one's own would pass for distance, and grow
@@ -41,12 +41,12 @@ STALL_RTTS = 3.0
 HOLD_S_MAX = 0.6
 """Three round trips are enough at this length; of longer ones one and a half."""
 LEAST_BYTES = 512
-HELD_TICKS = 32.0
-"""The share of ticks in which nothing could be sent is averaged over so many."""
+HELD_S = 1.0
+"""The share of ticks in which nothing could be sent is averaged over this long."""
 NARROW, WIDE = 0.5, 0.4
 """A path is narrow from this share on, until it is less than that."""
-NARROW_TICKS = 4.0
-"""On a narrow path, a snapshot may be as large as what it carries in so many ticks,"""
+NARROW_S = 0.125
+"""On a narrow path, a snapshot may be as large as what the path carries in this time,"""
 NARROW_BYTES = 96
 """or this."""
 
@@ -144,7 +144,7 @@ class Pacing:
         if held:
             self._full_at = now
         if held or self._held:
-            self._held += (held - self._held) / HELD_TICKS
+            self._held += (held - self._held) * min(tick_s / HELD_S, 1.0)
         return window
 
     def room(self, window: int) -> int:
@@ -168,7 +168,7 @@ class Pacing:
         self._narrow = self._held > (WIDE if self._narrow else NARROW)
         if self._narrow:
             self._carries = max(NARROW_BYTES, int(self.rate * (rtt_s + 2 * tick_s)))
-            self._portion = max(NARROW_BYTES, int(self.rate * NARROW_TICKS * tick_s))
+            self._portion = max(NARROW_BYTES, int(self.rate * NARROW_S))
         else:
             hold_s = min(STALL_RTTS * rtt_s, max(HOLD_S_MAX, 1.5 * rtt_s)) + tick_s
             self._carries = max(LEAST_BYTES, int(self.rate * hold_s))

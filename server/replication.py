@@ -2,8 +2,8 @@
 
 A client is sent what has happened since the last snapshot it was sent; an entity that goes on as it did, it takes on by
 itself (`shared.snapshot`). Most were sent the previous tick's, so one encoding serves them all; one that skipped some
-gets the whole states of those to which anything happened in those ticks; one that is more than `HISTORY` ticks behind,
-or has just begun to see the segment, gets a keyframe. Nothing is computed per entity and client.
+gets the whole states of those to which anything happened in those ticks; one that is further behind than changes are
+kept, or has just begun to see the segment, gets a keyframe. Nothing is computed per entity and client.
 """
 
 from collections import defaultdict
@@ -15,6 +15,7 @@ import msgpack
 
 from server.faults import Faults
 from shared.blocks import offset_of, pack, segment_of
+from shared.bounds import bounds, in_ticks
 from shared.checks import Cell
 from shared.layout import ID, X
 from shared.ring import Ring
@@ -22,8 +23,6 @@ from shared.snapshot import KEYFRAME, News, checksum, encode_part, encode_rows, 
 from shared.units import TO_SEGMENT
 from shared.world import World
 
-HISTORY = 64
-"""Ticks for which changes are kept."""
 PACKS_PER_TICK = 8
 """So many segments are packed anew in a tick, 0.25 to 0.7 ms each: who joins where nobody was waits for terrain, not
 everybody for the tick."""
@@ -31,8 +30,8 @@ SAID_BYTES = 32 * 1024
 """So much of what the rules say of entities goes with a part: no message is too long. The rest follows a tick later."""
 SAID_FEW, SAID_ID_BYTES = 3, 9
 """So few entities fit anyhow. An id counts as so many bytes, more than it has: no list gets too long, either."""
-CHECK_TICKS = 32
-"""How often a segment in which something changes is sent with its checksum."""
+CHECK_S = 1.0
+"""How often a segment in which something changes is sent with its checksum, in seconds."""
 NO_NEWS = (b"", b"", b"")
 
 
@@ -106,7 +105,9 @@ class ChangeLog:
         self._world = world
         self._attributes = {} if attributes is None else attributes
         self._said: set[int] = set()
-        self._ticks: Ring[_Tick] = Ring(HISTORY)
+        self.history = bounds(world.scene.tick_rate).history
+        """Ticks for which changes are kept."""
+        self._ticks: Ring[_Tick] = Ring(self.history)
         self._now = _Tick()
         states = world.states()
         homes = (states[:, X : X + 3] >> TO_SEGMENT).tolist()
@@ -118,10 +119,10 @@ class ChangeLog:
         self._packs_left = PACKS_PER_TICK
         self._due: set[Cell] = set()
         """The segments that are to be sent with their checksums now."""
-        self._news = News(world, CHECK_TICKS)
+        self._news = News(world, in_ticks(CHECK_S, world.scene.tick_rate, 1))
         self._latest: dict[Cell, tuple[bytes, bytes, bytes]] | None = None
         """What happened in the newest tick, packed, by segment; until something is removed."""
-        self._placed_at = -HISTORY
+        self._placed_at = -self.history
         """The newest tick in which an entity was placed."""
 
     def segment(self, entity: int) -> Cell:
@@ -179,11 +180,11 @@ class ChangeLog:
         self._packs_left = PACKS_PER_TICK
 
     def since(self, since: int) -> Parts:
-        """Each segment's encoded changes after tick `since`, `KEYFRAME` or at most `HISTORY` ago; empty: none."""
+        """Each segment's encoded changes after tick `since`, `KEYFRAME` or at most `history` ago; empty: none."""
         parts = self._parts.get(since)
         if parts is None:
             newest = self._world.tick
-            assert since == KEYFRAME or newest - since <= HISTORY, "lost track"
+            assert since == KEYFRAME or newest - since <= self.history, "lost track"
             first = (newest if since == KEYFRAME else since) + 1  # a keyframe needs none of them
             ticks = [tick for at in range(first, newest + 1) if (tick := self._ticks.get(at)) is not None]
             more = set().union(*(tick.more() for tick in ticks))
@@ -221,9 +222,9 @@ class ChangeLog:
     def _placed_lately(self) -> set[int]:
         """Returns the entities placed within the history: a client may know one of them from where it was before."""
         newest = self._world.tick
-        if newest - self._placed_at >= HISTORY:
+        if newest - self._placed_at >= self.history:
             return set()
-        ticks = map(self._ticks.get, range(newest - HISTORY + 1, newest + 1))
+        ticks = map(self._ticks.get, range(newest - self.history + 1, newest + 1))
         return set().union(*(tick.placed for tick in ticks if tick is not None))
 
     def _changes(self, segment: Cell, since: int, known: Parts) -> bytes:

@@ -1,11 +1,11 @@
 """Lag compensation: what a player saw when acting, answered by the server a moment later.
 
 Theory of operation. A client draws everybody else a little in the past, between two ticks; by the time its shot is
-here, they are elsewhere. So the last 250 ms are kept, as what each tick has undone: for the rows of the world's
-matrix that the tick changed, what they held before, and likewise the blocks. A `Past` starts from the newest tick and
-takes those back, one after the other: that costs what has changed, and nothing for what sleeps. Between two ticks it
-is computed in the same floats as `client_sdk.interpolation`, so a target is exactly where its shooter drew it. Blocks
-are those of the tick before: what is edited in a tick is there when that tick is over.
+here, they are elsewhere. So the last half second is kept (`Limits.rewind_s`), as what each tick has undone: for the
+rows of the world's matrix that the tick changed, what they held before, and likewise the blocks. A `Past` starts from
+the newest tick and takes those back, one after the other: that costs what has changed, and nothing for what sleeps.
+Between two ticks it is computed in the same floats as `client_sdk.interpolation`, so a target is exactly where its
+shooter drew it. Blocks are those of the tick before: what is edited in a tick is there when that tick is over.
 
 What the rules do (place, remove, change, spawn) takes effect at the end of its tick: until then an entity that they
 placed is where it was. A client that was not sent every tick draws between two ticks that are further apart: its *gaps*
@@ -29,8 +29,8 @@ from shared.scene import Scene
 from shared.units import BLOCK, SEGMENT_SHIFT
 from shared.world import World
 
-WINDOW_S = 0.25
-"""Nobody's past is longer ago."""
+WINDOW_S = 0.5
+"""How far back a query may go by default, in seconds."""
 KEPT = [ID, TEMPLATE, X, X + 1, X + 2]
 """The columns that are kept of a row."""
 MARGIN = 1e-3
@@ -60,15 +60,16 @@ class _Undo(NamedTuple):
 
 
 class Rewind:
-    """The last 250 ms of one world. Record each tick once, after its step.
+    """The recent past of one world. Record each tick once, after its step.
 
     Args:
         world: stepped elsewhere.
+        window_s: how far back it goes, in seconds. It takes 48 bytes for each entity that a tick of it has changed.
     """
 
-    def __init__(self, world: World) -> None:
+    def __init__(self, world: World, window_s: float = WINDOW_S) -> None:
         self._world = world
-        self._reach = WINDOW_S * world.scene.tick_rate
+        self._reach = window_s * world.scene.tick_rate
         self._undo: deque[_Undo] = deque()
         self._placed_at = -math.inf
         """The newest tick in which an entity was placed."""
@@ -151,7 +152,7 @@ class Rewind:
 
 
 class Past:
-    """The world at one moment of the last 250 ms, for as long as no tick has passed since it was asked for.
+    """The world at one moment of the recent past, for as long as no tick has passed since it was asked for.
 
     `seen` is the moment that was granted, in ticks of the server.
     """

@@ -12,9 +12,10 @@ from server import keeping
 from server.counters import Counters
 from server.limits import Limits
 from server.recorder import RecordedWorld
-from server.session import Player, Session
+from server.session import InputQueue, Player, Session
 from server.spawning import Spawns
 from server.stage import Stage
+from shared.bounds import bounds
 from shared.messages import RESUME_BYTES
 
 UNHEARD_S = 2.0
@@ -28,8 +29,11 @@ class Roster:
         self.players: dict[int, Player] = stage.players
         """By entity, in the order in which they joined; also those whose connection is lost, for a while."""
         self._world, self._stage, self._limits, self._counters = world, stage, limits, counters
+        self._bounds = bounds(world.scene.tick_rate)
         self._spawns = Spawns(world)
         self._fallen: list[int] = []
+        for player in self.players.values():  # of a game that goes on
+            player.inputs = InputQueue(self._bounds)
 
     @property
     def connected(self) -> int:
@@ -42,7 +46,7 @@ class Roster:
         entity = self._spawns.spawn()
         if entity is None:
             return None
-        player = self.players[entity] = Player(entity, name, session.subject)
+        player = self.players[entity] = Player(entity, name, session.subject, self._bounds)
         player.edits_left = 0.0  # else leaving and joining anew would give a burst each time
         self._counters.joined += 1
         session.seat(player)

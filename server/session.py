@@ -10,18 +10,15 @@ from typing import Protocol
 
 from server.pacing import Pacing
 from server.sight import Sight
+from shared.bounds import Bounds, bounds
 from shared.checks import Cell
 from shared.inputs import NEUTRAL, Input, clamp
 from shared.messages import (
-    AHEAD_MAX,
-    FATES_MAX,
     IDLE,
     INPUT_ROW_BYTES,
-    MARGIN_ONE,
     MARGIN_REFUSED,
     NEUTRALISED,
     REPEATED,
-    REPEATS_MAX,
     USED,
     Command,
     Hello,
@@ -29,6 +26,7 @@ from shared.messages import (
 )
 
 INPUT_ROW = struct.Struct("<bbB")
+DEFAULT = bounds(32)
 SETTLED_MAX = 128
 assert sys.byteorder == "little", "margins lie in memory as they go over the wire"
 
@@ -54,15 +52,22 @@ def _wish(row: bytes) -> Input:
 
 
 class InputQueue:
-    """The inputs of one player: exactly one is taken per tick, and each one's fate is kept until it is told."""
+    """The inputs of one player: exactly one is taken per tick, and each one's fate is kept until it is sent.
 
-    def __init__(self) -> None:
-        self._waiting: dict[int, Input] = {}  # by tick, at most `AHEAD_MAX` ahead
+    Args:
+        bounds: those of the scene's tick rate.
+    """
+
+    def __init__(self, bounds: Bounds = DEFAULT) -> None:
+        self._bounds = bounds
+        self._margin_one = bounds.margin_one
+        self._waiting: dict[int, Input] = {}  # by tick, at most `bounds.ahead` ahead
         self._held = NEUTRAL  # the latest to arrive whose tick has come
         self._missing = 0  # ticks since anything has arrived
+        self._accepted = -1  # the newest tick of which an input was not refused
         self.first = self.newest = -1
         self.margins = array("h")
-        """As they go over the wire, up to that of `newest`; at most `FATES_MAX`, like the fates."""
+        """As they go over the wire, up to that of `newest`; at most `bounds.fates`, like the fates."""
         self.fates = bytearray()
         self.late = self.refused = self.used = self.substituted = 0
         self.wheel: Input | None = None
@@ -72,23 +77,40 @@ class InputQueue:
         """Takes a message at tick `tick`; the next tick's deadline is `ahead` ticks away."""
         at, _, rows = message
         for start in range(0, len(rows), INPUT_ROW_BYTES):
-            if at <= self.newest:  # a duplicate, or an order that TCP cannot produce
+            if at <= self._accepted:  # a duplicate, or an order that TCP cannot produce
                 self.refused += 1
             else:
-                if self.first < 0 or at > self.newest + 1:
+                if at <= self.newest:  # it was refused before, for coming too early
+                    self._forget(at)
+                elif self.first < 0 or at > self.newest + 1:
                     self._skipped(at)
                 self.newest = at
                 self.margins.append(self._filed(at, rows[start : start + INPUT_ROW_BYTES], tick, ahead))
             at += 1
-        if len(self.margins) > FATES_MAX:
-            del self.margins[:-FATES_MAX]
+        if len(self.margins) > self._bounds.fates:
+            del self.margins[: -self._bounds.fates]
+
+    def restart(self, at: int) -> None:
+        """Withdraws the inputs for tick `at` and later that have not been used: the client sends them anew."""
+        if self.first < 0 or at > self.newest:
+            return
+        for tick in [tick for tick in self._waiting if tick >= at]:
+            del self._waiting[tick]
+        self._accepted = min(self._accepted, at - 1)
+        self._forget(at)
+
+    def _forget(self, at: int) -> None:
+        """Counts margins off from tick `at - 1` again."""
+        del self.margins[max(len(self.margins) - (self.newest - at + 1), 0) :]
+        self.first, self.newest = min(self.first, at), at - 1
 
     def _filed(self, at: int, row: bytes, tick: int, ahead: float) -> int:
         """Files the input for the tick `at`; its margin."""
-        if at > tick + AHEAD_MAX:
+        if at > tick + self._bounds.ahead:
             self.refused += 1
             return MARGIN_REFUSED
-        margin = math.floor((at - tick - 1 + ahead) * MARGIN_ONE)
+        self._accepted = at
+        margin = math.floor((at - tick - 1 + ahead) * self._margin_one)
         if at > tick:
             self._waiting[at] = _wish(row)
         else:
@@ -102,7 +124,7 @@ class InputQueue:
         if self.first < 0:
             self.first = at
         else:
-            self.margins.extend([MARGIN_REFUSED] * min(at - self.newest - 1, FATES_MAX))
+            self.margins.extend([MARGIN_REFUSED] * min(at - self.newest - 1, self._bounds.fates))
 
     def take(self, tick: int) -> Input:
         """The input for a tick whose time has come."""
@@ -118,9 +140,9 @@ class InputQueue:
         else:
             self._missing += 1
             self.substituted += 1
-            fate = REPEATED if self._missing <= REPEATS_MAX else NEUTRALISED
+            fate = REPEATED if self._missing <= self._bounds.repeats else NEUTRALISED
         self.fates.append(fate)
-        if len(self.fates) > FATES_MAX:
+        if len(self.fates) > self._bounds.fates:
             del self.fates[0]
         return NEUTRAL if fate == NEUTRALISED else self._held
 
@@ -139,13 +161,14 @@ class Player:
         entity: the player's own.
         name: what it calls itself.
         subject: whose token it showed; empty where none is asked for.
+        bounds: those of the scene's tick rate.
     """
 
-    def __init__(self, entity: int, name: str = "", subject: str = "") -> None:
+    def __init__(self, entity: int, name: str = "", subject: str = "", bounds: Bounds = DEFAULT) -> None:
         self.entity = entity
         self.name = name
         self.subject = subject
-        self.inputs = InputQueue()
+        self.inputs = InputQueue(bounds)
         self.commands: deque[Command] = deque()
         """Those that wait for their tick."""
         self.command = -1

@@ -15,8 +15,9 @@ from server.kinds import Kind, Parser, SettingsError, checked, kinds_of, nearest
 from server.limits import Limits
 from server.log import FORMATS
 from server.tokens import KEY_VARIABLE
+from shared.bounds import TICK_RATE_MAX
 from shared.checks import SceneError
-from shared.scene import SCENES, TICK_RATE_MAX, load_scene
+from shared.scene import SCENES, load_scene
 from shared.units import SEGMENT
 
 ENV_PREFIX = "SOVEREIGN_"

@@ -8,7 +8,7 @@ a wall of bytes in front of the own position.
 """
 
 from server import interest
-from server.replication import HISTORY, ChangeLog
+from server.replication import ChangeLog
 from shared.checks import Cell
 from shared.snapshot import KEYFRAME
 
@@ -48,9 +48,9 @@ class Sight:
         self._behind.clear()
         self._tick = -1
 
-    def lost_track(self, tick: int) -> bool:
-        """Whether something waits for longer than its changes are kept."""
-        return self._tick >= 0 and self.waits(tick) > HISTORY
+    def lost_track(self, tick: int, history: int) -> bool:
+        """Whether something waits for longer than its changes are kept: `history` ticks."""
+        return self._tick >= 0 and self.waits(tick) > history
 
     def begun(self, segment: Cell) -> bool:
         """Whether a segment that is seen has been sent whole."""
@@ -81,7 +81,7 @@ class Sight:
         due = special | {segment: self._tick for segment in self.sees - special.keys() if known[segment]}
         parts = {segment: part for segment, since in due.items() if (part := log.since(since)[segment])}
         if sum(map(len, parts.values())) > room:
-            parts = self._urgent(parts, due, tick, room)
+            parts = self._urgent(parts, due, tick, log.history, room)
         if self._fresh or self.drops:
             self._knows = self._knows.difference(self.drops) | (self._fresh & parts.keys())
             self._fresh.difference_update(parts)
@@ -94,12 +94,14 @@ class Sight:
         self._tick = tick
         return len(parts), b"".join(parts.values())
 
-    def _urgent(self, parts: dict[Cell, bytes], due: dict[Cell, int], tick: int, room: int) -> dict[Cell, bytes]:
+    def _urgent(
+        self, parts: dict[Cell, bytes], due: dict[Cell, int], tick: int, history: int, room: int
+    ) -> dict[Cell, bytes]:
         """The parts that fit, in the order of urgency; at least the own segment and one more."""
         centre = self.near[0]
 
         def urgency(segment: Cell) -> float:
-            waits = tick - due[segment] if due[segment] != KEYFRAME else HISTORY
+            waits = tick - due[segment] if due[segment] != KEYFRAME else history
             return waits / (1 + 3 * interest.distance(segment, centre))
 
         order = sorted(parts, key=lambda segment: (segment != centre, -urgency(segment)))

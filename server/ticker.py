@@ -2,10 +2,10 @@
 
 Overrun policy. Ticks are due at `start + n / rate`, whatever became of the ones before, so nothing drifts. A tick
 whose time has passed runs at once, with one pass of the event loop between two of them, so that what has arrived
-meanwhile is taken in. If `CATCH_UP_MAX` ticks have run in a row without catching up, the deadlines that have passed
-are given up: the next tick is due at the next deadline to come, and what was left out is counted as skipped time.
-A server that was stopped for 3 s runs 4 ticks at once and goes on; one that is too slow for its rate is never more
-than about `CATCH_UP_MAX` ticks of work behind, and says so in `skipped_s`.
+meanwhile is taken in. At most `limits.catch_up_ticks` run in a row that way. Of more missed deadlines the earliest are
+dropped, before any of the row runs, and counted as skipped time: so the deadline that a tick is handed always says what
+time it is on the server. A server at 32 Hz that was stopped for 3 s runs 4 ticks at once and goes on; one that is too
+slow for its rate is never more than that behind, and says so in `skipped_s`.
 """
 
 import asyncio
@@ -19,9 +19,8 @@ from typing import Any, Protocol
 
 from server.faults import Faults
 from server.histogram import Histogram
+from server.limits import catch_up_ticks
 
-CATCH_UP_MAX = 4
-"""Ticks that run in a row before the schedule gives up what it has missed."""
 FAILURES_MAX = 10
 """So many ticks that raise in a row break the ticker."""
 
@@ -33,7 +32,10 @@ class Schedule:
         self.rate = rate
         self.start = start
         self.skipped = 0
-        """Ticks that were given up."""
+        """Ticks that were dropped."""
+        self.late_s = 0.0
+        """How long the latest tick taken had been due, before any were dropped."""
+        self._catch_up = catch_up_ticks(rate)
         self._slot = 0
         self._in_a_row = 0
 
@@ -53,24 +55,23 @@ class Schedule:
         if deadline > now:
             self._in_a_row = 0
             return None
+        self.late_s = now - deadline
+        self._drop(now, self._catch_up - self._in_a_row)
+        deadline = self.deadline
         self._slot += 1
-        self._in_a_row += 1
-        if self.deadline > now:
-            self._in_a_row = 0
-        elif self._in_a_row == CATCH_UP_MAX:
-            self._give_up(now)
+        self._in_a_row = self._in_a_row + 1 if self.deadline <= now else 0
         return deadline
 
-    def _give_up(self, now: float) -> None:
-        """Goes on at the first deadline after `now`."""
-        missed = self._slot
-        self._slot = max(self._slot, int((now - self.start) * self.rate))  # may be one off, either way
-        while self.start + (self._slot - 1) / self.rate > now:
-            self._slot -= 1
-        while self.deadline <= now:
-            self._slot += 1
-        self.skipped += self._slot - missed
-        self._in_a_row = 0
+    def _drop(self, now: float, keep: int) -> None:
+        """Drops the earliest of the deadlines that have passed, but for `keep` of them."""
+        to_come = max(self._slot, int((now - self.start) * self.rate))  # may be one off, either way
+        while self.start + (to_come - 1) / self.rate > now:
+            to_come -= 1
+        while self.start + to_come / self.rate <= now:
+            to_come += 1
+        dropped = max(to_come - self._slot - keep, 0)
+        self._slot += dropped
+        self.skipped += dropped
 
 
 class Alarm(Protocol):
@@ -215,8 +216,9 @@ class Ticker:
 
     def _run(self, deadline: float, now: float) -> None:
         self.latest = now
-        self.lateness.record(now - deadline)
-        if (now - deadline) * self._schedule.rate > 1:
+        late_s = self._schedule.late_s
+        self.lateness.record(late_s)
+        if late_s * self._schedule.rate > 1:
             self.ticks_late += 1
         try:
             self._tick(deadline, now)

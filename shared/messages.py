@@ -10,17 +10,18 @@ travels as packed little-endian records in a MessagePack `bin`.
       4 Bye      code reason wait                          19 Terrain   x y z offset total chunk
       5 Command  number tick seen name payload             20 Pong      sent tick
       6 Resync                                             21 Happened  tick name payload
-                                                           22 Shared    values
+      7 Restart  tick                                      22 Shared    values
                                                             4 Bye       code reason wait
 
     Inputs.rows    n * [i8 move_x, i8 move_y, u8 buttons], for the ticks first, first + 1, ...
-    Snapshot       the state at the end of `tick`; how early the client's inputs came (margins, n * i16 in 1/256
-                   tick, for the ticks up to `newest`); what became of those from `first` on (fates, n * u8); and of
+    Snapshot       the state at the end of `tick`; how early the client's inputs came (margins, n * i16 in 1/8192
+                   s, for the ticks up to `newest`); what became of those from `first` on (fates, n * u8); and of
                    its commands (verdicts, n * [u32 number, u8 verdict]); which segments it no longer sees (drops,
                    n * [i32 x, y, z]); then each segment in which anything changed (`shared.snapshot`).
     Terrain        a part of a packed segment (`shared.blocks.pack`), which is complete with byte `total`.
     Command        something to do at the start of `tick`; `seen` is the tick at which the client drew the others.
     Resync         the client has lost track: everything it sees, anew.
+    Restart        the client's time has been set: the inputs sent for `tick` and later are withdrawn, and come anew.
     Hello.token    proves who the client is, where the server asks for it. Hello.resume is the one of the latest
                    `Welcome`, to go on as the player that one was about.
     Happened       something that the game's rules tell, once. Its payload is MessagePack, as a command's.
@@ -38,6 +39,7 @@ from typing import Any, NamedTuple
 import msgpack
 
 from shared.blocks import PACKED_MAX
+from shared.bounds import FATES_S, TICK_RATE_MAX, in_ticks
 
 VERSION = 3
 
@@ -50,7 +52,8 @@ INPUT_ROW_BYTES = 3
 NAME_MAX = 32
 SCENE_FIELDS_MAX = 32
 REASON_MAX = 500
-FATES_MAX = 256
+FATES_MAX = in_ticks(FATES_S, TICK_RATE_MAX, 1)
+"""Most margins, and most input statuses, in one snapshot."""
 DROPS_MAX = 4096
 VERDICTS_MAX = 128
 COMMAND_MAX = (1 << 32) - 1
@@ -70,12 +73,6 @@ ENTITY_MAX = (1 << 31) - 1
 USED, REPEATED, NEUTRALISED, IDLE = range(4)
 """USED: the client's own input of that tick. REPEATED: it was missing, the latest to arrive was used again.
 NEUTRALISED: missing for so long that the entity stood still. IDLE: the client had not begun."""
-REPEATS_MAX = 10
-"""The latest input to arrive, be it late, stands in for missing ones for at most so many ticks."""
-AHEAD_MAX = 64
-"""An input for more than so many ticks from now is refused."""
-MARGIN_ONE = 256
-"""A margin of one tick."""
 MARGIN_REFUSED = -(1 << 15)
 """Stands for the margin of an input that was refused."""
 
@@ -138,6 +135,12 @@ class Command(NamedTuple):
 
 class Resync(NamedTuple):
     """The client's copy is damaged: it needs everything anew."""
+
+
+class Restart(NamedTuple):
+    """Withdraws the inputs for `tick` and later ticks that the server has not used yet; the client sends them anew."""
+
+    tick: int
 
 
 class Bye(NamedTuple):
@@ -206,7 +209,9 @@ class Shared(NamedTuple):
     values: dict[str, Any]
 
 
-Message = Hello | Inputs | Ping | Bye | Command | Resync | Welcome | Snapshot | Terrain | Pong | Happened | Shared
+Message = (
+    Hello | Inputs | Ping | Bye | Command | Resync | Restart | Welcome | Snapshot | Terrain | Pong | Happened | Shared
+)
 Check = Callable[[Any], bool]
 
 
@@ -257,6 +262,7 @@ KINDS: dict[int, tuple[type[Any], tuple[Check, ...]]] = {
     4: (Bye, (_whole(0, 4999), _text(REASON_MAX), _finite)),
     5: (Command, (_whole(0, COMMAND_MAX), _tick, _finite, _text(NAME_MAX), _bytes(PAYLOAD_MAX))),
     6: (Resync, ()),
+    7: (Restart, (_first,)),
     17: (
         Welcome,
         (_whole(0, 1 << 31), _tick, _whole(1, ENTITY_MAX), lambda value: type(value) is dict, _resume),
@@ -278,7 +284,7 @@ KINDS: dict[int, tuple[type[Any], tuple[Check, ...]]] = {
     21: (Happened, (_tick, _text(NAME_MAX), _bytes(PAYLOAD_MAX))),
     22: (Shared, (_named,)),
 }
-CLIENT_KINDS = frozenset({1, 2, 3, 4, 5, 6})
+CLIENT_KINDS = frozenset({1, 2, 3, 4, 5, 6, 7})
 SERVER_KINDS = frozenset({4, 17, 18, 19, 20, 21, 22})
 _KIND_OF = {kind: number for number, (kind, _) in KINDS.items()}
 _INPUTS_HEAD = bytes((0x94, _KIND_OF[Inputs]))

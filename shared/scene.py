@@ -12,11 +12,11 @@ import msgpack
 import numpy as np
 
 from shared import layout
+from shared.bounds import TICK_RATE_MAX
 from shared.checks import Cell, SceneError, Vec, boolean, cell, finite, items, text, vector, whole
 from shared.inputs import MOVE_MAX
 from shared.units import RANGE_BLOCKS, SEGMENT, SPEED, rounded, to_position, to_velocity
 
-TICK_RATE_MAX = 240
 TEMPLATES_MAX = 255
 SEGMENTS_MAX = 1 << 16
 BOX_MAX = 32.0

@@ -114,5 +114,5 @@ function snapshot(tick, newest, early, first, fates, verdicts, drops, ...parts) 
   used += fates.filter(fate => fate === USED).length;
   margins.push(...[...records(2, early)].map(margin => margin.readInt16LE()).filter(margin => margin !== REFUSED));
   margins = margins.slice(-2 * scene.tick_rate);
-  if (margins.length) lead += Math.max(-0.02, Math.min(0.5 - Math.min(...margins) / 256, 0.1)); // half a tick to spare
+  if (margins.length) lead += Math.max(-0.02, Math.min(0.5 - Math.min(...margins) * scene.tick_rate / 8192, 0.1)); // half a tick to spare
 }

@@ -9,22 +9,24 @@ import pytest
 from client_sdk.clock import (
     CALM_S,
     FASTER,
-    FIRST_INPUTS,
+    FIRST_INPUTS_S,
     FIRST_S,
     HURRY,
-    JUMP,
+    JUMP_S,
     MEMORY_S,
     PING_FIRST_S,
     PING_LATER_S,
     PINGS,
-    PRICE,
-    SHIFT,
+    PRICE_S,
+    SAFETY_S,
+    SHIFT_S,
     PricedLead,
     ServerClock,
     Timeline,
 )
 
 RATE = 32.0
+FIRST_INPUTS, JUMP, PRICE, SHIFT = int(FIRST_INPUTS_S * RATE), JUMP_S * RATE, PRICE_S * RATE, SHIFT_S * RATE
 SAFETY = 0.03
 
 
@@ -145,6 +147,9 @@ def test_a_timeline_tells_of_jumps_only() -> None:
         def steer(self, phase: float, elapsed: float, clock: ServerClock, now: float) -> float:
             assert elapsed >= 0
             return self.phase
+
+        def step(self, clock: ServerClock) -> float:
+            return 0.0
 
     to, timeline, clock = To(), Timeline(RATE, 0.0, 0.0), clock_at()
     to.phase = JUMP
@@ -282,7 +287,7 @@ def test_the_cover_is_where_one_tick_more_is_worth_one_tick() -> None:
     rng = random.Random(4)
     needs = [100.0 + rng.expovariate(2.0) for _ in range(40_000)]
     for price in (50.0, 10.0, 2.5):
-        loop = Loop(needs.__getitem__, PricedLead(price, safety=0.0)).run(40_000)
+        loop = Loop(needs.__getitem__, PricedLead(price / RATE, safety_s=0.0)).run(40_000)
         assert len([i for i in loop.late if i > 4000]) / 36_000 == pytest.approx(1 / (2 * price), rel=0.2)
 
 
@@ -301,10 +306,10 @@ def test_a_long_way_at_a_high_rate_is_learnt_like_any() -> None:
     lead = PricedLead()
     timeline = Timeline(clock.rate, lead.start(clock, 2.0), 2.0)
     need = timeline.phase - 5.0
-    for i in range(4000):
+    for i in range(20_000):
         timeline.steer(lead, clock, 2.0 + i / clock.rate)
         lead.observe(i, timeline.phase - need, timeline.phase, 2.0 + i / clock.rate)
-    assert timeline.phase == pytest.approx(need + SAFETY, abs=0.1)
+    assert timeline.phase == pytest.approx(need + SAFETY_S * clock.rate, abs=0.1)
 
 
 @pytest.mark.parametrize("slope", [0.0, 1e-3, -1e-3, 0.05])

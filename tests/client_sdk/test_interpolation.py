@@ -3,7 +3,17 @@
 import numpy as np
 import pytest
 
-from client_sdk.interpolation import CALM_S, EXTRAPOLATE_S, FALL_S_PER_S, KEPT, Interpolation
+from client_sdk.interpolation import (
+    CALM_S,
+    EXTRAPOLATE_S,
+    FALL_S_PER_S,
+    KEPT_S,
+    LONG_CALM_S,
+    LONG_FALL,
+    LONG_S,
+    LONG_SHARE,
+    Interpolation,
+)
 from shared.layout import TEMPLATE, VX, Int64s
 from shared.units import BLOCK, SPEED
 
@@ -149,7 +159,7 @@ def test_a_placed_entity_that_was_not_there_before_and_one_that_is_gone_are_no_t
 
 def test_what_is_kept_is_bounded() -> None:
     interpolation = fed(*[(tick, states(a=tick)) for tick in range(1000)])
-    assert shown(interpolation, 0.0) == {"a": 1000 - KEPT}
+    assert shown(interpolation, 0.0) == {"a": 1000 - KEPT_S * RATE}
 
 
 def test_the_delay_rises_at_once_by_what_was_missing() -> None:
@@ -162,13 +172,35 @@ def test_the_delay_rises_at_once_by_what_was_missing() -> None:
 
 def test_the_delay_falls_slowly_and_only_after_a_while_of_calm() -> None:
     interpolation = fed((10, states(a=0)))
-    interpolation.advance(20.0, 1.0)
-    assert interpolation.delay_ticks == 10.0
+    interpolation.advance(16.0, 1.0)
+    assert interpolation.delay_ticks == 6.0 <= LONG_S * RATE
     interpolation.push(100, states(a=0))
     interpolation.advance(100.0, 1.0 + CALM_S)
-    assert interpolation.delay_ticks == 10.0
+    assert interpolation.delay_ticks == 6.0
     interpolation.advance(100.0, 2.0 + CALM_S)
-    assert interpolation.delay_ticks == 10.0 - FALL_S_PER_S * RATE
+    assert interpolation.delay_ticks == 6.0 - FALL_S_PER_S * RATE
+
+
+def test_a_long_delay_falls_soon_and_faster_the_longer_it_is() -> None:
+    interpolation = fed((10, states(a=0)))
+    interpolation.advance(50.0, 1.0)
+    assert interpolation.delay_ticks == 40.0
+    interpolation.push(200, states(a=0))
+    interpolation.advance(50.0, 1.0 + LONG_CALM_S)
+    assert interpolation.delay_ticks == 40.0
+    interpolation.advance(50.0, 1.25 + LONG_CALM_S)
+    assert interpolation.delay_ticks == 40.0 - 0.25 * RATE * (LONG_FALL + LONG_SHARE * (1.0 - LONG_S))
+
+
+def test_a_step_of_the_servers_time_does_not_show_the_past_again() -> None:
+    interpolation = fed((100, states(a=0)))
+    interpolation.advance(140.0, 1.0)  # it stood still, and its time seemed to go on
+    shown_before = interpolation.shown(140.0)
+    interpolation.shift(-30.0)
+    assert interpolation.shown(110.0) == shown_before
+    delay_ticks = interpolation.delay_ticks
+    interpolation.shift(30.0)  # ahead: what is shown goes along
+    assert interpolation.delay_ticks == delay_ticks
 
 
 def test_the_delay_falls_no_lower_than_one_tick_nor_than_what_there_is_to_show() -> None:

@@ -13,16 +13,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from server.limits import Limits
+from server.rewind import WINDOW_S
 from server.rules import Rules
 from server.session import Player
 from shared import edits, messages
+from shared.bounds import bounds
 from shared.inputs import Input, clamp
 from shared.layout import BUTTONS, CELL, MOVE_X, VZ, X, Y, Z
 from shared.messages import (
-    AHEAD_MAX,
     INPUT_ROW_BYTES,
     INPUT_ROWS_MAX,
-    REPEATS_MAX,
     TICK_MAX,
     Bye,
     Command,
@@ -41,6 +41,7 @@ from tests.tables import HELLO, FakeLink, Table, order
 State = tuple[int, ...]
 
 RATE = 64
+AHEAD_MAX, REPEATS_MAX = bounds(RATE).ahead, bounds(RATE).repeats
 WALK = 3 * BLOCK // RATE
 """Grid steps that a player goes in a tick along an axis, at most: 3 blocks/s at 64 ticks/s, without a remainder."""
 APEX = 2 * BLOCK
@@ -169,7 +170,7 @@ def test_a_flood_of_inputs_ends_the_player_and_gains_nothing_until_then(cheat: C
         cheat.tick()
     assert cheat.walked() == 8 * WALK
     cheat.prove()
-    cheat.link.say(*[ahead(cheat.table, EAST, INPUT_ROWS_MAX)] * 300)
+    cheat.link.say(*[ahead(cheat.table, EAST, INPUT_ROWS_MAX)] * 600)
     assert cheat.link.refusal() == (messages.MALFORMED, "too many messages")
     cheat.table.tick()
     assert cheat.entity not in cheat.table.game.world
@@ -428,14 +429,14 @@ class Asking(Rules):
 
 
 @pytest.mark.parametrize("seen", [0, -1, -(1 << 63), -1e300, 5e-324, 1e300, (1 << 64) - 1, 10_000.5])
-def test_who_lies_about_what_it_saw_gets_the_last_quarter_of_a_second(seen: float) -> None:
+def test_who_lies_about_what_it_saw_gets_the_last_half_second(seen: float) -> None:
     rules = Asking()
     cheat = Cheat(plain(rules))
     cheat.tick(100)
     cheat.link.say(Command(1, 0, seen, "shoot", b"\xc0"))
     cheat.tick()
     (ago,) = rules.granted
-    assert ago == (RATE / 4 if seen < 100 else 0.0)
+    assert ago == (RATE * WINDOW_S if seen < 100 else 0.0)
 
 
 # -- any schedule --------------------------------------------------------------------------------------------

@@ -8,8 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from server.limits import Limits
-from server.replication import HISTORY
 from shared import messages
+from shared.bounds import bounds
 from shared.messages import (
     Bye,
     Command,
@@ -22,6 +22,8 @@ from shared.messages import (
 )
 from tests.tables import HELLO, FakeLink, Table, gone, ids, order
 from tests.worlds import EAST, STEP
+
+HISTORY = bounds(64).history
 
 
 @pytest.fixture

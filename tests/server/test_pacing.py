@@ -1,6 +1,6 @@
 """How much may be on the way: by hand-made paths."""
 
-from server.pacing import HOLD_S_MAX, LEAST_BYTES, NARROW_TICKS, RTT_WINDOW_S, SAMPLE_S, Pacing
+from server.pacing import HOLD_S_MAX, LEAST_BYTES, NARROW_S, RTT_WINDOW_S, SAMPLE_S, Pacing
 
 TICK_S = 1 / 32
 
@@ -109,7 +109,7 @@ def test_a_path_that_mostly_holds_snapshots_back_is_narrow_and_gets_small_ones_u
     window = path.window(1000, now)
     assert window == int(path.pacing.rate * (0.05 + 2 * TICK_S)) < wide
     path.outstanding = 0
-    assert path.pacing.room(window) == int(path.pacing.rate * NARROW_TICKS * TICK_S)
+    assert path.pacing.room(window) == int(path.pacing.rate * NARROW_S)
     now = path.stream(2.0, 320, now)
     assert path.window(1000, now) == wide
 

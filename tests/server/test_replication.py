@@ -8,9 +8,10 @@ import pytest
 
 from server.game import Game
 from server.limits import Limits
-from server.replication import HISTORY, PACKS_PER_TICK, ChangeLog
+from server.replication import PACKS_PER_TICK, ChangeLog
 from server.session import Session
 from shared.blocks import Kinds, unpack
+from shared.bounds import bounds
 from shared.checks import Cell
 from shared.inputs import Input
 from shared.layout import FALLING, FLAGS, ID
@@ -22,6 +23,8 @@ from shared.world import OverlapError, World
 from tests.worlds import scene
 
 HOME, EAST, WEST = (0, 0, 0), (1, 0, 0), (-1, 0, 0)
+
+HISTORY = bounds(64).history
 
 
 def row_of_segments() -> Scene:

@@ -13,8 +13,9 @@ from hypothesis import strategies as st
 from client_sdk.core import Core
 from client_sdk.interpolation import Interpolation
 from server.game import Game
+from server.limits import Limits
 from server.rays import Ray
-from server.rewind import Hit, Past, Rewind
+from server.rewind import WINDOW_S, Hit, Past, Rewind
 from shared.checks import Cell, SceneError, Vec
 from shared.inputs import Input
 from shared.layout import Int64s
@@ -78,9 +79,9 @@ def test_every_tick_of_the_window_is_as_it_was_with_its_blocks(seed: int, compil
 
     def check(world: World, rewind: Rewind) -> None:
         then.append(world.copy())
-        window = math.ceil(0.25 * world.scene.tick_rate)
+        window = math.ceil(WINDOW_S * world.scene.tick_rate)
         del then[: -window - 1]
-        oldest = world.tick - 0.25 * world.scene.tick_rate
+        oldest = world.tick - WINDOW_S * world.scene.tick_rate
         for old in then:
             past = rewind.at(old.tick)
             if old.tick < oldest:
@@ -174,7 +175,7 @@ def test_a_gap_that_began_before_the_window_is_remembered_and_memory_is_bounded(
         if tick == 26:
             assert rewind.at(19.5, 0, [(19, 25)]).position(thing)[0] == 0
             assert rewind.at(24.5, 0, [(17, 25)]).position(thing)[0] == 0
-        assert len(rewind._undo) <= 16
+        assert len(rewind._undo) <= WINDOW_S * 64
     assert len(rewind._undo) == 8, "nobody has been placed for a while"
 
 
@@ -184,7 +185,7 @@ def test_the_moment_is_clamped_and_must_be_a_number() -> None:
     for _ in range(100):
         world.step()
         rewind.record()
-    assert (rewind.at(0).seen, rewind.at(90.5).seen, rewind.at(1e300).seen) == (84, 90.5, 100)
+    assert (rewind.at(0).seen, rewind.at(90.5).seen, rewind.at(1e300).seen) == (68, 90.5, 100)
     for wrong in (NAN, INF, -INF):
         with pytest.raises(SceneError, match="seen"):
             rewind.at(wrong)
@@ -364,8 +365,8 @@ class Range:
     The shot says when it was fired by the shooter's own picture, and reaches the server half a round trip later.
     """
 
-    def __init__(self, delay_s: float, seed: int) -> None:
-        self.match = Match(load_scene("flat"), seed)
+    def __init__(self, delay_s: float, seed: int, limits: Limits | None = None) -> None:
+        self.match = Match(load_scene("flat"), seed, limits=limits)
         self.target = self.match.join(strafe, Path(0.02, 0.005))
         self.shooter = self.match.join(lambda core, rng: Input(), Path(delay_s, 0.01))
         self.shots = self.rewound = self.plain = 0
@@ -414,10 +415,16 @@ def test_at_200_ms_a_shot_at_what_is_drawn_hits_always_and_without_rewinding_har
     assert 0.19 < max(run.lags) <= 0.25
 
 
-def test_beyond_250_ms_nobody_is_shot_where_they_were() -> None:
-    run = Range(0.3, 5)
-    assert set(run.lags) == {0.25}
+def test_beyond_the_window_nobody_is_shot_where_they_were() -> None:
+    run = Range(0.6, 5)
+    assert set(run.lags) == {WINDOW_S}
     assert run.rewound < 60
+
+
+def test_the_window_is_a_setting() -> None:
+    run = Range(0.3, 5, Limits(rewind_s=1.0))
+    assert run.rewound == run.shots == 100
+    assert WINDOW_S < max(run.lags) <= 1.0
 
 
 def test_a_shooter_does_not_find_itself() -> None:

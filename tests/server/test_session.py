@@ -4,22 +4,21 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from server.session import InputQueue, Session
+from shared.bounds import bounds
 from shared.inputs import NEUTRAL, Input, clamp
 from shared.messages import (
-    AHEAD_MAX,
-    FATES_MAX,
     IDLE,
     INPUT_ROWS_MAX,
-    MARGIN_ONE,
     MARGIN_REFUSED,
     NEUTRALISED,
     REPEATED,
-    REPEATS_MAX,
     TICK_MAX,
     USED,
     Inputs,
 )
 
+LIMITS = bounds(32)
+AHEAD_MAX, REPEATS_MAX, FATES_MAX, MARGIN_ONE = LIMITS.ahead, LIMITS.repeats, LIMITS.fates, LIMITS.margin_one
 EAST, NORTH, WEST = Input(127, 0, 0), Input(0, 127, 1), Input(-127, 0, 255)
 
 

@@ -4,17 +4,21 @@ from itertools import groupby
 
 import pytest
 
-from server.replication import HISTORY
 from server.sight import Sight
+from shared.bounds import bounds
 from shared.checks import Cell
 from shared.snapshot import KEYFRAME
 
 OWN, NEAR, FAR = (0, 0, 0), (1, 0, 0), (2, 0, 0)
 ROW = [OWN, NEAR, FAR]
 
+HISTORY = bounds(32).history
+
 
 class Log:
     """Stands for the change log: in every tick, every segment changes; a part is as long as it is told to be."""
+
+    history = HISTORY
 
     def __init__(self, sizes: dict[Cell, int]) -> None:
         self.sizes = sizes
@@ -79,7 +83,7 @@ def test_what_waits_is_caught_up_with_from_where_it_was_and_nobody_starves() -> 
         for segment in take(sight, log, tick, 20):
             longest[segment] = max(longest[segment], tick - latest[segment])
             latest[segment] = tick
-        assert not sight.lost_track(tick + 1)
+        assert not sight.lost_track(tick + 1, HISTORY)
     assert longest[OWN] == 1
     assert longest[OWN] <= longest[NEAR] <= longest[FAR] < 8
 
@@ -98,9 +102,9 @@ def test_a_part_is_asked_for_since_the_tick_it_was_sent_last() -> None:
 def test_who_is_too_far_behind_has_lost_track(ticks: int) -> None:
     sight, log = looking(), Log(dict.fromkeys(ROW, 10))
     take(sight, log, 1, 100)
-    assert sight.lost_track(1 + ticks) == (ticks > HISTORY)
+    assert sight.lost_track(1 + ticks, HISTORY) == (ticks > HISTORY)
     sight.forget()
-    assert not sight.lost_track(1 + ticks)
+    assert not sight.lost_track(1 + ticks, HISTORY)
     take(sight, log, 1 + ticks, 100)
     assert {since for _, since in log.asked} == {KEYFRAME}
 

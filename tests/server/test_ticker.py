@@ -7,10 +7,12 @@ from collections.abc import Callable
 
 import pytest
 
-from server.ticker import CATCH_UP_MAX, FAILURES_MAX, Alarm, LoopAlarm, Schedule, Ticker, TimerfdAlarm, best_alarm
+from server.limits import catch_up_ticks
+from server.ticker import FAILURES_MAX, Alarm, LoopAlarm, Schedule, Ticker, TimerfdAlarm, best_alarm
 
 RATE = 32  # a power of two: every deadline below is exact
 PERIOD = 1 / RATE
+CATCH_UP_MAX = catch_up_ticks(RATE)
 
 
 def taken(schedule: Schedule, now: float) -> list[float]:
@@ -49,8 +51,8 @@ def test_a_short_stall_is_caught_up_entirely() -> None:
 def test_a_long_stall_is_caught_up_by_four_ticks_and_the_rest_is_counted() -> None:
     schedule = Schedule(RATE, 0.0)
     assert taken(schedule, 0.0) == [0]
-    assert taken(schedule, 3.0) == [1, 2, 3, 4]
-    assert schedule.deadline == 3.0 + PERIOD  # the deadline at 3.0 had passed, too
+    assert taken(schedule, 3.0) == [93, 94, 95, 96]  # the earliest are dropped: these tell the time
+    assert schedule.deadline == 3.0 + PERIOD
     assert schedule.skipped == 96 - 4
     assert schedule.skipped_s == 92 * PERIOD
     assert taken(schedule, 3.0 + PERIOD) == [97]
@@ -58,7 +60,7 @@ def test_a_long_stall_is_caught_up_by_four_ticks_and_the_rest_is_counted() -> No
 
 def test_one_more_than_four_is_one_skipped() -> None:
     schedule = Schedule(RATE, 0.0)
-    assert taken(schedule, 4 * PERIOD) == [0, 1, 2, 3]
+    assert taken(schedule, 4 * PERIOD) == [1, 2, 3, 4]
     assert (schedule.skipped, schedule.deadline) == (1, 5 * PERIOD)
 
 
@@ -86,7 +88,20 @@ def test_giving_up_ends_at_the_first_deadline_to_come_whatever_the_rounding(rate
         while schedule.take(now) is not None:
             pass
         assert now < schedule.deadline <= now + 1.001 / rate + 1e-6
-        assert schedule.skipped == pytest.approx(stall + 1 - CATCH_UP_MAX, abs=1)
+        assert schedule.skipped == pytest.approx(max(stall + 1 - catch_up_ticks(rate), 0), abs=1)
+
+
+def test_how_late_a_tick_is_does_not_depend_on_what_is_dropped() -> None:
+    schedule = Schedule(RATE, 0.0)
+    schedule.take(0.0)
+    schedule.take(3.0)
+    assert schedule.late_s == 3.0 - PERIOD
+    schedule.take(3.0)
+    assert schedule.late_s == 2 * PERIOD
+
+
+def test_catching_up_is_a_matter_of_time_not_of_ticks() -> None:
+    assert [catch_up_ticks(rate) for rate in (1, 20, 32, 60, 128, 240)] == [4, 4, 4, 8, 16, 30]
 
 
 class Bench:

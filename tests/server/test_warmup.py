@@ -8,15 +8,17 @@ import pytest
 
 from client_sdk.bots import DigAndPlace, RunAndJump
 from server.game import Game
-from server.replication import HISTORY
 from server.session import Session
 from server.warmup import warm_up
 from shared import bulk, edits, kernel, kernels, messages
+from shared.bounds import bounds
 from shared.checks import SceneError
 from shared.messages import Bye, Command, Hello, Inputs, Resync, encode
 from shared.scene import load_scene
 
 pytestmark = pytest.mark.skipif(not kernels.available(), reason="there is nothing to compile without Numba")
+
+HISTORY = bounds(32).history
 
 
 @pytest.fixture

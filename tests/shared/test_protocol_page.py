@@ -11,8 +11,10 @@ import msgpack
 import numpy as np
 import pytest
 
+from shared import bounds as bounds_module
 from shared import edits, layout, messages
 from shared.blocks import offset_of, pack, unpack
+from shared.bounds import bounds
 from shared.messages import KINDS, Message, Snapshot, decode_from_client, decode_from_server, encode, join_snapshot
 from shared.snapshot import FIELDS, ROW, decode_parts
 
@@ -101,7 +103,7 @@ def example(kind: type[Any]) -> Any:
 
 def test_the_snapshot_is_what_is_said_of_it() -> None:
     snapshot = example(Snapshot)
-    assert (np.frombuffer(snapshot.margins, "<i2") / messages.MARGIN_ONE).tolist() == [2.5, -0.25, 2.0]
+    assert (np.frombuffer(snapshot.margins, "<i2") / bounds(32).margin_one).tolist() == [2.5, -0.25, 2.0]
     assert snapshot.newest == 1021
     assert list(snapshot.fates) == [messages.USED, messages.REPEATED]
     (part,), states, turns = decode_parts(snapshot.segments, 1)
@@ -148,6 +150,8 @@ def test_tables_of_numbers() -> None:
     assert set(re.findall(r"[A-Z_]{3,}", listed)) == codes.keys()
     limits = {name: int(value) for name, value, _ in table("limit", "value")}
     assert limits == {name: getattr(messages, name) for name in limits}
+    times = {name: float(value) for name, value, _ in table("time", "seconds")}
+    assert times == {name: getattr(bounds_module, name) for name in times}
     events = {name: 1 << int(bit) for bit, name, _ in table("bit", "event")}
     assert events == {name: getattr(layout, name) for name in events}
     assert sum(events.values()) == layout.WHOLE - 1

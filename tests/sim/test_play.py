@@ -7,6 +7,7 @@ import pytest
 from client_sdk.core import Core
 from client_sdk.events import Diverged, Left, Resynchronised, SegmentLoaded
 from client_sdk.links import PRESETS
+from shared.bounds import UPDATE_S
 from shared.inputs import JUMP, Input
 from shared.messages import Command, decode_from_client
 from shared.scene import load_scene
@@ -75,7 +76,7 @@ def test_a_suspended_program_begins_anew_without_a_spiral(seconds: float) -> Non
     steps = stats.replayed_ticks + stats.inputs_sent
     player.suspend(seconds)
     match.run(seconds + 1)
-    assert stats.resyncs == (seconds > 0.5)
+    assert stats.resyncs == (seconds > UPDATE_S)
     assert [type(event) for event in player.events if isinstance(event, Resynchronised)] == [
         Resynchronised
     ] * stats.resyncs
