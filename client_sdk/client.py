@@ -81,7 +81,7 @@ class Client(BaseClient):
             link: see `link`.
 
         Raises:
-            ValueError: there is no such link.
+            ValueError: there is no such link; or the name or the token is no text that UTF-8 can hold.
             ConnectError: there is no connection; the text says why and what to do.
         """
         core = LinkedCore(name, scene, token=token, patience_s=patience_s)

@@ -25,6 +25,7 @@ from client_sdk.prediction import Prediction
 from client_sdk.replica import Replica
 from client_sdk.stats import Stats
 from shared import edits, messages
+from shared.checks import text
 from shared.inputs import NEUTRAL, Input, clamp
 from shared.messages import ProtocolError, decode_from_server, encode
 from shared.scene import Scene
@@ -32,6 +33,8 @@ from shared.scene import Scene
 INPUT_DELAY_MAX = 3
 COME_AGAIN = (messages.TOO_SLOW, messages.GOING_AWAY, messages.NO_HELLO)
 """The connection was at fault, not the player."""
+NAME_MAX = 1 << 16
+"""The longest name that is taken; what goes beyond `messages.NAME_MAX` characters is not sent."""
 EVENTS_MAX = 1000
 READ_BYTES = 64 * 1024
 
@@ -46,6 +49,9 @@ class Core:
         patience_s: for so long it tries to come back after a lost connection; 0: that is the end.
         compiled: run the physics compiled by Numba; None: where it is installed.
         neighbours: predict blocking others, too (see `Prediction`).
+
+    Raises:
+        ValueError: the name or the token is no text, is too long, or UTF-8 cannot hold it.
     """
 
     def __init__(
@@ -58,7 +64,7 @@ class Core:
         compiled: bool | None = None,
         neighbours: bool = True,
     ) -> None:
-        self.name = name
+        self.name = text(name, "name", NAME_MAX, shortest=0)
         self.scene = scene
         self.state = "joining"
         self.close_request: tuple[int, str] | None = None
@@ -68,7 +74,7 @@ class Core:
         self.wish = NEUTRAL
         self.shared: dict[str, Any] = {}
         """The values that the game shares with all clients."""
-        self._token = token
+        self._token = text(token, "token", messages.TOKEN_MAX, shortest=0)
         self._resume = b""
         self._compiled = compiled
         self._neighbours = neighbours

@@ -6,6 +6,7 @@ import numpy as np
 
 from client_sdk.events import Answered
 from shared import edits, messages
+from shared.checks import text
 from shared.messages import Command, encode
 from shared.snapshot import VERDICT
 
@@ -28,11 +29,12 @@ class Orders:
         Raises:
             ValueError: the name or the data are too long (32 characters, 1,024 bytes), or no MessagePack.
         """
-        if not 0 < len(name) <= messages.NAME_MAX or name == edits.NAME:
-            raise ValueError(
-                f"command {name[:80]!r}: must be 1 to {messages.NAME_MAX} characters, and not {edits.NAME!r}"
-            )
-        payload = messages.pack_value(data)
+        if text(name, "name", messages.NAME_MAX) == edits.NAME:
+            raise ValueError(f"name = {name!r}: must be another one, which the client itself does not use")
+        try:
+            payload = messages.pack_value(data)
+        except ValueError as error:
+            raise ValueError(f"{name}: data = {error}") from error
         return Command(self.number(), tick, seen, name, payload)
 
     def file(self, command: Command) -> bytes:

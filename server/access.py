@@ -1,8 +1,10 @@
 """From settings to what decides on players, and to what speaks TLS for the server."""
 
 import importlib
+import inspect
 import os
 import ssl
+from typing import Any
 
 from server import tokens
 from server.auth import Authenticator
@@ -22,12 +24,15 @@ def authenticator(settings: Settings) -> Authenticator | None:
         return tokens.Tokens(tokens.read_key(settings.auth_key_file, os.environ))
     module, _, name = settings.auth.partition(":")
     try:
-        found: Authenticator = getattr(importlib.import_module(module), name)
+        found: Any = getattr(importlib.import_module(module), name)
     except (ImportError, AttributeError, TypeError, ValueError) as error:  # the latter two: no name of a module
         raise SettingsError(f"auth = {settings.auth!r}: cannot be used ({error})") from error
-    if not callable(found):
-        raise SettingsError(f"auth = {settings.auth!r}: cannot be called")
-    return found
+    if not callable(found) or isinstance(found, type):
+        raise SettingsError(f"auth = {settings.auth!r}: must name a function, or an object that can be called")
+    if inspect.iscoroutinefunction(found) or inspect.iscoroutinefunction(type(found).__call__):
+        raise SettingsError(f"auth = {settings.auth!r}: must not be async, for nothing waits for it")
+    checked: Authenticator = found
+    return checked
 
 
 def tls_context(settings: Settings) -> ssl.SSLContext | None:

@@ -23,9 +23,10 @@ from server.recorder import RecordedWorld
 from server.rules import Rules
 from server.session import InputQueue, Session
 from server.stage import Stage
+from shared.checks import text
 from shared.inputs import MOVE_MAX, NEUTRAL, Input, clamp
 from shared.layout import FALLING, FLAGS, ID, TEMPLATE, VX, Int64s, X
-from shared.messages import Command, pack_value
+from shared.messages import NAME_MAX, Command, pack_value
 from shared.scene import Scene, load_scene
 from shared.units import BLOCK, BLOCK_SHIFT, RANGE_BLOCKS, SEGMENT, SEGMENT_SHIFT, SPEED, SPEED_MAX
 from shared.world import World
@@ -162,12 +163,17 @@ class Arena(ParallelEnv):  # type: ignore[misc]  # it says nothing of its types
 
         Returns:
             Its number. The verdict is in the next step's `infos[agent]["verdicts"]`, as (number, verdict).
+
+        Raises:
+            ValueError: the name or the data are too long (32 characters, 1,024 bytes), or no MessagePack.
         """
+        text(name, "name", NAME_MAX)
+        payload = pack_value(data)
         player = self._seats[agent].player
         assert player is not None
         self._number += 1
         tick = self.world.tick
-        self._game.orders.file(player, Command(self._number, tick + 1, float(tick), name, pack_value(data)))
+        self._game.orders.file(player, Command(self._number, tick + 1, float(tick), name, payload))
         return self._number
 
     def step(

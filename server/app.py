@@ -203,7 +203,7 @@ class Server:
             **({} if self.store is None else self.store.stats()),
             "connections": len(self.gateway.connections),
             "refused_at_door": dict(self.door.refused),
-            "internal_errors": self.faults.total,
+            "internal_errors": self.faults.total + (0 if self.store is None else self.store.faults.total),
             "stalls": 0 if self.watchdog is None else self.watchdog.stalls,
             "ready": not self.unready(),
             "uptime_s": round(time.monotonic() - self.started, 3),

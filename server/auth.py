@@ -2,12 +2,23 @@
 
 from typing import Protocol
 
+from shared.checks import text
+
 SUBJECT_MAX = 64
-"""No subject is longer, in characters."""
+"""The longest subject, in characters."""
 
 
 class AuthError(ValueError):
     """The client may not come in; the text says why, and is sent to it."""
+
+
+def checked_subject(subject: object) -> str:
+    """The result of an `Authenticator`, or the subject of a token: a text of at most `SUBJECT_MAX` characters.
+
+    Raises:
+        SceneError: it is none, is too long, or UTF-8 cannot hold it.
+    """
+    return text(subject, "subject", SUBJECT_MAX, shortest=0)
 
 
 class Authenticator(Protocol):

@@ -13,6 +13,7 @@ from collections.abc import Callable
 from typing import Any
 
 from server import keeping
+from server.auth import checked_subject
 from server.counters import Counters
 from server.delivery import Delivery
 from server.faults import Faults
@@ -222,7 +223,7 @@ class Game:
 
     def _welcome(self, session: Session) -> None:
         assert session.hello is not None
-        player = self.roster.find(session.hello.resume, session.subject)
+        player, new = self.roster.find(session.hello.resume, session.subject), False
         if player is not None:
             self.counters.resumed += 1
             if player.session is not None and not player.session.closed:
@@ -232,12 +233,17 @@ class Game:
             self._refuse(session, messages.FULL, f"the server is full ({self.limits.clients_max} clients)")
             return
         else:
-            player = self.roster.enter(session, session.hello.name)
+            player, new = self.roster.enter(session, session.hello.name), True
             if player is None:
                 self._refuse(session, messages.FULL, "no room to spawn")
                 return
-        token = self.roster.issue(player)
-        welcome = encode(Welcome(messages.VERSION, self.world.tick, player.entity, self._rules, token))
+        try:
+            token = self.roster.issue(player)
+            welcome = encode(Welcome(messages.VERSION, self.world.tick, player.entity, self._rules, token))
+        except Exception:
+            if new:
+                self.roster.expel(player)
+            raise
         session.greeting = (self.world.tick + 1, welcome)
 
     def _take_inputs(self) -> dict[int, Input]:
@@ -321,9 +327,18 @@ class Game:
             return
         if self._authenticate is not None:
             try:
-                session.subject = self._authenticate(hello.token)
+                subject = self._authenticate(hello.token)
             except ValueError as error:
                 self._refuse(session, messages.UNAUTHORISED, str(error))
+                return
+            except Exception:
+                self._break(session, "authenticating a client")
+                return
+            try:
+                session.subject = checked_subject(subject)
+            except ValueError:
+                self.faults.report("what authenticates clients")
+                self._refuse(session, messages.UNAUTHORISED, "the server cannot use what its check of tokens says")
                 return
         session.pacing.answered(now - session.opened, 0, now)  # of a path that was empty
         session.hello = hello._replace(token="")
@@ -348,7 +363,7 @@ class Game:
         self.lost(session, session.heard)
 
     def _end(self, session: Session, code: int, reason: str, wait: float = -1.0) -> None:
-        reason = reason[: messages.REASON_MAX]
+        reason = reason.encode(errors="replace").decode()[: messages.REASON_MAX]
         self.counters.closed[code] = self.counters.closed.get(code, 0) + 1
         try:
             session.send(encode(Bye(code, reason, wait)))

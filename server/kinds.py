@@ -7,6 +7,11 @@ from collections.abc import Iterable, Sequence
 from dataclasses import field, fields
 from typing import Any, NamedTuple, NoReturn
 
+from shared.checks import utf8
+
+PLAIN = "without spaces around it, in UTF-8"
+"""What a text must be that is a name, an address or a path."""
+
 
 class SettingsError(ValueError):
     """A setting that cannot be used; the message names the setting, the value and where it came from."""
@@ -82,11 +87,11 @@ def checked(name: str, kind: Kind, value: object, origin: str) -> Any:
         good, wanted = isinstance(value, bool), "true or false"
     elif kind.type is tuple:
         good = isinstance(value, list) and all(_plain(part) for part in value)
-        value, wanted = tuple(value) if isinstance(value, list) else value, "a list of texts without spaces around them"
+        value, wanted = tuple(value) if isinstance(value, list) else value, f"a list of texts {PLAIN}"
     elif kind.choices:
         good, wanted = value in kind.choices, f"one of {', '.join(kind.choices)}"
     else:
-        good, wanted = _plain(value), "a text without spaces around it"
+        good, wanted = _plain(value), f"a text {PLAIN}"
     if not good:
         raise SettingsError(f"{name} = {value!r} (from {origin}): must be {wanted}")
     return value
@@ -104,7 +109,7 @@ def to_toml(value: str | int | float | bool | tuple[str, ...]) -> str:
 
 def _plain(value: object) -> bool:
     """Whether a value is a text that can be a name, an address or a path."""
-    return isinstance(value, str) and value.strip() == value != "" and "\0" not in value
+    return isinstance(value, str) and value.strip() == value != "" and "\0" not in value and utf8(value)
 
 
 def _typed(kind: type[Any], text: str) -> str | int | float | bool | list[str]:

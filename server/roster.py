@@ -48,9 +48,14 @@ class Roster:
             return None
         player = self.players[entity] = Player(entity, name, session.subject, self._bounds)
         player.edits_left = 0.0  # else leaving and joining anew would give a burst each time
+        player.announced = False
         self._counters.joined += 1
-        session.seat(player)
-        self._stage.joined(player)
+        try:
+            session.seat(player)
+            self._stage.joined(player)
+        except Exception:
+            self.expel(player)
+            raise
         return player
 
     def issue(self, player: Player) -> bytes:
@@ -59,6 +64,12 @@ class Roster:
         player.tokens.append(_digest(token))
         self._world.note(keeping.note_of(player))
         return token
+
+    def expel(self, player: Player) -> None:
+        """Takes back a join that has failed: nothing of it stays."""
+        if player.session is not None:
+            player.session.vacate()
+        self._let_go([player])
 
     def find(self, token: bytes, subject: str) -> Player | None:
         """The player who was given that token, which is used up with this; it may still have a connection."""

@@ -168,6 +168,8 @@ class Player:
         self.entity = entity
         self.name = name
         self.subject = subject
+        self.announced = True
+        """Whether the rules have been told of the join."""
         self.inputs = InputQueue(bounds)
         self.commands: deque[Command] = deque()
         """Those that wait for their tick."""
@@ -241,6 +243,12 @@ class Session:
         player.session, player.away_until = self, math.inf
         del player.verdicts[:-SETTLED_MAX]  # who comes back time and again without reading must not pile them up
         self.hello = None
+
+    def vacate(self) -> None:
+        """Undoes `seat`."""
+        if self.player is not None:
+            self.player.session = None
+        self.player, self.entity, self.inputs = None, 0, InputQueue()
 
     def send(self, message: bytes) -> None:
         """Hands a message to the link."""

@@ -21,7 +21,7 @@ from server.rewind import Past, Rewind
 from server.rules import Rules
 from server.session import Player, Session
 from shared import messages
-from shared.checks import SceneError, Vec
+from shared.checks import SceneError, Vec, text
 from shared.edits import Edit
 from shared.inputs import Input, make_input
 from shared.layout import TEMPLATE
@@ -253,11 +253,11 @@ class Stage:
         Raises:
             SceneError: the name is longer than 32 characters, the data than 1,024 bytes as MessagePack.
         """
+        text(name, "name", messages.NAME_MAX)
         try:
             payload = pack_value(data)
         except ValueError as error:
-            raise SceneError(f"send {name!r}: {error}") from error
-        _checked(name, None)
+            raise SceneError(f"send {name!r}: data = {error}") from error
         players = (to,) if isinstance(to, Player) else to
         entities = None if players is None else frozenset(player.entity for player in players)
         self._outgoing.append((entities, encode(Happened(self.tick, name, payload))))
@@ -268,11 +268,13 @@ class Stage:
         """A player has an entity."""
         if player.name:
             self.set(player.entity, "name", player.name)
+        player.announced = True
         self._call(self._rules.on_join, player)
 
     def left(self, player: Player) -> None:
         """A player leaves, and the entity with it, if the rules have not removed that already."""
-        self._call(self._rules.on_leave, player)
+        if player.announced:
+            self._call(self._rules.on_leave, player)
         if player.entity in self._world:
             self._remove(player.entity)
 
@@ -363,12 +365,11 @@ def _overrides(rules: Rules, name: str) -> bool:
 
 def _checked(name: str, value: Any) -> bytes:
     """A value that may be told, packed."""
-    if not 0 < len(name) <= messages.NAME_MAX:
-        raise SceneError(f"name {name[:80]!r}: must be a text of 1 to {messages.NAME_MAX} characters")
+    text(name, "name", messages.NAME_MAX)
     try:
         packed = pack_value(value)
     except ValueError as error:
-        raise SceneError(f"{name}: {error}") from error
+        raise SceneError(f"{name} = {error}") from error
     if len(packed) > VALUE_BYTES_MAX:
         raise SceneError(f"{name}: a value of {len(packed)} bytes; at most {VALUE_BYTES_MAX}")
     return packed

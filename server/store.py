@@ -19,10 +19,11 @@ checkpoint before piece by piece and in the thread), packed between the transact
 transaction, which also drops the log up to there. Until it is complete the old checkpoint and its log are. The ticks
 wait for none of it.
 
-When the disk takes no more, or does not keep up by more than `BEHIND_S`, there is a gap: `trouble` says why, records
-are dropped, and the game refuses commands (`messages.UNSAVED`) while players move on. What was told "done" before is on
-disk; what was carried out and not yet answered stays unanswered. Then the file is opened anew and a fresh
-checkpoint tried, again and again. With it everything is saved, the unanswered too, and the gap is closed.
+A checkpoint that fails by a fault of our own is reported, counted and tried again; the log goes on meanwhile. When the
+disk takes no more, or does not keep up by more than `BEHIND_S`, there is a gap: `trouble` says why, records are
+dropped, and the game refuses commands (`messages.UNSAVED`) while players move on. What was told "done" before is on
+disk; what was carried out and not yet answered stays unanswered. Then the file is opened anew and a fresh checkpoint
+tried, again and again. With it everything is saved, the unanswered too, and the gap is closed.
 
 Rejected: a transaction in the tick (a disk's hiccup would be everybody's); a log of states instead of inputs (a hundred
 times the bytes); a file per segment (no transaction spans them); a copy of the world by fork (threads, and Windows);
@@ -42,10 +43,11 @@ import msgpack
 
 from server.checkpoint import Checkpoint, Copy, Saved
 from server.database import Database, Record, StoreError, chained, seal_of
+from server.faults import Faults
 from server.histogram import Histogram
 from server.loading import claimed, load
 from server.recorder import Pen
-from shared.checks import Cell
+from shared.checks import Cell, text
 from shared.inputs import Input
 from shared.scene import Scene
 from shared.world import World
@@ -64,6 +66,8 @@ RETRY_S = 2.0
 """After a failure the next attempt waits so long, twice as long after each further one,"""
 RETRY_MAX_S = 30.0
 """but no longer than this: a disk that stays full should not fill with lines of the log, either."""
+GAME_MAX = 1024
+"""The longest name of a game, in characters."""
 CLOSE_S = 2.5
 """The end waits so long for the disk."""
 
@@ -87,6 +91,7 @@ class Store(Pen):
         notes: what has been noted since then, in order.
 
     Raises:
+        SceneError: the game's name is no text that UTF-8 can hold.
         StoreError: what is there cannot be used, by this program or now; nothing has been changed.
     """
 
@@ -101,8 +106,12 @@ class Store(Pen):
         compiled: bool | None = None,
     ) -> None:
         super().__init__(first=False, hashed_max=HASHED_MAX, stale_max=STALE_MAX)
+        text(game, "game", GAME_MAX, shortest=0)
         self._path = Path(directory) / "world.db"
         self._rules, self._game = msgpack.packb(scene.to_table()), game
+        self.faults = Faults("the store has failed")
+        """Exceptions of our own, by what has been given up because of them."""
+        self.checkpoints_failed = 0
         self._power = power
         self._checkpoint_ticks = max(1, round(checkpoint_s * scene.tick_rate))
         self.trouble = ""
@@ -119,7 +128,7 @@ class Store(Pen):
         self._wake = threading.Condition()
         self._records: list[tuple[int, bytes, float]] = []
         self._copy: Copy | None = None
-        self._urgent = self._closing = self._copy_due = self._gap = False
+        self._urgent = self._closing = self._copy_due = self._gap = self._reopening = False
         self._claim = claimed(self._path.parent)
         try:
             loaded = load(self._path, scene, game, compiled=compiled)
@@ -137,7 +146,7 @@ class Store(Pen):
         self._chain, self._log_bytes, self._copied = loaded.chain, loaded.log_bytes, loaded.checkpoint_tick
         self.restored = (self.world.tick, self.world.state_hash().hex())
         """The tick and the state hash of the world that was found, or of the new one."""
-        self._tick = self._loud = self._written = self.world.tick
+        self._tick = self._loud = self._written = self._not_before = self.world.tick
         self._keep: Callable[[], Any] = lambda: None
         self._thread = threading.Thread(target=self._run, name="store", daemon=True)
         self.world.attach(self)
@@ -170,12 +179,20 @@ class Store(Pen):
             copy.touch(segment)
 
     def tick(self, world: World, inputs: Mapping[int, Input]) -> None:
-        parts, tick = self.taken(world, inputs), world.tick
-        loud = any(parts[:3])
-        copy = None
-        if self._copy is None and (self._copy_due or tick - self._copied >= self._checkpoint_ticks):
-            copy = Copy(world, msgpack.packb(self._keep()))
-        record = msgpack.packb(parts)
+        tick = world.tick
+        try:
+            parts = self.taken(world, inputs)
+            record, loud = msgpack.packb(parts), any(parts[:3])
+        except Exception:  # the tick goes on: what it was told is as good as on a disk that takes nothing
+            self.faults.report("the record of a tick")
+            with self._wake:
+                self._tick = self._loud = tick
+                self._drop("internal error")
+            return
+        due = self._copy_due or tick - self._copied >= self._checkpoint_ticks
+        if self._gap:  # not before the file is opened anew: the log must not go on behind a gap
+            due = self._reopening
+        copy = self._copied_world() if self._copy is None and due and tick >= self._not_before else None
         with self._wake:
             self._tick = tick
             if loud:
@@ -194,8 +211,9 @@ class Store(Pen):
         """Saves all that there is, and lets go of the directory; whether that worked."""
         self.world.detach(self)
         if self._thread.is_alive():
+            copy = self._copied_world()  # if that fails, the log has all that there is
             with self._wake:
-                self._copy = Copy(self.world, msgpack.packb(self._keep()))
+                self._copy = copy
                 self._closing = self._urgent = True
                 self._wake.notify()
             self._thread.join(CLOSE_S)
@@ -222,8 +240,24 @@ class Store(Pen):
             "log_bytes": self._log_bytes,
             "commit_ms": self.commit_s.summary(),
             "checkpoints": self.checkpoint_s.count,
+            "checkpoints_failed": self.checkpoints_failed,
             "checkpoint_ms": self.checkpoint_s.summary(),
         }
+
+    def _copied_world(self) -> Copy | None:
+        """A copy of the world for a checkpoint; None if that failed, which is counted, and tried again later."""
+        try:
+            return Copy(self.world, msgpack.packb(self._keep()))
+        except Exception:
+            self._checkpoint_failed()
+            return None
+
+    def _checkpoint_failed(self) -> None:
+        """An exception of ours has hit a checkpoint: the log goes on, and another attempt follows."""
+        self.faults.report("a checkpoint")
+        self.checkpoints_failed += 1
+        self._copy_due = True
+        self._not_before = self._tick + round(RETRY_S * self.world.scene.tick_rate)
 
     # -- the thread's side -----------------------------------------------------------------------------------
 
@@ -238,10 +272,10 @@ class Store(Pen):
             except (sqlite3.Error, OSError) as error:
                 self._fail(str(error))
             except Exception:
-                logger.exception("internal error in the store")
+                self.faults.report("writing")
                 self._fail("internal error")
             with self._wake:
-                done = self._closing and self._copy is None
+                done = self._closing and self._copy is None and not self._records
         if self._file is not None:
             self._file.close()
 
@@ -261,10 +295,19 @@ class Store(Pen):
             if copy is not self._copying:
                 self._copying, self._pieces, self._chain_there = copy, copy.pieces(self._saved), there
                 self._began = time.monotonic()
-            checkpoint = next(self._pieces)
-            if checkpoint is not None and self._copy is copy:
-                self._save(file, copy, checkpoint, self._chain_there)
-                self._retry_s = RETRY_S
+            try:
+                checkpoint = next(self._pieces)
+                if checkpoint is not None and self._copy is copy:
+                    self._save(file, copy, checkpoint, self._chain_there)
+                    self._retry_s = RETRY_S
+            except (sqlite3.Error, OSError):
+                raise
+            except Exception:
+                if self.trouble:  # it was to close a gap, behind which the log must not go on
+                    raise
+                with self._wake:
+                    self._checkpoint_failed()
+                    self._copy = None if self._copy is copy else self._copy
 
     def _append(self, file: Database, records: list[tuple[int, bytes, float]], tick: int) -> int:
         """Puts records on disk, in one transaction; what the chain is after a tick."""
@@ -306,12 +349,14 @@ class Store(Pen):
         """After a gap: waits a while, and saves everything anew. What has come since then follows in `_write_on`."""
         with self._wake:
             self._wake.wait_for(lambda: self._closing, self._retry_s)
-            self._copy_due = True
-            self._wake.wait_for(lambda: self._copy is not None)
+            self._reopening = True
+            self._wake.wait_for(lambda: self._copy is not None or self._closing)
+            self._reopening = False
             copy = self._copying = self._copy
             if self._closing:
                 self._gap = False
-        assert copy is not None
+        if copy is None:
+            return
         self._began = time.monotonic()
         file = Database(self._path, power=self._power)
         try:

@@ -12,6 +12,7 @@ import jwt
 
 from server.auth import SUBJECT_MAX, AuthError
 from server.kinds import Parser, SettingsError
+from shared.checks import text, utf8
 
 ALGORITHM = "HS256"
 KEY_BYTES_MIN = 32
@@ -57,6 +58,8 @@ class Tokens:
             raise AuthError("the token names no subject")
         if len(subject) > SUBJECT_MAX:
             raise AuthError(f"the token's subject is longer than {SUBJECT_MAX} characters")
+        if not utf8(subject):
+            raise AuthError(f"the token's subject {subject!r} is not a text that UTF-8 can hold")
         return subject
 
     def _signed(self, token: str) -> dict[str, Any]:
@@ -88,7 +91,12 @@ def _time(claims: Mapping[str, Any], name: str) -> float | None:
 
 
 def issue(key: bytes, subject: str, seconds: float, now: float) -> str:
-    """A token for a subject, valid for so long from now (seconds since 1970) on."""
+    """A token for a subject, valid for so long from now (seconds since 1970) on.
+
+    Raises:
+        SceneError: the subject is too long, or no text that UTF-8 can hold.
+    """
+    text(subject, "subject", SUBJECT_MAX)
     return jwt.encode({"sub": subject, "iat": int(now), "exp": math.ceil(now + seconds)}, key, ALGORITHM)
 
 
@@ -99,7 +107,7 @@ def read_key(path: str | None, environment: Mapping[str, str]) -> bytes:
         SettingsError: there is none, or it is too short.
     """
     if path is None:
-        origin, key = KEY_VARIABLE, environment.get(KEY_VARIABLE, "").encode()
+        origin, key = KEY_VARIABLE, environment.get(KEY_VARIABLE, "").encode(errors="surrogateescape")
         if not key:
             raise SettingsError(f"auth_key_file is not set, and neither is {KEY_VARIABLE}: tokens need a key")
     else:
@@ -129,8 +137,8 @@ def main(arguments: Sequence[str], environment: Mapping[str, str] = os.environ) 
     )
     flags = parser.flags(arguments)
     subject, hours = flags["subject"], flags["hours"]
-    if not 0 < len(subject.strip()) <= SUBJECT_MAX >= len(subject):
-        raise SettingsError(f"subject = {subject!r}: must be a text of 1 to {SUBJECT_MAX} characters")
+    if not 0 < len(subject.strip()) <= SUBJECT_MAX >= len(subject) or not utf8(subject):
+        raise SettingsError(f"subject = {subject!r}: must be a text of 1 to {SUBJECT_MAX} characters, in UTF-8")
     if not 0 < hours <= HOURS_MAX:
         raise SettingsError(f"hours = {hours:g}: must be more than 0 and at most {HOURS_MAX}")
     print(issue(read_key(flags["auth_key_file"], environment), subject, hours * 3600, time.time()))

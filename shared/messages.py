@@ -38,6 +38,7 @@ from typing import Any, NamedTuple
 
 import msgpack
 
+from shared import checks
 from shared.blocks import PACKED_MAX
 from shared.bounds import FATES_S, TICK_RATE_MAX, in_ticks
 
@@ -322,10 +323,17 @@ def pack_value(value: Any) -> bytes:
         payload: bytes = msgpack.packb(value)
         unpack_value(payload)
     except (TypeError, ValueError, OverflowError, RecursionError) as error:
-        raise ValueError(f"{str(value)[:80]}: not a MessagePack value ({error})") from error
+        raise ValueError(f"{checks.shown(value)}: {_unpackable(error)}") from error
     if len(payload) > PAYLOAD_MAX:
         raise ValueError(f"a value of {len(payload)} bytes: longer than {PAYLOAD_MAX}")
     return payload
+
+
+def _unpackable(error: Exception) -> str:
+    """Why a value cannot be packed."""
+    if isinstance(error, UnicodeEncodeError):
+        return f"a text in it, {checks.shown(error.object)}, is none that UTF-8 can hold"
+    return f"not a MessagePack value ({' '.join(str(error).split())[:80]})"
 
 
 def unpack_value(payload: bytes) -> Any:

@@ -13,7 +13,7 @@ import numpy as np
 
 from shared import layout
 from shared.bounds import TICK_RATE_MAX
-from shared.checks import Cell, SceneError, Vec, boolean, cell, finite, items, text, vector, whole
+from shared.checks import Cell, SceneError, Vec, boolean, cell, choice, finite, items, shown, text, vector, whole
 from shared.inputs import MOVE_MAX
 from shared.units import RANGE_BLOCKS, SEGMENT, SPEED, rounded, to_position, to_velocity
 
@@ -26,6 +26,14 @@ INTEGRATORS = ("mean", "semi")
 SHOWN = ("interpolated", "predicted")
 
 SCENES = Path(__file__).parent / "scenes"
+
+
+def _own_numbers(owner: Any) -> None:
+    """Puts Python's own numbers in the place of numpy's, which MessagePack cannot hold."""
+    for f in fields(owner):
+        value = getattr(owner, f.name)
+        if isinstance(value, np.generic):
+            object.__setattr__(owner, f.name, value.item())
 
 
 @dataclass(frozen=True)
@@ -51,8 +59,8 @@ class Template:
     shown: str = "interpolated"
 
     def __post_init__(self) -> None:
-        at = f"templates.{self.name}"
-        text(self.name, "templates.name")
+        _own_numbers(self)
+        at = f"templates.{text(self.name, 'templates.name')}"
         offset = vector(self.box_offset, f"{at}.box_offset")
         size = vector(self.box_size, f"{at}.box_size")
         for axis, offset_k, size_k in zip("xyz", offset, size, strict=True):
@@ -64,8 +72,7 @@ class Template:
             if to_velocity(getattr(self, name), f"{at}.{name}") < 0:
                 raise SceneError(f"{at}.{name} = {getattr(self, name)!r}: must not be negative")
         boolean(self.solid, f"{at}.solid")
-        if self.shown not in SHOWN:
-            raise SceneError(f"{at}.shown = {self.shown!r}: must be one of {', '.join(SHOWN)}")
+        choice(self.shown, f"{at}.shown", SHOWN)
         object.__setattr__(self, "box_offset", offset)
         object.__setattr__(self, "box_size", size)
 
@@ -118,6 +125,7 @@ class Scene:
         return f"<Scene {self.name!r}, {blocks} blocks, {self.tick_rate} ticks/s>"
 
     def __post_init__(self) -> None:
+        _own_numbers(self)
         text(self.name, "name")
         whole(self.tick_rate, "tick_rate", 1, TICK_RATE_MAX)
         for name in ("gravity", "terminal_speed"):
@@ -129,8 +137,7 @@ class Scene:
             raise SceneError(f"gravity = {self.gravity!r}: vanishes in one tick; 0 switches it off")
         if self.gravity > 0 and to_velocity(self.terminal_speed, "terminal_speed") == 0:
             raise SceneError(f"terminal_speed = {self.terminal_speed!r}: nothing could fall; set gravity = 0 instead")
-        if self.integrator not in INTEGRATORS:
-            raise SceneError(f"integrator = {self.integrator!r}: must be one of {', '.join(INTEGRATORS)}")
+        choice(self.integrator, "integrator", INTEGRATORS)
         boolean(self.entity_collision, "entity_collision")
         if not 0 <= finite(self.reach, "reach") <= REACH_MAX:
             raise SceneError(f"reach = {self.reach!r}: must be 0 to {REACH_MAX:g}")
@@ -143,22 +150,30 @@ class Scene:
             raise SceneError(f"size = {self.size}: more than {SEGMENTS_MAX} segments")
         terrain: object = self.terrain
         if not isinstance(terrain, Mapping) or not isinstance(terrain.get("generator"), str):
-            raise SceneError(f"terrain = {self.terrain!r}: must be a table with a generator")
-        if not self.spawns or not isinstance(self.spawns, list | tuple):
-            raise SceneError(f"spawns = {self.spawns!r}: must list at least one position")
-        spawns = tuple(vector(spawn, f"spawns[{i}]") for i, spawn in enumerate(self.spawns))
+            raise SceneError(f"terrain = {shown(terrain)}: must be a table with a generator")
+        for key, value in terrain.items():
+            text(key, "terrain: the name of a parameter")
+            try:
+                msgpack.packb(_plain(value))
+            except (TypeError, ValueError, OverflowError, RecursionError) as error:
+                raise SceneError(f"terrain.{key} = {shown(value)}: cannot be sent ({type(error).__name__})") from error
+        spawns = tuple(vector(spawn, f"spawns[{i}]") for i, spawn in enumerate(items(self.spawns, "spawns")))
+        if not spawns:
+            raise SceneError(f"spawns = {shown(self.spawns)}: must list at least one position")
         for i, spawn in enumerate(spawns):
             for axis, value in zip("xyz", spawn, strict=True):
                 to_position(value, f"spawns[{i}].{axis}")
         object.__setattr__(self, "spawns", spawns)
+        for i, template in enumerate(items(self.templates, "templates")):
+            if not isinstance(template, Template):
+                raise SceneError(f"templates[{i}] = {shown(template)}: must be a `Template`")
         if not 1 <= len(self.templates) <= TEMPLATES_MAX:
             raise SceneError(f"templates: {len(self.templates)} of them; must be 1 to {TEMPLATES_MAX}")
         object.__setattr__(self, "templates", tuple(self.templates))
         names = [template.name for template in self.templates]
         if len(set(names)) < len(names):
             raise SceneError(f"templates: two have the same name ({', '.join(names)})")
-        if self.player not in names:
-            raise SceneError(f"player = {self.player!r}: no such template (there are {', '.join(names)})")
+        self.template(self.player, "player")
 
     @classmethod
     def from_table(cls, table: Mapping[str, Any]) -> "Scene":
@@ -198,6 +213,21 @@ class Scene:
         """Template names to their numbers."""
         return {template.name: i for i, template in enumerate(self.templates)}
 
+    def template(self, name: object, at: str = "template") -> int:
+        """The number of a template.
+
+        Args:
+            name: the template's.
+            at: where the name stands, for the error.
+
+        Raises:
+            SceneError: there is no such template.
+        """
+        kind = self.index_of.get(name) if isinstance(name, str) else None
+        if kind is None:
+            raise SceneError(f"{at} = {shown(name)}: no such template (there are {', '.join(self.index_of)})")
+        return kind
+
     def with_template(self, name: str, like: str | None = None, **changes: Any) -> "Scene":
         """The same scene with one template more.
 
@@ -208,10 +238,8 @@ class Scene:
         Raises:
             SceneError: there is no template to begin with, a field is unknown or out of range, or the name is taken.
         """
-        base = like or self.player
-        if base not in self.index_of:
-            raise SceneError(f"like = {base!r}: no such template (there are {', '.join(self.index_of)})")
-        entry = {f.name: getattr(self.templates[self.index_of[base]], f.name) for f in fields(Template)}
+        base = self.templates[self.template(self.player if like is None else like, "like")]
+        entry = {f.name: getattr(base, f.name) for f in fields(Template)}
         return replace(self, templates=(*self.templates, _template({**entry, **changes, "name": name})))
 
     def segments(self) -> list[Cell]:

@@ -61,7 +61,7 @@ class Loopback:
             link: see `Client.link`.
 
         Raises:
-            ValueError: there is no such link.
+            ValueError: there is no such link; or the name or the token is no text that UTF-8 can hold.
         """
         core = LinkedCore(name, token=token, patience_s=PATIENCE_S)
         core.link = link
