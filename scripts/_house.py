@@ -16,6 +16,7 @@ from shared.messages import (
     Inputs,
     Ping,
     ProtocolError,
+    Restart,
     Resync,
     Welcome,
     decode_from_client,
@@ -147,6 +148,7 @@ class House:
                     ),
                     Ping(rng.random(), rng.randrange(9)),
                     Resync() if rng.random() < 0.2 else Ping(0.0),
+                    Restart(max(0, tick + rng.randint(-70, 70))),
                 )
             )
         )

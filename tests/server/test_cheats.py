@@ -30,6 +30,7 @@ from shared.messages import (
     Inputs,
     Message,
     Ping,
+    Restart,
     Resync,
     Welcome,
     encode,
@@ -449,6 +450,7 @@ ACTS = st.one_of(
     st.tuples(st.just("inputs"), OFFSETS, ROWS),
     st.tuples(st.just("inputs"), st.just(1), st.sampled_from([EAST, JUMP, b"\x80\x80\xff"])),
     st.tuples(st.just("wait"), st.integers(0, 24), st.just(b"")),
+    st.tuples(st.just("restart"), OFFSETS, st.just(b"")),
     st.tuples(st.sampled_from(["cut off", "take over", "resync", "ping", "order"]), st.just(0), st.just(b"")),
 )
 
@@ -465,6 +467,10 @@ def test_any_schedule_comes_to_an_honest_path(schedule: list[tuple[str, int, byt
                     continue  # more in the same tick
             case "wait":
                 cheat.tick(number)
+            case "restart":
+                cheat.link.say(Restart(max(0, cheat.table.tick_number + number)))
+                if number % 2:
+                    continue
             case "cut off":
                 cheat.cut_off()
             case "take over":

@@ -1,5 +1,6 @@
 """One input per tick: what becomes of each, told exactly, whatever a client sends."""
 
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -136,6 +137,61 @@ def test_a_wish_that_is_too_long_is_shortened_by_the_rule_of_both_sides() -> Non
 def test_a_message_without_rows_changes_nothing() -> None:
     queue = filed(TICK_MAX)
     assert (queue.first, queue.newest, queue.refused, len(queue.margins)) == (-1, -1, 0, 0)
+
+
+# -- inputs that are withdrawn -------------------------------------------------------------------------------
+
+
+def test_inputs_that_have_not_been_used_can_be_withdrawn_and_sent_anew() -> None:
+    queue = filed(1, EAST, EAST, EAST, EAST)
+    assert queue.take(1) == EAST
+    queue.restart(3)
+    assert (queue.newest, list(margins(queue))) == (2, [1, 2])
+    queue.file(inputs(3, NORTH, NORTH, NORTH), 1, 1.0)
+    assert [queue.take(tick) for tick in (2, 3, 4, 5)] == [EAST, NORTH, NORTH, NORTH]
+    assert (queue.refused, queue.used, queue.late) == (0, 5, 0)
+    assert list(margins(queue)) == [1, 2, 3, 4, 5]
+
+
+def test_what_has_been_used_stays_used() -> None:
+    queue = filed(1, EAST, EAST, EAST)
+    assert [queue.take(tick) for tick in (1, 2)] == [EAST, EAST]
+    queue.restart(1)
+    assert queue.take(3) == EAST, "withdrawn, so the latest to arrive is repeated"
+    assert list(queue.fates) == [USED, USED, REPEATED]
+    queue.file(inputs(1, NORTH, NORTH, NORTH), 3, 1.0)
+    assert (queue.late, queue.take(4)) == (3, NORTH)
+
+
+def test_nothing_is_withdrawn_where_there_is_nothing() -> None:
+    queue = InputQueue()
+    queue.restart(0)
+    assert (queue.first, queue.newest) == (-1, -1)
+    queue = filed(1, EAST, EAST)
+    queue.restart(3)
+    assert (queue.newest, [queue.take(tick) for tick in (1, 2)]) == (2, [EAST, EAST])
+
+
+def test_margins_that_were_sent_are_not_counted_off_again() -> None:
+    queue = filed(1, EAST, EAST, EAST, EAST)
+    queue.told()
+    queue.file(inputs(5, EAST), 0, 1.0)
+    queue.restart(3)
+    assert (queue.newest, list(queue.margins)) == (2, [])
+    queue.file(inputs(3, NORTH), 0, 1.0)
+    assert margins(queue) == {3: 3 * MARGIN_ONE}
+
+
+@pytest.mark.parametrize("rate", [4, 20, 32, 60, 128, 240])
+def test_a_margin_holds_four_seconds_at_every_rate(rate: int) -> None:
+    limits = bounds(rate)
+    queue = InputQueue(limits)
+    queue.file(inputs(limits.ahead, EAST), 0, 1.0)
+    (margin,) = queue.margins
+    assert margin / limits.margin_one == pytest.approx(limits.ahead, abs=1 / limits.margin_one)
+    late = InputQueue(limits)
+    late.file(inputs(1, EAST), 1 + 3 * rate, 0.0)
+    assert late.margins[0] / limits.margin_one == pytest.approx(-3 * rate - 1, abs=1.0)
 
 
 # -- margins -------------------------------------------------------------------------------------------------
