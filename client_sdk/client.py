@@ -15,6 +15,7 @@ from types import TracebackType
 from typing import Any, Protocol
 
 from client_sdk.base import BaseClient
+from client_sdk.compiling import COMPILER
 from client_sdk.events import Event
 from client_sdk.linked import LinkedCore
 from client_sdk.links import Path
@@ -84,6 +85,7 @@ class Client(BaseClient):
             ValueError: there is no such link; or the name or the token is no text that UTF-8 can hold.
             ConnectError: there is no connection; the text says why and what to do.
         """
+        COMPILER.begin()
         core = LinkedCore(name, scene, token=token, patience_s=patience_s)
         core.link = link
         return cls(core, PollingTransport(Connection(url, core), timeout, tls))

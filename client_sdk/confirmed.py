@@ -13,7 +13,7 @@ from shared.layout import FALLING, FLAGS, ID, Int64s, X
 from shared.messages import ProtocolError, Snapshot
 from shared.ring import Ring
 from shared.scene import Scene
-from shared.snapshot import ACTED, KEYFRAME, PLACED, SegmentPart, checksum, decode_parts, prepare
+from shared.snapshot import ACTED, KEYFRAME, PLACED, SegmentPart, checksum, decode_parts
 from shared.units import SEGMENT, TO_SEGMENT
 from shared.world import World
 
@@ -27,7 +27,6 @@ class Confirmed:
     def __init__(self, scene: Scene, entity: int, *, compiled: bool | None = None) -> None:
         self.entity = entity
         self.world = World(scene, compiled=compiled)
-        prepare(self.world.compiled)
         self.states = self.world.states()
         """Those of the world, [n, 12], ascending by id. Not to be written to."""
         self.attributes: dict[int, dict[str, Any]] = {}
@@ -68,7 +67,7 @@ class Confirmed:
             ProtocolError: a part of it is malformed.
         """
         world = self.world
-        parts, states, turns = decode_parts(snapshot.segments, self._templates, compiled=world.compiled)
+        parts, states, turns = decode_parts(snapshot.segments, self._templates, world.kernel)
         ticks = snapshot.tick - world.tick
         if len(turns) and ticks != 1:
             raise ProtocolError("segment.heads: the tick before was not told")

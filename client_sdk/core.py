@@ -24,7 +24,7 @@ from client_sdk.play import RECONNECTED, Play
 from client_sdk.prediction import Prediction
 from client_sdk.replica import Replica
 from client_sdk.stats import Stats
-from shared import edits, messages
+from shared import edits, kernels, messages
 from shared.checks import text
 from shared.inputs import NEUTRAL, Input, clamp
 from shared.messages import ProtocolError, decode_from_server, encode
@@ -47,7 +47,8 @@ class Core:
         scene: the scene this program was built for, checked by the server; None: the server's is taken.
         token: proves who this is, where the server asks for it.
         patience_s: for so long it tries to come back after a lost connection; 0: that is the end.
-        compiled: run the physics compiled by Numba; None: where it is installed.
+        compiled: run a compiled kernel, or the plain one; None: the one that `shared.kernels` chooses, but the plain
+            one while that has to be compiled: no call of a core waits for a compiler.
         neighbours: predict blocking others, too (see `Prediction`).
 
     Raises:
@@ -77,6 +78,7 @@ class Core:
         self._token = text(token, "token", messages.TOKEN_MAX, shortest=0)
         self._resume = b""
         self._compiled = compiled
+        self._plain_for_now = False
         self._neighbours = neighbours
         self._delay = 0
         self._open = False
@@ -201,6 +203,8 @@ class Core:
 
     def update(self, now: float) -> None:
         """Sends pings that are due, and predicts every tick whose time has come."""
+        if self._plain_for_now and kernels.ready():
+            self._speed_up()
         if self._play and self.state != "closed":
             for message in self._play.follow(now, online=self.state == "playing"):
                 self._send(message)
@@ -282,7 +286,10 @@ class Core:
     def _welcome(self, welcome: messages.Welcome, now: float) -> None:
         if self._filled:
             raise ProtocolError("a second Welcome")
-        world = Replica(welcome, self.clock, now, neighbours=self._neighbours, compiled=self._compiled)
+        self._plain_for_now = self._compiled is None and not kernels.ready()
+        compiled = False if self._plain_for_now else self._compiled
+        world = Replica(welcome, self.clock, now, neighbours=self._neighbours, compiled=compiled)
+        self.stats.kernel = "plain for now" if self._plain_for_now else world.known.world.kernel.form
         if self.scene is not None and world.scene.digests != self.scene.digests:
             raise ProtocolError("Welcome.scene: not the scene that was asked for")
         self.scene, self._resume = world.scene, welcome.resume
@@ -292,6 +299,16 @@ class Core:
         elif self._play:
             self._events += self._orders.give_up()
         self._filled = world
+
+    def _speed_up(self) -> None:
+        """Goes on with the chosen kernel, which is there now."""
+        self._plain_for_now = False
+        kernel = kernels.get()
+        if self._filled is not None:
+            self._filled.use(kernel)
+        if self._play is not None and self._play.world is not self._filled:
+            self._play.world.use(kernel)
+        self.stats.kernel = kernel.form
 
     def _welcomed(self, message: messages.Message) -> Replica:
         if self._filled is None:

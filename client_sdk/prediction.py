@@ -24,7 +24,7 @@ import numpy as np
 
 from client_sdk.confirmed import Confirmed
 from client_sdk.events import Corrected
-from shared import bulk, edits, kernels
+from shared import edits
 from shared.bounds import bounds
 from shared.edits import Edit
 from shared.inputs import NEUTRAL, Input, row
@@ -89,11 +89,7 @@ class Prediction:
         self._inputs: Ring[Input] = Ring(limits.predicted)
         self._states: Ring[Int64s] = Ring(limits.predicted)
         templates = known.world.scene.templates
-        compiled = known.world.compiled
-        ahead = np.array([template.shown == "predicted" for template in templates], np.int64)
-        self._shown_ahead = kernels.lent(ahead, compiled)
-        states = kernels.lent(known.states, compiled)
-        self._alike = kernels.direct(kernels.of(bulk, compiled).alike, states, 0, states, 0, 0, 0, self._shown_ahead)
+        self._shown_ahead = np.array([template.shown == "predicted" for template in templates], np.int64)
         self._edits: dict[int, tuple[int, Edit]] = {}  # by number, with its tick; until there is a verdict
         self._refused = False  # an edit that was carried out in the last replay has been, since
         self._compared = -1
@@ -249,8 +245,9 @@ class Prediction:
         """Whether all that could meet the own entity, or is drawn as predicted, is as predicted."""
         if guess.tobytes() == truth.tobytes():
             return True
-        a, b = kernels.lent(guess, self.confirmed.compiled), kernels.lent(truth, self.confirmed.compiled)
-        return bool(self._alike(a, len(guess), b, len(truth), self.entity, MEET_BLOCKS * BLOCK, self._shown_ahead))
+        kernel, reach = self.confirmed.kernel, MEET_BLOCKS * BLOCK
+        a, b, always = map(kernel.lent, (guess, truth, self._shown_ahead))
+        return bool(kernel.alike(a, len(guess), b, len(truth), self.entity, reach, always))
 
     def _difference(self, guess: Int64s, truth: Int64s) -> tuple[tuple[str, ...], float] | None:
         """In which fields, and by how many blocks, the own entity is not as predicted."""

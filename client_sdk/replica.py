@@ -6,6 +6,7 @@ from client_sdk.picture import Picture
 from client_sdk.prediction import Prediction
 from shared.blocks import unpack
 from shared.checks import Cell
+from shared.kernels import Kernel
 from shared.messages import ProtocolError, Snapshot, Terrain, Welcome
 from shared.scene import Scene
 
@@ -41,6 +42,11 @@ class Replica:
         self.wrong = ""
         """What is not as the server has it, if anything."""
         self._pieces: tuple[Cell, bytearray] = ((0, 0, 0), bytearray())
+
+    def use(self, kernel: Kernel) -> None:
+        """Goes on with another kernel."""
+        self.prediction.confirmed.use(kernel)
+        self.prediction.predicted.use(kernel)
 
     @property
     def complete(self) -> bool:

@@ -49,6 +49,8 @@ class Stats:
     reconnects: int = 0
     divergences: int = 0
     """Alarms; must be 0."""
+    kernel: str = ""
+    """What computes the physics: `prebuilt`, `numba` or `plain` (`shared.kernels`); empty before there is a world."""
     _measured: tuple[float, int, int] | None = field(default=None, repr=False)
 
     @property
@@ -84,6 +86,8 @@ class Stats:
             ("corrections", f"{self.corrections}"),
         ]
         figures += [(f"  {cause}", f"{count}") for cause, count in sorted(self.corrections_by_cause.items())]
+        if self.kernel:
+            figures.append(("kernel", self.kernel))
         if self.reconnects:
             figures.append(("reconnects", f"{self.reconnects}"))
         if self.divergences:

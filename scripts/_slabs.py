@@ -9,7 +9,9 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
+from shared import kernel, kernels
 from shared.blocks import Blocks
+from shared.layout import Arrays
 from shared.units import BLOCK, SEGMENT
 from shared.world import World
 
@@ -130,5 +132,6 @@ def boxes_on(world: World, count: int) -> Boxes:
 def dense_hits(world: World, boxes: Boxes) -> Flags:
     """The same by the product's own look-up."""
     out = np.zeros(len(boxes), np.bool_)
-    _dense(world._kernel.blocks_in, world._arrays, boxes, out)
+    arrays = Arrays(*map(np.asarray, world.arrays))
+    _dense(kernels.jitted(kernel).blocks_in, arrays, boxes, out)
     return out

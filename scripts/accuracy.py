@@ -119,7 +119,7 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--quick", action="store_true", help="fewer players, for less time")
     args = parser.parse_args(argv)
     console = Console()
-    if not kernels.available():
+    if not kernels.numba_installed():
         console.print("error: Numba is not installed; the variants are compiled by it")
         return 2
     if args.plot and (why := lacking("matplotlib")):

@@ -74,7 +74,7 @@ def ratios(samples: Samples) -> list[float]:
 
 def run_physics(args: argparse.Namespace, console: Console) -> tuple[Report, int]:
     if not kernels.available():
-        console.print("error: Numba is not installed; the benchmark times the compiled step")
+        console.print("error: there is neither a prebuilt kernel nor Numba; the benchmark times the compiled step")
         return {}, 2
     rounds = 10 if args.quick else 60
     rows: list[Row] = []

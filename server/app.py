@@ -35,8 +35,8 @@ from server.store import Store
 from server.ticker import Ticker, best_alarm
 from server.warmup import warm_up
 from server.watchdog import Watchdog
+from shared import kernels
 from shared.checks import SceneError
-from shared.kernels import compiling
 from shared.scene import Scene, load_scene
 
 READY_S = 1.0
@@ -98,7 +98,10 @@ def run(settings: Settings) -> int:
     if settings.reach is not None:
         scene = dataclasses.replace(scene, reach=settings.reach)
     scene = rules.prepare(scene)
-    with compiling(lambda: announce_compiling(sys.stderr)):
+    kernels.force(settings.kernel)
+    if settings.kernel == kernels.AUTO and kernels.trouble():
+        logger.warning("the physics is slower, or has to be compiled", kernel=kernels.describe())
+    with kernels.compiling(lambda: announce_compiling(sys.stderr)):
         warm_up(scene)
     with asyncio.Runner(loop_factory=loop_factory()) as runner, contextlib.ExitStack() as stack:
         store = world = None
@@ -161,7 +164,8 @@ class Server:
             self.watchdog = Watchdog(loop)
             freeze()
             kind = type(loop).__module__.partition(".")[0]
-            logger.info("started", scene=self.game.scene.name, tick_rate=rate, loop=kind, auth=self.settings.auth)
+            scene, auth, form = self.game.scene.name, self.settings.auth, self.game.world.kernel.form
+            logger.info("started", scene=scene, tick_rate=rate, loop=kind, auth=auth, kernel=form)
             secure, host = "" if self.settings.tls_cert is None else "s", self.settings.host
             print(f"listening on ws{secure}://{bracketed(host)}:{port}", flush=True)
             if self.settings.page and self.door.trusted(reachable(address)):

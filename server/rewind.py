@@ -22,7 +22,7 @@ import numpy as np
 import numpy.typing as npt
 
 from server.rays import Ray
-from shared import bulk, kernels, layout
+from shared import layout
 from shared.checks import Cell, Vec, finite, vector
 from shared.layout import ID, TEMPLATE, Int64s, X
 from shared.scene import Scene
@@ -78,8 +78,6 @@ class Rewind:
         self._alive = 0
         self._now = np.zeros((0, len(KEPT)), np.int64)
         self._begin()
-        w, now = world.arrays, kernels.lent(self._now, world.compiled)
-        self._recall = kernels.direct(kernels.of(bulk, world.compiled).recall, w.entities, w.changed, now, now, 0)
 
     def record(self) -> None:
         """Takes in what the step has changed."""
@@ -93,8 +91,8 @@ class Rewind:
             self._now = np.concatenate((self._now, np.zeros((more, len(KEPT)), np.int64)))
         n = int(w.lengths[layout.N_CHANGED])
         rows = np.empty((n, 1 + len(KEPT)), np.int64)
-        now, before = kernels.lent(self._now, world.compiled), kernels.lent(rows, world.compiled)
-        self._alive += self._recall(w.entities, w.changed, now, before, n)
+        now, before = world.kernel.lent(self._now), world.kernel.lent(rows)
+        self._alive += world.kernel.recall(w.entities, w.changed, now, before, n)
         if self._alive != len(world):  # some have been removed
             matrix = world.matrix
             gone = np.flatnonzero(self._now[: len(matrix), 0] != matrix[:, ID])

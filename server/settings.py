@@ -15,6 +15,7 @@ from server.kinds import Kind, Parser, SettingsError, checked, kinds_of, nearest
 from server.limits import Limits
 from server.log import FORMATS
 from server.tokens import KEY_VARIABLE
+from shared import kernels
 from shared.bounds import TICK_RATE_MAX
 from shared.checks import SceneError
 from shared.scene import SCENES, load_scene
@@ -92,6 +93,14 @@ class Settings:
     game: str | None = setting(None, Kind(str, "the rules of a game (default: none)", "MODULE:CLASS"))
     seed: int = setting(0, Kind(int, "of the randomness of its rules", "N", 0, (1 << 63) - 1))
     record: str | None = setting(None, Kind(str, "record every change of the world into a new file", "FILE"))
+    kernel: str = setting(
+        kernels.AUTO,
+        Kind(
+            str,
+            "what computes the physics, all to the same bits; auto: the first that is there",
+            choices=kernels.CHOICES,
+        ),
+    )
     data: str | None = setting(None, Kind(str, "save the world there, and go on with the one that is there", "DIR"))
     durability: str = setting(
         "power",
@@ -110,12 +119,13 @@ class Settings:
             for name in names:
                 value = getattr(owner, name)
                 line = f"# {name} is not set" if value is None else f"{name} = {to_toml(value)}"
-                lines.append(f"{line}  # {self.origins.get(name, 'default')}")
+                runs = f"; runs: {kernels.describe(self.kernel)}" if name == "kernel" else ""
+                lines.append(f"{line}  # {self.origins.get(name, 'default')}{runs}")
         return "\n".join(lines) + "\n"
 
 
 GROUPS = {
-    "what is played": ("scene", "game", "seed", "tick_rate", "reach"),
+    "what is played": ("scene", "game", "seed", "tick_rate", "reach", "kernel"),
     "where it listens": ("host", "port", "tls_cert", "tls_key", "allowed_origins", "allowed_hosts"),
     "who may play": ("auth", "auth_key_file"),
     "what is kept": ("data", "durability", "checkpoint_s", "record"),
@@ -187,6 +197,8 @@ def _check_together(settings: Settings) -> None:
                 f"allowed_hosts = {name!r} (from {settings.origins['allowed_hosts']}): must be a host name, without "
                 f"scheme and port, or {ANY} for all"
             )
+    if why := kernels.missing(settings.kernel):
+        raise SettingsError(f"kernel = {settings.kernel!r} (from {settings.origins['kernel']}): {why}")
     if (settings.tls_cert is None) != (settings.tls_key is None):
         given, missing = ("tls_cert", "tls_key") if settings.tls_key is None else ("tls_key", "tls_cert")
         raise SettingsError(f"{given} (from {settings.origins[given]}): needs {missing} as well")

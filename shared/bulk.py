@@ -188,9 +188,7 @@ def wire_state(packed: Any, to: int, e: Any, at: int) -> int:
 
 
 @jit
-def news(
-    e: Any, changed: Any, lengths: Any, tick: int, every: int, ids: Any, parts: Any, due: Any, packed: Any
-) -> tuple[int, int]:
+def news(e: Any, changed: Any, lengths: Any, tick: int, every: int, ids: Any, parts: Any, due: Any, packed: Any) -> int:
     """What has happened to entities, by segment, as it is packed in `shared.snapshot`.
 
     Args:
@@ -198,11 +196,12 @@ def news(
         ids: [n] gets those to which something happened, segment by segment, those that are sent whole last.
         parts: [n * 8] gets each segment's index, then where in `ids` those sent whole begin, and end; and where in
             `packed` its heads, tails and rows end.
-        due: [n * 3] gets the index of each segment that is due, once for each that has changed there.
+        due: [1 + n * 3] gets the count of the numbers that follow; then the index of each segment that is due, once for
+            each entity that has changed there.
         packed: [n * 33] gets the bytes.
 
     Returns:
-        How many numbers have gone to `parts` and to `due`.
+        The count of the numbers in `parts`.
     """
     told = n_parts = n_due = 0
     for i in range(lengths[N_CHANGED]):
@@ -213,14 +212,15 @@ def news(
         y = e[at + Y] >> TO_SEGMENT
         z = e[at + Z] >> TO_SEGMENT
         if (x + 3 * y + 5 * z + tick) % every == 0:
-            due[n_due] = x
-            due[n_due + 1] = y
-            due[n_due + 2] = z
+            due[n_due + 1] = x
+            due[n_due + 2] = y
+            due[n_due + 3] = z
             n_due += 3
         if e[at + CHANGED] & ALL_EVENTS != 0:
             ids[told] = at
             told += 1
 
+    due[0] = n_due
     gap = 1
     while gap < told:
         gap = 3 * gap + 1
@@ -271,7 +271,7 @@ def news(
         for i in range(start, end):
             ids[i] = e[ids[i] + ID]
         start = end
-    return n_parts, n_due
+    return n_parts
 
 
 @jit

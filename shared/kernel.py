@@ -760,20 +760,20 @@ def follow(w: Arrays, turns: Any, n: int, rows: int, ticks: int, tick: int) -> b
 
 @jit
 def collect(e: Any, rows: int, out: Any) -> int:
-    """Copies the states in use to `out` ([rows, 12]), ascending by id, and without bookkeeping; how many."""
+    """Copies the states in use to `out` ([rows * 12]), ascending by id, without bookkeeping; how many."""
     n = 0
     for row in range(rows):
         from_ = row << WIDTH_SHIFT
         entity = e[from_ + ID]
         if entity == 0:
             continue
-        at = n
-        while at > 0 and out[at - 1, ID] > entity:
+        at = CELL * n
+        while at > 0 and out[at - CELL + ID] > entity:
             for k in range(CELL):
-                out[at, k] = out[at - 1, k]
-            at -= 1
+                out[at + k] = out[at - CELL + k]
+            at -= CELL
         for k in range(CELL):
-            out[at, k] = e[from_ + k]
-        out[at, FLAGS] &= FALLING
+            out[at + k] = e[from_ + k]
+        out[at + FLAGS] &= FALLING
         n += 1
     return n

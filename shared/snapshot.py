@@ -25,7 +25,6 @@ from its surroundings, so the result is exact whether the client knows them or n
 changed its segment, is sent whole, as is all that something has happened to in a span of more ticks than one.
 """
 
-import functools
 import hashlib
 from collections.abc import Collection, Sequence
 from typing import Any, NamedTuple
@@ -34,6 +33,7 @@ import numpy as np
 
 from shared import bulk, kernels
 from shared.checks import Cell
+from shared.kernels import Kernel
 from shared.layout import (
     BUTTONS,
     CELL,
@@ -94,7 +94,6 @@ STATE_HIGH = np.array(
     np.int64,
 )
 """The bounds of a state on the wire: nothing a peer sends may take the kernel out of its tables."""
-BOUNDS = {compiled: [kernels.lent(bound, compiled) for bound in (STATE_LOW, STATE_HIGH)] for compiled in (False, True)}
 
 
 class SegmentPart(NamedTuple):
@@ -149,10 +148,6 @@ class News:
     def __init__(self, world: World, check_ticks: int) -> None:
         self._world, self._check_ticks = world, check_ticks
         self._allocate(len(world.arrays.changed))
-        w, mine = world.arrays, (self._ids, self._parts, self._due, self._packed)
-        self._news = kernels.direct(
-            kernels.of(bulk, world.compiled).news, w.entities, w.changed, w.lengths, 0, 1, *mine
-        )
 
     def pack(self, acted: Collection[int], placed: Collection[int] = ()) -> tuple[list[Share], set[Cell]]:
         """What there is to tell of the entities that the latest step changed, and the segments of them that are due.
@@ -162,10 +157,10 @@ class News:
             placed: ids that the rules placed.
         """
         w, tick = self._world.arrays, self._world.tick
-        if len(w.changed) > len(self._ids):
+        if len(w.changed) >= len(self._ids):
             self._allocate(len(w.changed))
         mine = self._ids, self._parts, self._due, self._packed
-        n_parts, n_due = self._news(w.entities, w.changed, w.lengths, tick, self._check_ticks, *mine)
+        n_parts = self._world.kernel.news(w.entities, w.changed, w.lengths, tick, self._check_ticks, *mine)
         shares: list[Share] = []
         start = at = 0
         parts = self._parts[:n_parts].tolist()
@@ -181,13 +176,13 @@ class News:
             fields = packed[: heads - at], packed[heads - at : tails - at], packed[tails - at :]
             shares.append(Share((x, y, z), ids, ids[whole - start :], fields))
             start, at = end, stop
-        due = self._due[:n_due].tolist()
-        return shares, {(due[i], due[i + 1], due[i + 2]) for i in range(0, n_due, 3)}
+        due = self._due[1 : 1 + self._due[0]].tolist()
+        return shares, {(due[i], due[i + 1], due[i + 2]) for i in range(0, len(due), 3)}
 
     def _allocate(self, room: int) -> None:
         """Makes room for so many entities."""
         self._ids, self._parts, self._due, self._packed = (
-            kernels.lent(np.empty(room * numbers, kind), self._world.compiled)
+            self._world.kernel.lent(np.empty(1 + room * numbers, kind))
             for numbers, kind in ((1, np.int64), (8, np.int64), (3, np.int64), (ROW_BYTES, np.uint8))
         )
 
@@ -231,9 +226,9 @@ def checksum(world: World, segment: Cell) -> int:
 
     It is the first 4 bytes, little-endian, of a SHA-256: over the segment's digest and the rows of its entities.
     """
-    kernel = kernels.of(bulk, world.compiled)
+    kernel = world.kernel
     keys, packed = np.empty(len(world), np.int64), np.empty(len(world) * ROW_BYTES, np.uint8)
-    mine = kernels.lent(keys, world.compiled), kernels.lent(packed, world.compiled)
+    mine = kernel.lent(keys), kernel.lent(packed)
     end = kernel.muster(world.arrays.entities, world.arrays.heads, *mine, world.blocks.rows[segment])
     whole = hashlib.sha256(world.blocks.digest(segment))
     whole.update(packed[:end].data)
@@ -241,9 +236,9 @@ def checksum(world: World, segment: Cell) -> int:
 
 
 def decode_parts(
-    segments: Sequence[Any], templates: int, *, compiled: bool = False
+    segments: Sequence[Any], templates: int, kernel: Kernel | None = None
 ) -> tuple[list[SegmentPart], Int64s, Int64s]:
-    """Checks and unpacks `Snapshot.segments`, in a scene of so many templates; `compiled` by Numba, or not.
+    """Checks and unpacks `Snapshot.segments`, in a scene of so many templates, by a kernel (None: the plain one).
 
     Returns:
         The parts, the states ([n, 12], as `World.put` takes them but for `ACTED` and `PLACED`) of all their entities,
@@ -258,42 +253,24 @@ def decode_parts(
     news: tuple[list[bytes], list[bytes], list[bytes]] = ([], [], [])
     parts = [_decode_part(segment, corners, news) for segment in segments]
     heads, tails, rows = map(b"".join, news)
-    states = _decode_rows(rows, corners, templates, compiled) if rows else NO_STATES
-    return parts, states, _decode_turns(heads, tails, compiled) if heads or tails else NO_TURNS
+    kernel = kernel or kernels.get(False)
+    states = _decode_rows(rows, corners, templates, kernel) if rows else NO_STATES
+    return parts, states, _decode_turns(heads, tails, kernel) if heads or tails else NO_TURNS
 
 
-def _decode_rows(rows: bytes, corners: list[int], templates: int, compiled: bool) -> Int64s:
+def _decode_rows(rows: bytes, corners: list[int], templates: int, kernel: Kernel) -> Int64s:
     states = np.empty((len(rows) // ROW_BYTES, CELL), np.int64)
-    read_rows, _ = _reading(compiled)
-    of_parts = kernels.lent(np.array(corners, np.int64), compiled)
-    if not read_rows(rows, of_parts, *BOUNDS[compiled], templates, kernels.lent(states, compiled)):
+    of_parts, low, high = map(kernel.lent, (np.array(corners, np.int64), STATE_LOW, STATE_HIGH))
+    if not kernel.read_rows(rows, of_parts, low, high, templates, kernel.lent(states)):
         raise ProtocolError("segment.rows: a value is out of range")
     return states
 
 
-def _decode_turns(heads: bytes, tails: bytes, compiled: bool) -> Int64s:
+def _decode_turns(heads: bytes, tails: bytes, kernel: Kernel) -> Int64s:
     turns = np.empty((len(heads) // HEAD.itemsize, TURN), np.int64)
-    _, read_turns = _reading(compiled)
-    if not read_turns(heads, tails, kernels.lent(turns, compiled)):
+    if not kernel.read_turns(heads, tails, kernel.lent(turns)):
         raise ProtocolError("segment.tails: too many or too few")
     return turns
-
-
-@functools.cache
-def _reading(compiled: bool) -> tuple[Any, Any]:
-    """`read_rows` and `read_turns` of a kernel."""
-    kernel, some = kernels.of(bulk, compiled), kernels.lent(NO_TURNS, compiled)
-    return (
-        kernels.direct(kernel.read_rows, b"", some, some, some, 0, some),
-        kernels.direct(kernel.read_turns, b"", b"", some),
-    )
-
-
-def prepare(compiled: bool) -> None:
-    """Has everything compiled that parts are read and checked by: the first checksum comes when one plays already."""
-    _reading(compiled)
-    ids, heads, packed = (kernels.lent(np.zeros(0, kind), compiled) for kind in (np.int64, np.int32, np.uint8))
-    kernels.direct(kernels.of(bulk, compiled).muster, ids, heads, ids, packed, 0)
 
 
 def _decode_part(part: Any, corners: list[int], news: tuple[list[bytes], ...]) -> SegmentPart:

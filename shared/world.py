@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from shared import blocks, kernel, kernels, layout, terrain
+from shared import blocks, kernels, layout, terrain
 from shared.checks import Cell, SceneError, whole
 from shared.inputs import Input
 from shared.layout import ENTITY, FALLING, FLAGS, ID, NEXT, PREV, TEMPLATE, VX, Arrays, X
@@ -42,7 +42,7 @@ class World:
 
     Args:
         scene: the rules.
-        compiled: run the kernel compiled by Numba; None: where Numba is installed.
+        compiled: run a compiled kernel, or the plain one; None: the one that `kernels` chooses.
     """
 
     def __init__(self, scene: Scene, *, compiled: bool | None = None) -> None:
@@ -50,8 +50,8 @@ class World:
         self.tick = 0
         """How many ticks have passed; see `rebase`."""
         self.blocks = blocks.Blocks()
-        self.compiled = kernels.available() if compiled is None else compiled
-        self._kernel: Any = kernels.of(kernel, self.compiled)
+        self.kernel = kernels.get(compiled)
+        """What steps it; its functions are for all that works on this world."""
         self._templates, self._walk, self._parameters = scene.kernel_tables()
         self._row_of: dict[int, int] = {}
         self._next_id = 1
@@ -73,11 +73,7 @@ class World:
         self._changed = self._fell = np.zeros(0, np.int64)
         self._allocate(8)
         self._bind()
-        told = self._told = self._lent(self._inputs)
-        self._step = kernels.direct(self._kernel.step, self._arrays, told, 0, 0)
-        self._store = kernels.direct(self._kernel.store, self._arrays, told, told, 0, 0)
-        self._follow = kernels.direct(self._kernel.follow, self._arrays, told, 0, 0, 0, 0)
-        self._collect = kernels.direct(self._kernel.collect, told, 0, np.zeros((0, STATES), np.int64))
+        self._told = self.kernel.lent(self._inputs)
 
     # -- reading -------------------------------------------------------------------------------------------
 
@@ -104,7 +100,7 @@ class World:
         """The whole states of all entities, [n, 12], ascending by id: equal worlds have equal ones. A copy."""
         if self.compiled and self._rows <= COLLECT_MAX:
             out = np.empty((self._rows, STATES), np.int64)
-            return out[: self._collect(self._arrays.entities, self._rows, out)]
+            return out[: self.kernel.collect(self._arrays.entities, self._rows, self.kernel.lent(out))]
         rows: layout.Int64s = self._entities[: self._rows, :STATES]
         rows = rows[rows[:, ID] != 0]
         rows = rows[np.argsort(rows[:, ID])]
@@ -157,6 +153,11 @@ class World:
         view: layout.Int64s = self._entities[: self._rows]
         view.flags.writeable = False
         return view
+
+    @property
+    def compiled(self) -> bool:
+        """Whether its kernel is a compiled one."""
+        return self.kernel.compiled
 
     @property
     def arrays(self) -> Arrays:
@@ -223,7 +224,7 @@ class World:
         if self.blocks.load(index, kinds):
             self._bind()
         if self._lengths[layout.N_HOMELESS]:
-            self._kernel.relink_range(self._arrays, 0, self._rows)
+            self.kernel.relink_range(self._bound, 0, self._rows)
         self._wake_segment(index)
 
     def unload_segment(self, index: Cell) -> None:
@@ -269,7 +270,7 @@ class World:
             self.editing.setdefault((x, y, z), before)
             if kind == blocks.AIR:
                 face = (x * BLOCK, y * BLOCK, (x + 1) * BLOCK, (y + 1) * BLOCK, (z + 1) * BLOCK)
-                self._kernel.wake_on(self._arrays, -1, *face)
+                self.kernel.wake_on(self._bound, -1, *face)
         states, placing = [self.state(entity) for entity in in_the_way], set(self.placing)
         try:
             for entity in in_the_way:
@@ -335,7 +336,7 @@ class World:
         states[:, TEMPLATE] = kind
         states[:, X : X + 3] = at
         rows = np.array([self._row(entity) for entity in ids], np.int64)
-        settled = self._kernel.settle(self._arrays, self._lent(rows), self._lent(states), n, self.tick + 1)
+        settled = self.kernel.settle(self._bound, self.kernel.lent(rows), self.kernel.lent(states), n, self.tick + 1)
         if settled < n:
             for entity in ids[settled:]:
                 self._free.append(self._row_of.pop(entity))
@@ -379,7 +380,7 @@ class World:
         """
         row = self._row_of.pop(entity)
         self._leave(row)
-        self._kernel.unlink(self._arrays, row)
+        self.kernel.unlink(self._bound, row)
         self._entities[row, ID] = 0
         (self._limbo if self._entities[row, FLAGS] & layout.AWAKE else self._free).append(row)
 
@@ -389,7 +390,7 @@ class World:
         ids = new[:, ID].tolist()
         known = list(map(self._row_of.get, ids))
         rows = np.array([self._row(entity) for entity in ids] if None in known else known, np.int64)
-        self._store(self._arrays, self._lent(rows), self._lent(new), len(rows), self.tick + 1)
+        self.kernel.store(self._bound, self.kernel.lent(rows), self.kernel.lent(new), len(rows), self.tick + 1)
 
     def write_blocks(self, segment: Cell, offsets: Iterable[int], kinds: Iterable[int]) -> None:
         """Changes blocks of a loaded segment (by index z << 10 | y << 5 | x): what a snapshot says, verbatim.
@@ -404,8 +405,8 @@ class World:
             )
             self.editing.setdefault((x, y, z), self.blocks.get(x, y, z) or blocks.AIR)
             self.blocks.set(x, y, z, kind)
-            self._kernel.wake_on(
-                self._arrays, -1, x * BLOCK, y * BLOCK, (x + 1) * BLOCK, (y + 1) * BLOCK, (z + 1) * BLOCK
+            self.kernel.wake_on(
+                self._bound, -1, x * BLOCK, y * BLOCK, (x + 1) * BLOCK, (y + 1) * BLOCK, (z + 1) * BLOCK
             )
 
     def follow(self, turns: layout.Int64s, ticks: int, tick: int) -> bool:
@@ -422,7 +423,7 @@ class World:
         if len(turns):
             row_of = self._row_of
             turns[:, 0] = [row_of.get(entity, -1) for entity in turns[:, 0].tolist()]
-        there = self._follow(self._arrays, self._lent(turns), len(turns), self._rows, ticks, self.tick + 1)
+        there = self.kernel.follow(self._bound, self.kernel.lent(turns), len(turns), self._rows, ticks, self.tick + 1)
         self._rebased(tick)
         return bool(there)
 
@@ -460,13 +461,13 @@ class World:
                 told += (self._row_of[entity], *wish)
             if len(told) > len(self._inputs):
                 self._inputs = np.zeros(2 * len(told), np.int64)
-                self._told = self._lent(self._inputs)
+                self._told = self.kernel.lent(self._inputs)
             self._inputs[: len(told)] = told
         self.tick += 1
         self.edited, self.editing = self.editing, {}
         if self.placing or self.placed:
             self.placed, self.placing = self.placing, set()
-        self._step(self._arrays, self._told, n, self.tick)
+        self.kernel.step(self._bound, self._told, n, self.tick)
         if self._limbo:
             self._free += self._limbo
             self._limbo.clear()
@@ -502,6 +503,12 @@ class World:
         if moved:
             self._bind()
 
+    def use(self, kernel: kernels.Kernel) -> None:
+        """Goes on with another kernel; the state stays the same."""
+        self.kernel = kernel
+        self._told = kernel.lent(self._inputs)
+        self._bind()
+
     # -- inside --------------------------------------------------------------------------------------------
 
     def _allocate(self, rows: int) -> None:
@@ -519,10 +526,8 @@ class World:
             self._awake, self._next_awake, self._woken, self._later, self._candidates, self._changed, self._fell,
             self._lengths, b.near,
         )  # fmt: skip
-        self._arrays = Arrays(*(self._lent(array) for array in arrays))
-
-    def _lent(self, array: np.ndarray[Any, Any]) -> Any:
-        return kernels.lent(array, self.compiled)
+        self._arrays = Arrays(*map(self.kernel.lent, arrays))
+        self._bound = self.kernel.bound(self._arrays)
 
     def _row(self, entity: int) -> int:
         """The row of an entity, a new one if it is not known."""
@@ -560,7 +565,7 @@ class World:
 
     def _near(self, but: int, box: list[int]) -> layout.Int64s:
         """The candidates of the kernel for a box (`but`: a row left out, or -1), [n, 7]."""
-        end = self._kernel.gather(self._arrays, but, True, *box)
+        end = self.kernel.gather(self._bound, but, True, *box)
         return self._candidates[: end // layout.CANDIDATE]
 
     def _overlapping(self, but: int, box: list[int]) -> list[int]:
@@ -571,7 +576,7 @@ class World:
         return sorted(self._entities[near[hits, 6], ID].tolist())
 
     def _taken(self, row: int, kind: int, box: list[int]) -> bool:
-        if self._kernel.blocks_in(self._arrays, *box):
+        if self.kernel.blocks_in(self._bound, *box):
             return True
         return self._meets(kind) and bool(self._overlapping(row, box))
 
@@ -621,12 +626,12 @@ class World:
     def _wake_segment(self, index: Cell) -> None:
         """Wakes what overlaps or touches a segment."""
         low = [part * SEGMENT * BLOCK for part in index]
-        self._kernel.wake_in(self._arrays, *low, *(part + SEGMENT * BLOCK for part in low))
+        self.kernel.wake_in(self._bound, *low, *(part + SEGMENT * BLOCK for part in low))
 
     def _leave(self, row: int) -> None:
         """Wakes what stands on an entity that is about to go or to change."""
         box = self._box_at(int(self._entities[row, TEMPLATE]), self._entities[row, X : X + 3].tolist())
-        self._kernel.wake_on(self._arrays, row, box[0], box[1], box[3], box[4], box[5])
+        self.kernel.wake_on(self._bound, row, box[0], box[1], box[3], box[4], box[5])
 
 
 def hash_of(tick: int, segments: layout.Int64s, digests: npt.NDArray[np.uint8], states: layout.Int64s) -> bytes:

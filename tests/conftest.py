@@ -1,6 +1,6 @@
 """Property tests are the same in every run and on every machine: the same examples, and no limit on time.
 
-A test that steps a world runs it both ways: compiled by Numba, and the same source plain.
+A test that steps a world runs it both ways: by the compiled kernel that runs here, and by the same source plain.
 """
 
 import signal
@@ -20,7 +20,7 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
 
 @pytest.fixture(
     params=[
-        pytest.param(True, marks=pytest.mark.skipif(not kernels.available(), reason="Numba is not installed")),
+        pytest.param(True, marks=pytest.mark.skipif(not kernels.available(), reason="there is no compiled kernel")),
         False,
     ],
     ids=["compiled", "plain"],

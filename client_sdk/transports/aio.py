@@ -17,6 +17,7 @@ from types import TracebackType
 from typing import Any, cast
 
 from client_sdk.base import BaseClient
+from client_sdk.compiling import COMPILER
 from client_sdk.core import EVENTS_MAX, READ_BYTES, Core
 from client_sdk.events import Event
 from client_sdk.linked import LinkedCore
@@ -91,6 +92,7 @@ class AsyncClient(BaseClient):
         Raises:
             ConnectError: there is no connection; the text says why and what to do.
         """
+        COMPILER.begin()
         core = LinkedCore(name, scene, token=token, patience_s=patience_s)
         core.link = link
         client = cls(core, url, before_update, tls)

@@ -8,6 +8,7 @@ from client_sdk.links import Path
 from client_sdk.stats import Stats
 from client_sdk.transports.loopback import Loopback
 from server.game import Game
+from shared import kernels
 from shared.scene import load_scene
 from tests.match import Match, wander
 
@@ -63,8 +64,9 @@ def test_the_overlay_is_text_to_draw() -> None:
         client.update(frame / 60)
     lines = client.overlay().splitlines()
     assert [line[:16].strip() for line in lines] == [
-        "round trip", "lead", "snapshot age", "up", "down", "late inputs", "corrections",
+        "round trip", "lead", "snapshot age", "up", "down", "late inputs", "corrections", "kernel",
     ]  # fmt: skip
+    assert lines[-1].split()[-1] == kernels.chosen()
     assert {len(line) for line in lines} == {26}
     client.stats.reconnects = client.stats.divergences = 1
     assert [line.split()[0] for line in client.overlay().splitlines()[-2:]] == ["reconnects", "DIVERGED"]

@@ -28,7 +28,7 @@ def on_a_terminal(cache: Path) -> list[str]:
     """The lines that somebody sees who starts a server, up to the one that it listens."""
     seen, its = os.openpty()
     command = [sys.executable, "-m", "server", "--port", "0", "--scene", "flat", "--log-level", "warning"]
-    environment = {**os.environ, "NUMBA_CACHE_DIR": str(cache)}
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(cache), kernels.VARIABLE: kernels.NUMBA}
     with subprocess.Popen(command, cwd=ROOT, env=environment, stdin=its, stdout=its, stderr=its) as process:
         os.close(its)
         try:
@@ -42,17 +42,19 @@ def on_a_terminal(cache: Path) -> list[str]:
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(os.name == "nt" or not kernels.available(), reason="needs a terminal, and something to compile")
+@pytest.mark.skipif(os.name == "nt" or not kernels.numba_installed(), reason="needs a terminal, and Numba")
 def test_the_first_start_says_on_a_terminal_what_takes_so_long(tmp_path: Path) -> None:
     assert on_a_terminal(tmp_path) == ["compiling", "listening"]
     assert on_a_terminal(tmp_path) == ["listening"]
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(not kernels.available(), reason="there is nothing to compile")
+@pytest.mark.skipif(not kernels.numba_installed(), reason="Numba is not installed")
 def test_the_first_start_says_in_a_log_what_takes_so_long(tmp_path: Path) -> None:
     for lines in ([COMPILING], []):
-        with running("--port", "0", "--scene", "flat", NUMBA_CACHE_DIR=str(tmp_path)) as server:
+        with running(
+            "--port", "0", "--scene", "flat", NUMBA_CACHE_DIR=str(tmp_path), SOVEREIGN_KERNEL="numba"
+        ) as server:
             server.address()
             assert server.end(signal.SIGTERM) == 0
             assert [json.loads(line)["event"] for line in server.errors if "compiling" in line] == lines

@@ -13,7 +13,7 @@ from shared import kernels
 ROOT = Path(__file__).resolve().parent.parent.parent
 pytestmark = [
     pytest.mark.slow,
-    pytest.mark.skipif(not kernels.available(), reason="the reports need Numba"),
+    pytest.mark.skipif(not kernels.numba_installed(), reason="the reports need Numba"),
 ]
 
 CHOICES = {"format", "integrator", "tick_rate", "mover", "obstacles", "executor"}

@@ -5,7 +5,7 @@ import random
 import numpy as np
 import pytest
 
-from shared import bulk, kernels
+from shared import kernels
 from shared.layout import CELL, ID, TEMPLATE, Int64s, X
 
 REACH = 10
@@ -46,12 +46,12 @@ def changed(states: Int64s, rng: random.Random) -> Int64s:
 @pytest.mark.parametrize("seed", range(8))
 def test_alike_are_those_whose_rows_that_count_are_equal(seed: int, compiled: bool) -> None:
     rng = random.Random(seed)
-    kernel = kernels.of(bulk, compiled)
+    kernel = kernels.get(compiled)
     found = set()
     for _ in range(200):
         a = drawn(rng)
         b = changed(a, rng)
-        flat, other, always = (kernels.lent(array, compiled) for array in (a, b, ALWAYS))
+        flat, other, always = map(kernel.lent, (a, b, ALWAYS))
         alike = bool(kernel.alike(flat, len(a), other, len(b), 1, REACH, always))
         assert alike == np.array_equal(that_count(a, 1), that_count(b, 1))
         found.add((alike, np.array_equal(a, b)))

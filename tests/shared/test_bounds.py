@@ -28,17 +28,21 @@ WORK = (
 CONTROL = """
 import numpy as np
 from shared import bulk, kernels
-kernels.of(bulk, True).sort(np.zeros(3, np.int64), 4)
+kernels.jitted(bulk).sort(np.zeros(3, np.int64), 4)
 """
 
 pytestmark = [
     pytest.mark.slow,
-    pytest.mark.skipif(not kernels.available(), reason="there is nothing compiled without Numba"),
+    pytest.mark.skipif(not kernels.numba_installed(), reason="Numba is not installed"),
 ]
 
 
 def test_no_index_is_out_of_bounds(tmp_path: Path) -> None:
-    environment = os.environ | {"NUMBA_BOUNDSCHECK": "1", "NUMBA_CACHE_DIR": str(tmp_path)}
+    environment = os.environ | {
+        "NUMBA_BOUNDSCHECK": "1",
+        "NUMBA_CACHE_DIR": str(tmp_path),
+        kernels.VARIABLE: kernels.NUMBA,
+    }
 
     def run(*arguments: str) -> subprocess.CompletedProcess[str]:
         return subprocess.run(

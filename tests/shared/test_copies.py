@@ -122,7 +122,6 @@ def test_a_step_leaves_what_it_was_copied_from_alone(compiled: bool) -> None:
 
 def test_both_kernels_share_a_past() -> None:
     """A compiled world is restored from a plain one and goes on alike."""
-    pytest.importorskip("numba")
     plain = crowd(False)
     steps(plain, 20, {1: EAST, 2: WEST})
     compiled = World(plain.scene, compiled=True)

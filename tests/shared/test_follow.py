@@ -63,7 +63,7 @@ class Told:
         parts = [join_part(share.segment, 1, share.packed) for share in shares]
         self.bytes += sum(map(len, parts))
         templates = len(self.world.scene.templates)
-        _, states, turns = decode_parts(list(map(msgpack.unpackb, parts)), templates, compiled=self.world.compiled)
+        _, states, turns = decode_parts(list(map(msgpack.unpackb, parts)), templates, self.world.kernel)
         self.other.put(states)
         assert self.other.follow(turns, self.world.tick - self.other.tick, self.world.tick)
 
@@ -195,8 +195,9 @@ def test_news_are_packed_in_the_order_of_ids_segment_by_segment(n: int, compiled
     lengths = np.zeros(LENGTHS, np.int64)
     lengths[N_CHANGED] = len(changed)
     lists = {"entities": matrix, "changed": np.append(changed, 0), "lengths": lengths}
-    arrays = SimpleNamespace(**{name: kernels.lent(each, compiled) for name, each in lists.items()})
-    world = SimpleNamespace(arrays=arrays, tick=7, compiled=compiled)
+    kernel = kernels.get(compiled)
+    arrays = SimpleNamespace(**{name: kernel.lent(each) for name, each in lists.items()})
+    world = SimpleNamespace(arrays=arrays, tick=7, kernel=kernel)
     shares, due = News(world, 4).pack(acted)  # type: ignore[arg-type]
     told: dict[Cell, list[Int64s]] = {}
     everywhere: set[Cell] = set()

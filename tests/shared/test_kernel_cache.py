@@ -14,13 +14,13 @@ READ = """
 import numpy as np
 from shared import bulk, kernels, layout
 turns = np.zeros(8, np.int64)
-assert kernels.of(bulk, True).read_turns(bytes((1, 0, 0, 0, layout.TOLD)), b"\\1\\2\\3", turns)
+assert kernels.jitted(bulk).read_turns(bytes((1, 0, 0, 0, layout.TOLD)), b"\\1\\2\\3", turns)
 print(turns[2:5].tolist())
 """
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(not kernels.available(), reason="there is nothing compiled without Numba")
+@pytest.mark.skipif(not kernels.numba_installed(), reason="Numba is not installed")
 def test_a_constant_that_changes_in_another_file_is_compiled_anew(tmp_path: Path) -> None:
     shutil.copytree(ROOT / "shared", tmp_path / "shared", ignore=shutil.ignore_patterns("__pycache__"))
 

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from shared import bulk, kernels
+from shared import kernels
 from shared.blocks import BLOCKS, PACKED_MAX, pack, unpack
 from shared.checks import Cell
 from shared.inputs import Input
@@ -28,7 +28,6 @@ from shared.snapshot import (
     decode_parts,
     encode_part,
     encode_rows,
-    prepare,
 )
 from tests.worlds import build
 
@@ -123,7 +122,7 @@ def test_parts_share_one_table_of_states_and_each_has_its_own_corner(compiled: b
         msgpack.unpackb(encode_part(s, -1, np.array(t, np.int64).reshape(-1, CELL), [], []))
         for s, t in zip(segments, tables, strict=True)
     ]
-    parts, decoded, _ = decode_parts(encoded, 255, compiled=compiled)
+    parts, decoded, _ = decode_parts(encoded, 255, kernels.get(compiled))
     assert [part.entities for part in parts] == [0, 1, 2]
     assert [tuple(row) for row in decoded.tolist()] == [state for table in tables for state in table]
 
@@ -169,18 +168,6 @@ def test_a_checksum_is_that_of_the_blocks_and_the_rows_ascending_by_id(compiled:
         check = hashlib.sha256(digest + encode_rows(rows)).digest()[:4]
         assert checksum(world, segment) == int.from_bytes(check, "little")
     assert min(len(world.in_segment(segment)) for segment in segments) > 1
-
-
-@pytest.mark.skipif(not kernels.available(), reason="there is nothing to compile without Numba")
-def test_the_first_checksum_has_nothing_to_compile_once_all_is_prepared() -> None:
-    kernels.compiled.cache_clear()
-    prepare(True)
-    signatures = list(kernels.compiled(bulk).muster.signatures)
-    assert len(signatures) == 1
-    world = build(compiled=True)
-    checksum(world, next(iter(world.blocks)))
-    assert kernels.compiled(bulk).muster.signatures == signatures
-    kernels.compiled.cache_clear()
 
 
 def test_a_checksum_is_of_all_a_segment_holds_and_of_nothing_else() -> None:
@@ -232,13 +219,13 @@ def test_a_part_beyond_its_bounds_is_refused(fields: dict[str, Any]) -> None:
 )  # fmt: skip
 def test_a_state_that_no_world_has_is_refused(column: int, value: int, compiled: bool) -> None:
     with pytest.raises(ProtocolError, match=r"segment\.rows"):
-        decode_parts([part_of(), part_of(rows=part_of()[6] + row_with(column, value))], 255, compiled=compiled)
+        decode_parts([part_of(), part_of(rows=part_of()[6] + row_with(column, value))], 255, kernels.get(compiled))
 
 
 def test_a_template_is_one_of_the_scene(compiled: bool) -> None:
-    decode_parts([part_of(rows=row_with(TEMPLATE, 2))], 3, compiled=compiled)
+    decode_parts([part_of(rows=row_with(TEMPLATE, 2))], 3, kernels.get(compiled))
     with pytest.raises(ProtocolError, match=r"segment\.rows"):
-        decode_parts([part_of(rows=row_with(TEMPLATE, 3))], 3, compiled=compiled)
+        decode_parts([part_of(rows=row_with(TEMPLATE, 3))], 3, kernels.get(compiled))
 
 
 def test_nesting_a_thousand_deep_is_refused_like_anything_else() -> None:

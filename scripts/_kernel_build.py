@@ -1,0 +1,181 @@
+"""Builds the kernel for every target: `_kernel_build.py OUT [--objects-only]`; `scripts/kernels` is its door.
+
+LLVM makes an object file for each target from one IR (`_kernel_ir`), and LLD a library from that; both are pinned. The
+same sources give the same bytes with the same versions, which the manifest names. The linker is that of `ziglang`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import json
+import os
+import platform
+import subprocess
+import sys
+import tempfile
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).resolve().parent.parent
+LINKER = ROOT / "build" / "linker"
+"""Where `scripts/kernels` puts the linker."""
+OBJECT, STUBS, DEFINITION = "kernel.o", "python3.lib", "python3.def"
+BUILDING = {"NUMBA_OPT": "0", "NUMBA_CPU_NAME": "generic", "NUMBA_CPU_FEATURES": "", "PYTHONHASHSEED": "0"}
+"""The environment of a build."""
+WASM_FEATURES = "+bulk-memory,+sign-ext,+mutable-globals,+nontrapping-fptoint"
+WASM_STACK_BYTES = 64 * 1024
+
+
+@dataclass(frozen=True)
+class Target:
+    """A library to build.
+
+    Attributes:
+        triple, cpu, features: see `_kernel_ir.Machine`.
+        link: command lines of the linker's tools, one after the other; {exports} stands for an `--export=NAME` for each
+            function, {init} for the export of the Python module.
+        python: whether it is a Python module, else its functions are exported themselves.
+    """
+
+    triple: str
+    cpu: str
+    link: tuple[str, ...]
+    features: str = ""
+    python: bool = True
+
+
+ELF = "ld.lld -shared --strip-all --build-id=none --hash-style=gnu -soname=sovereign_kernel"
+MACHO = (
+    "cc -target aarch64-macos.11.0 -dynamiclib -nostdlib -Wl,-undefined,dynamic_lookup"
+    " -Wl,-install_name,sovereign_kernel -Wl,-x"
+)
+WASM = "wasm-ld --no-entry --strip-all {exports}"
+TARGETS = {
+    "linux-x86_64.so": Target("x86_64-unknown-linux-gnu", "x86-64", (ELF,)),
+    "linux-arm64.so": Target("aarch64-unknown-linux-gnu", "generic", (f"{ELF} -z max-page-size=65536",)),
+    "windows-x86_64.pyd": Target(
+        "x86_64-pc-windows-msvc",
+        "x86-64",
+        (
+            f"dlltool -m i386:x86-64 -d {DEFINITION} -l {STUBS}",
+            f"lld-link /dll /noentry /nodefaultlib /machine:x64 /Brepro {{init}} {STUBS}",
+        ),
+    ),
+    "macos-arm64.so": Target(
+        "arm64-apple-macosx11.0.0",
+        "apple-m1",
+        (MACHO,),
+    ),
+    "kernel.wasm": Target(
+        "wasm32-unknown-unknown",
+        "mvp",
+        (f"{WASM} --import-memory --stack-first -z stack-size={WASM_STACK_BYTES} --export=__heap_base",),
+        WASM_FEATURES,
+        python=False,
+    ),
+    "kernel-emscripten.so": Target(
+        "wasm32-unknown-emscripten",
+        "mvp",
+        (f"{WASM} --experimental-pic -shared",),
+        WASM_FEATURES,
+        python=False,
+    ),
+}
+
+
+def build(out: Path, *, link: bool = True) -> dict[str, Any]:
+    """Builds all targets into a folder, with a manifest; returns the manifest.
+
+    Args:
+        link: else there are only the manifest's checksums of the object files.
+    """
+    import llvmlite.binding as llvm
+
+    import _kernel_ir
+    import _kernel_python
+    from shared import exports, freshness, kernels
+
+    llvm.initialize_all_targets()
+    llvm.initialize_all_asmprinters()
+    print("compiling with Numba ...", flush=True)
+    sources = _kernel_ir.numba_sources(ROOT)
+    texts = freshness.sources(Path(source.__file__ or "") for source in kernels.SOURCES)
+    code_crc = freshness.code_crc(texts)
+    python = _kernel_python.module({**exports.functions(), "built_from": exports.NUMBER})
+    files: dict[str, dict[str, Any]] = {}
+    for name, target in TARGETS.items():
+        print(f"{name} ...", flush=True)
+        machine = _kernel_ir.Machine(target.triple, target.cpu, target.features)
+        more, visible = (python, (_kernel_python.INIT,)) if target.python else ("", ())
+        module, target_machine = _kernel_ir.linked(sources, code_crc, machine, more, visible)
+        code = target_machine.emit_object(module)
+        files[name] = {"object": _sha256(code)}
+        if link:
+            library = _linked(name, code, list(exports.functions()))
+            (out / name).write_bytes(library)
+            files[name] |= {"sha256": _sha256(library), "bytes": len(library)}
+    manifest = {
+        "text_crc": freshness.text_crc(texts),
+        "code_crc": code_crc,
+        "constants_crc": kernels.constants_crc(),
+        "made_with": made_with(),
+        "files": files,
+    }
+    (out / kernels.MANIFEST).write_text(json.dumps(manifest, indent=2) + "\n", encoding="utf-8")
+    return manifest
+
+
+def made_with() -> dict[str, str]:
+    """The versions that decide which bytes come out."""
+    python = ".".join(platform.python_version_tuple()[:2])
+    return {"python": python, "numba": version("numba"), "llvmlite": version("llvmlite")}
+
+
+def _linked(name: str, code: bytes, functions: list[str]) -> bytes:
+    """The library for an object file."""
+    from _kernel_python import INIT, PYTHON
+
+    shown = " ".join(f"--export={each}" for each in (*functions, "built_from"))
+    with tempfile.TemporaryDirectory() as folder:
+        (Path(folder) / OBJECT).write_bytes(code)
+        (Path(folder) / DEFINITION).write_text("\n".join(("LIBRARY python3.dll", "EXPORTS", *PYTHON, "")))
+        *before, last = (line.format(exports=shown, init=f"/export:{INIT}").split() for line in TARGETS[name].link)
+        for command in before:
+            _zig(folder, *command)
+        _zig(folder, *last, OBJECT, *((f"/out:{name}",) if last[0] == "lld-link" else ("-o", name)))
+        return (Path(folder) / name).read_bytes()
+
+
+def _zig(folder: str, *arguments: str) -> None:
+    """Runs a tool of the linker's package in a folder."""
+    environment = os.environ | {
+        "PYTHONPATH": str(LINKER),
+        "ZIG_GLOBAL_CACHE_DIR": folder,
+        "ZIG_LOCAL_CACHE_DIR": folder,
+    }
+    command = (sys.executable, "-m", "ziglang", *arguments)
+    done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False)
+    if done.returncode:
+        sys.exit(f"{' '.join(arguments)}: {done.stdout}{done.stderr}")
+
+
+def _sha256(data: bytes) -> str:
+    return hashlib.sha256(data).hexdigest()
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("out", type=Path, help="an existing folder")
+    parser.add_argument("--objects-only", action="store_true", help="no linker: only the manifest")
+    args = parser.parse_args()
+    build(args.out, link=not args.objects_only)
+
+
+if __name__ == "__main__":
+    if any(os.environ.get(name) != value for name, value in BUILDING.items()):
+        sys.exit(subprocess.run((sys.executable, *sys.argv), env=os.environ | BUILDING, check=False).returncode)
+    sys.path.insert(0, str(ROOT))
+    main()

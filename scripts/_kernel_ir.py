@@ -1,0 +1,230 @@
+"""LLVM IR of the kernel sources, made by Numba: one module for a target, in which each function of `shared.exports` is
+
+    i32 NAME(i64* words)
+
+All arguments stand in one block of int64 words: a number or a truth value is one word, an array is its address and its
+length, a world is the address of the table of its arrays (`exports.table`). Nothing else is left in the module that
+another one could see, and it needs nothing that is not in it.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import re
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import llvmlite.binding as llvm
+
+from shared import kernels
+
+FAILED = -(1 << 31)
+"""The result of a function that met an index out of bounds, where indices are checked."""
+SPEED_LEVEL = 3
+
+
+@dataclass(frozen=True)
+class Machine:
+    """What LLVM makes code for: see `llvm::TargetMachine`."""
+
+    triple: str
+    cpu: str
+    features: str = ""
+    reloc: str = "pic"
+
+    def target_machine(self) -> Any:
+        """A new target machine of LLVM."""
+        target = llvm.Target.from_triple(self.triple)
+        return target.create_target_machine(
+            cpu=self.cpu, features=self.features, opt=SPEED_LEVEL, reloc=self.reloc, codemodel="small"
+        )
+
+
+@dataclass(frozen=True)
+class Source:
+    """What Numba has made of an exported function: an LLVM module, and the function's name in it."""
+
+    name: str
+    symbol: str
+    text: str
+
+
+def numba_sources(root: Path, *, bounds: bool = False) -> list[Source]:
+    """Compiles every exported function of the sources in `root`/shared, without optimising any.
+
+    Call it once in a process, with NUMBA_OPT=0 and NUMBA_CPU_NAME=generic in the environment.
+
+    Args:
+        bounds: indices are checked, and a function that meets one out of bounds returns `FAILED`.
+    """
+    import numba
+    from numba import types
+
+    from shared import exports, jit, layout
+
+    options: dict[str, Any] = {name: value for name, value in jit.OPTIONS.items() if name != "cache"}
+    options["boundscheck"] = bounds
+    jit.OPTIONS.clear()
+    jit.OPTIONS.update(options)
+    of_word, of_array = _intrinsics()
+    scope: dict[str, Any] = {"Arrays": layout.Arrays, "int32": numba.int32, "table_at": of_word}
+    scope |= {f"array_{kind}": of_array(getattr(types, name)) for kind, (name, _) in exports.ARRAYS.items()}
+    made: list[Source] = []
+    for module, functions in exports.EXPORTS.items():
+        compiled = _load(root / "shared" / f"{module}.py", module + jit.COMPILED)
+        for name, kinds in functions.items():
+            local = {**scope, "function": getattr(compiled, name)}
+            exec(_wrapper(name, kinds, local["function"].py_func.__annotations__["return"] is not None), local)
+            jitted: Any = numba.njit((_words_type(),), **options)(local[name])
+            result = jitted.overloads[jitted.signatures[0]]
+            made.append(Source(name, result.fndesc.llvm_func_name, result.library.get_llvm_str()))
+    return made
+
+
+def _wrapper(name: str, kinds: str, returns: bool) -> str:
+    """Python source of a function that takes its arguments from a block of words and gives an int32."""
+    from shared import exports
+
+    arguments: list[str] = []
+    word = 0
+    for kind in kinds:
+        if kind == exports.WORLD:
+            fields = (f"array_{of}(table, {2 * i})" for i, of in enumerate(exports.FIELDS.values()))
+            arguments.append(f"Arrays({', '.join(fields)})")
+        elif kind == exports.NUMBER:
+            arguments.append(f"words[{word}]")
+        elif kind == exports.TRUTH:
+            arguments.append(f"words[{word}] != 0")
+        else:
+            arguments.append(f"array_{kind.lower()}(words, {word})")
+        word += exports.words_of(kind)
+    table = ["    table = table_at(words, 0)"] if exports.WORLD in kinds else []
+    assert kinds.find(exports.WORLD) <= 0, "a world is the first argument, if there is one"
+    call = f"function({', '.join(arguments)})"
+    result = [f"    return int32({call})"] if returns else [f"    {call}", "    return int32(0)"]
+    return "\n".join((f"def {name}(words):", *table, *result))
+
+
+def _intrinsics() -> tuple[Any, Any]:
+    """For compiled functions: the pointer in a word; and for a type of elements, the array in two words."""
+    from numba import types
+    from numba.extending import intrinsic
+    from numba.np import arrayobj
+
+    pointer = _words_type()
+    populate_array: Any = arrayobj.populate_array
+
+    def word_at(builder: Any, words: Any, at: Any, more: int = 0) -> Any:
+        return builder.load(builder.gep(words, [builder.add(at, at.type(more))]))
+
+    @intrinsic
+    def of_word(context: Any, words: Any, at: Any) -> Any:
+        def code(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+            return builder.inttoptr(word_at(builder, *arguments), arguments[0].type)
+
+        return pointer(pointer, types.intp), code
+
+    def of_array(element: Any) -> Any:
+        array = types.Array(element, 1, "C")
+        size = element.bitwidth // 8
+
+        @intrinsic
+        def array_at(context: Any, words: Any, at: Any) -> Any:
+            def code(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+                words, at = arguments
+                made = context.make_array(array)(context, builder)
+                stride = context.get_constant(types.intp, size)
+                populate_array(
+                    made,
+                    data=builder.inttoptr(word_at(builder, words, at), made.data.type),
+                    shape=[word_at(builder, words, at, 1)],
+                    strides=[stride],
+                    itemsize=stride,
+                    meminfo=None,
+                )
+                return made._getvalue()
+
+            return array(pointer, types.intp), code
+
+        return array_at
+
+    return of_word, of_array
+
+
+def _words_type() -> Any:
+    """The type of a pointer to int64 words."""
+    from numba import types
+
+    pointer: Any = types.CPointer
+    return pointer(types.int64)
+
+
+def _load(path: Path, name: str) -> ModuleType:
+    spec = importlib.util.spec_from_file_location(name, path)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[name] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+EXPORT = """
+define i32 @{name}(ptr %words) {{
+  %result = alloca i32
+  %trouble = alloca ptr
+  store i32 0, ptr %result
+  %status = call i32 @{symbol}(ptr %result, ptr %trouble, ptr %words)
+  %value = load i32, ptr %result
+  %fine = icmp eq i32 %status, 0
+  %told = select i1 %fine, i32 %value, i32 {failed}
+  ret i32 %told
+}}
+declare i32 @{symbol}(ptr, ptr, ptr)
+"""
+BUILT_FROM = """
+define i32 @built_from(ptr %words) {{
+  %asked = load i64, ptr %words
+  %constants = icmp eq i64 %asked, {which}
+  %crc = select i1 %constants, i32 {constants}, i32 {code}
+  ret i32 %crc
+}}
+"""
+
+
+def linked(
+    sources: list[Source], code_crc: int, machine: Machine, more: str = "", visible: tuple[str, ...] = ()
+) -> tuple[Any, Any]:
+    """One optimised module for a machine, and the target machine.
+
+    Args:
+        code_crc: the checksum of the sources (`shared.freshness`).
+        more: IR that is linked with it, such as what binds it to Python.
+        visible: the functions that others may see; none: all exports.
+    """
+    target_machine = machine.target_machine()
+    ours = "".join(EXPORT.format(name=each.name, symbol=each.symbol, failed=FAILED) for each in sources)
+    ours += BUILT_FROM.format(which=kernels.CONSTANTS_CRC, constants=kernels.constants_crc(), code=code_crc)
+    whole = _parsed(ours, machine, target_machine)
+    for text in (*(each.text for each in sources), more):
+        whole.link_in(_parsed(text, machine, target_machine))
+    keep = visible or ("built_from", *(each.name for each in sources))
+    for value in (*whole.functions, *whole.global_variables):
+        if not value.is_declaration and value.name not in keep:
+            value.linkage = "internal"
+    whole.verify()
+    builder = llvm.create_pass_builder(target_machine, llvm.create_pipeline_tuning_options(speed_level=SPEED_LEVEL))
+    builder.getModulePassManager().run(whole, builder)
+    return whole, target_machine
+
+
+def _parsed(text: str, machine: Machine, target_machine: Any) -> Any:
+    text = re.sub(r"^(target (triple|datalayout)|source_filename) .*$", "", text, flags=re.MULTILINE)
+    module = llvm.parse_assembly(text)
+    module.name = "kernel"
+    module.triple = machine.triple
+    module.data_layout = str(target_machine.target_data)
+    return module
