@@ -9,7 +9,10 @@ Type checkers do not run that alias. For them the hook writes one stub per modul
 """
 
 import ast
+import hashlib
+import importlib.util
 import io
+import json
 import re
 import shutil
 import tempfile
@@ -36,6 +39,10 @@ class RewriteError(Exception):
     """A source uses a module's name in a way that cannot be rewritten. The text says where, and what to write."""
 
 
+class StaleError(Exception):
+    """The prebuilt kernels are not those of the sources."""
+
+
 class Hook(BuildHookInterface[Any]):
     """Called by hatchling around each build of a wheel."""
 
@@ -45,6 +52,7 @@ class Hook(BuildHookInterface[Any]):
         if version == "editable":
             write_stubs(Path(self.root))
             return
+        refuse_stale_kernels(Path(self.root))
         self._staged = tempfile.TemporaryDirectory(prefix=f"{PACKAGE}-")
         stage(Path(self.root), Path(self._staged.name))
         build_data["force_include"][self._staged.name] = PACKAGE
@@ -75,6 +83,27 @@ def stage(root: Path, place: Path) -> None:
         source = file.read_text("utf-8")
         text = docstring_alone(source) if target == Path("__init__.py") else rewritten(source, str(target), modules)
         copy.write_text(text, "utf-8", newline="\n")
+
+
+def refuse_stale_kernels(root: Path) -> None:
+    """Compares the prebuilt kernels with the sources that go into the wheel with them.
+
+    Raises:
+        StaleError: they are not those of the sources. The text says what to do.
+    """
+    spec = importlib.util.spec_from_file_location("freshness", root / "shared" / "freshness.py")
+    assert spec is not None
+    assert spec.loader is not None
+    freshness = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(freshness)
+    folder = root / "shared" / "prebuilt"
+    manifest = json.loads((folder / "manifest.json").read_text("utf-8"))
+    texts = freshness.sources(root / "shared" / name for name in ("kernel.py", "bulk.py"))
+    if freshness.code_crc(texts) != manifest["code_crc"]:
+        raise StaleError("shared/prebuilt is not made from shared/kernel.py and shared/bulk.py: run scripts/kernels")
+    for name, told in manifest["files"].items():
+        if hashlib.sha256((folder / name).read_bytes()).hexdigest() != told["sha256"]:
+            raise StaleError(f"shared/prebuilt/{name} is not as manifest.json has it: run scripts/kernels")
 
 
 def files(folder: Path) -> Iterator[Path]:

@@ -30,7 +30,7 @@ PACKAGES = (
     *("prometheus-client", "pyjwt", "structlog", "uvloop", "pettingzoo", "pygame-ce", "rich"),
     *("mypy", "pytest"),
 )
-"""What the package requires with all its extras but Numba, which would compile the kernels anew; and tools of users."""
+"""What the package requires with all its extras but Numba, which is for other platforms; and tools of users."""
 COMMANDS = ("loadtest", "new-game", "play", "replay", "server")
 
 
@@ -158,6 +158,13 @@ def test_every_module_can_be_imported(installed: Installed) -> None:
         "print(sorted({'server', 'shared', 'client_sdk', 'scripts', 'tests'} & sys.modules.keys()))\n"
     )
     assert installed.run("-W", "error", "-c", program) == "[]\n"
+
+
+def test_the_physics_is_prebuilt(installed: Installed) -> None:
+    """Numba is not installed there."""
+    program = "from sovereign_netcode.shared import kernels; print(kernels.chosen(), kernels.trouble())"
+    said = installed.run("-c", program)
+    assert said == "prebuilt \n" or "no prebuilt kernel for" in said
 
 
 @pytest.mark.parametrize("name", COMMANDS)
