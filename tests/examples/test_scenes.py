@@ -1,13 +1,11 @@
 """Every example game in every scene, and trees where there is little room for them."""
 
-import runpy
-import sys
 from collections.abc import Callable
-from pathlib import Path
 from random import Random
 
 import pytest
 
+from sovereign_netcode import new_game
 from sovereign_netcode.client_sdk.bots import Follow, RunAndJump
 from sovereign_netcode.examples.freeze import Freeze
 from sovereign_netcode.examples.tag import LEAVES, TRUNK, Tag
@@ -16,18 +14,15 @@ from sovereign_netcode.server.rules import Rules
 from sovereign_netcode.shared.scene import SCENES, Scene, load_scene
 from sovereign_netcode.shared.units import SEGMENT
 
-ROOT = Path(__file__).resolve().parents[2]
 
-
-def new_game() -> Rules:
+def skeleton() -> Rules:
     """The game that `scripts/new-game` writes."""
-    sys.path.insert(0, str(ROOT / "scripts"))
     space: dict[str, type[Rules]] = {}
-    exec(runpy.run_path(str(ROOT / "scripts" / "new-game"))["RULES"].format(name="mine", title="Mine"), space)
+    exec(new_game.RULES.format(name="mine", title="Mine"), space)
     return space["Mine"]()
 
 
-@pytest.mark.parametrize("make", [Rules, Tag, Freeze, new_game])
+@pytest.mark.parametrize("make", [Rules, Tag, Freeze, skeleton])
 @pytest.mark.parametrize("scene", sorted(path.stem for path in SCENES.glob("*.toml")))
 def test_every_game_plays_in_every_scene(scene: str, make: Callable[[], Rules]) -> None:
     match = Match(load_scene(scene), seed=3, rules=make())
