@@ -1,10 +1,14 @@
-"""What people read: the README and docs/, and the programs (or files) in them by the heading that they stand under."""
+"""The pages for readers (README.md and the others beside it, docs/), and the programs in them by their heading."""
 
 import re
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
-PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+PAGES = [
+    ROOT / "README.md",
+    *sorted({*ROOT.glob("*.md")} - {ROOT / "README.md"}),
+    *sorted((ROOT / "docs").glob("*.md")),
+]
 _HEADING_OR_FENCE = re.compile(r"^#+ ([^\n]+)$|^```(\w*)[^\n]*\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 
 
@@ -27,3 +31,10 @@ def headings(page: Path) -> set[str]:
     anchors = [re.sub(r"[^\w\- ]", "", title.lower()).replace(" ", "-") for title in titles]
     assert len(anchors) == len(set(anchors)), f"{page.name}: the same heading twice"
     return set(anchors)
+
+
+def section(page: Path, title: str) -> str:
+    """The text under a heading of the second level, up to the next one."""
+    _, heading, text = page.read_text("utf-8").partition(f"\n## {title}\n")
+    assert heading, f"{page.name}: no heading {title!r}"
+    return text.partition("\n## ")[0]

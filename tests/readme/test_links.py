@@ -1,4 +1,4 @@
-"""Links in the README and docs/ lead somewhere; files and flags that they name exist."""
+"""Links in the pages have a target, and files and flags that the pages name exist."""
 
 import re
 from pathlib import Path
@@ -17,7 +17,7 @@ each_page = pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 
 
 def broken(page: Path, target: str) -> str:
-    """Why a link leads nowhere; empty if it does not."""
+    """Returns why a link has no target; empty if it has one."""
     if target.startswith(("http://", "https://")):
         return ""
     path, _, anchor = target.partition("#")
@@ -43,7 +43,7 @@ def test_a_broken_link_is_found() -> None:
 
 def test_every_page_is_linked_from_the_readme() -> None:
     readme = (ROOT / "README.md").read_text("utf-8")
-    assert [page.name for page in PAGES[1:] if f"](docs/{page.name})" not in readme] == []
+    assert [page.name for page in PAGES[1:] if f"]({page.relative_to(ROOT).as_posix()})" not in readme] == []
 
 
 @each_page
