@@ -260,6 +260,7 @@ class Core:
             case messages.Pong():
                 if message.sent in self._pings:  # anything else is no answer to a ping of ours
                     self._pings.remove(message.sent)
+                    self.stats.pinged(max(now - message.sent, 0.0))
                     self._stepped(self._told_clock.answered(message.sent, message.tick, now), now)
                     if self._play:
                         self._play.answered(message.sent)

@@ -258,7 +258,6 @@ class Play:
                 # How late the program itself was with it is no need of the path.
                 self._phases.put(tick, phase - (timeline.tick(now) - tick) if timeline.own else phase)
             stats.inputs_sent += to + 1 - first
-            stats.rtt_s = clock.rtt_s
             stats.lead_ticks = phase - clock.phase
             stats.lead_s = stats.lead_ticks / clock.rate
             inputs += [

@@ -37,8 +37,91 @@ def test_corrections_are_told_by_their_causes() -> None:
 
 
 def test_a_share_of_nothing_is_nothing() -> None:
-    assert Stats().late_share == 0
+    assert Stats().late_share == Stats().late_share_lately == 0
     assert Stats(inputs_late=1, inputs_sent=8).late_share == 0.125
+    assert Stats(inputs_late=1, inputs_sent=8).late_share_lately == 0.125, "all of it is new"
+
+
+def test_late_inputs_are_shown_of_the_last_seconds_and_counted_since_the_start() -> None:
+    stats = Stats()
+    shown: list[str] = []
+    for second in range(30):
+        stats.measure(100.0 + second)
+        shown.append(dict(stats.figures())["late inputs"])
+        stats.inputs_sent += 32
+        stats.inputs_late += 16 if 10 <= second < 12 else 0
+    assert set(shown[:11]) == set(shown[17:]) == {"0.00 %"}
+    assert shown[11:17] == ["10.00 %", "20.00 %", "20.00 %", "20.00 %", "20.00 %", "10.00 %"]
+    assert stats.late_share == 32 / (30 * 32)
+
+
+def test_inputs_whose_fate_is_told_later_are_no_more_than_all() -> None:
+    stats = Stats(inputs_sent=1000)
+    for second in range(10):
+        stats.measure(float(second))
+    stats.inputs_late = 64  # nothing was sent meanwhile
+    assert stats.late_share_lately == 1.0
+
+
+def test_corrections_are_shown_of_the_last_minute_and_counted_since_the_start() -> None:
+    stats = Stats()
+    for second in range(150):
+        stats.measure(float(second))
+        if second in (10, 20, 50):
+            stats.corrected(Corrected(1, ("x",), 0.25, 3, "late input" if second < 50 else "other entity"))
+        expected = {"late input": (10 <= second < 71) + (20 <= second < 81), "other entity": 50 <= second < 111}
+        assert stats.corrections_lately == {cause: count for cause, count in expected.items() if count}, second
+        assert dict(stats.figures())["corrections"] == str(sum(expected.values()))
+    assert stats.corrections == 3
+    assert stats.corrections_by_cause == {"late input": 2, "other entity": 1}
+
+
+def test_marks_are_kept_as_long_as_anything_looks_back() -> None:
+    stats = Stats()
+    for step in range(60 * 600):
+        stats.measure(step / 60)
+    assert len(stats._marks) <= 62
+    stats.measure(1e6)  # a program that has slept
+    assert len(stats._marks) <= 2
+    assert stats.late_share_lately == 0
+
+
+def test_one_late_pong_is_not_the_round_trip() -> None:
+    stats = Stats()
+    shown = []
+    for round_trip_s in (0.05, 0.05, 0.4, 0.05, 0.06, 0.6, 0.61, 0.6, 0.05, 0.05):
+        stats.pinged(round_trip_s)
+        shown.append(stats.rtt_s)
+    assert shown == [0.05, 0.05, 0.05, 0.05, 0.06, 0.06, 0.6, 0.6, 0.6, 0.05]
+
+
+@pytest.mark.parametrize(("before_s", "after_s"), [(0.0, 0.3), (0.3, 0.0), (0.02, 0.5), (0.1, 0.12)])
+def test_the_round_trip_is_that_of_the_last_seconds(before_s: float, after_s: float) -> None:
+    """17 ms, and 17 ms for 15 s after the latency was set to 610: that was the least of the last 15 s."""
+    match = Match(load_scene("flat"), 1)
+    core = LinkedCore()
+    core.link = Path(before_s)
+    match.join(wander, Path(0.0085), core).frame_s = 0.004
+    match.run(20)
+    assert core.stats.rtt_s == pytest.approx(0.017 + 2 * before_s, abs=0.005)
+    core.link = Path(after_s)
+    match.run(3.5 + 2 * after_s)
+    assert core.stats.rtt_s == pytest.approx(0.017 + 2 * after_s, abs=0.005)
+    assert dict(core.stats.figures())["round trip"] == f"{core.stats.rtt_s * 1000:.0f} ms"
+
+
+def test_what_a_player_sees_of_a_bad_moment_is_over_soon_after_it() -> None:
+    match = Match(load_scene("flat"), 1)
+    core = LinkedCore()
+    match.join(wander, Path(0.02), core)
+    match.run(20)
+    assert dict(core.stats.figures())["late inputs"] == "0.00 %"
+    core.link = Path(0.2)  # the inputs on the way come 200 ms later
+    match.run(1)
+    assert float(dict(core.stats.figures())["late inputs"].removesuffix(" %")) > 0
+    match.run(15)
+    assert dict(core.stats.figures())["late inputs"] == "0.00 %"
+    assert core.stats.late_share > 0
 
 
 def test_figures_are_those_of_the_path() -> None:

@@ -1,11 +1,19 @@
-"""Engines without a window, and the least that stands in for those that are not installed."""
+"""Engines without a window, and the least that stands in for those that are not installed; and what they show."""
 
+import importlib
 import importlib.util
 import os
 import sys
 from collections.abc import Callable
 from types import ModuleType, SimpleNamespace
-from typing import Any
+from typing import Any, ClassVar
+
+import numpy as np
+import numpy.typing as npt
+
+Point = tuple[float, float]
+FIGURE_PIXELS = 5
+"""A figure is at least so many pixels wide; the lines on the ground are narrower."""
 
 
 def module(name: str, **names: Any) -> ModuleType:
@@ -26,20 +34,10 @@ def ever(frame: Callable[[], object]) -> None:
 
 
 class Thing:
-    """Takes every call and every attribute; notes what has been drawn or placed."""
-
-    drawn = 0
+    """Takes every call and every attribute."""
 
     def __init__(self, *args: Any, **more: Any) -> None:
         pass
-
-    def __setattr__(self, name: str, value: Any) -> None:
-        Thing.drawn += name == "position"
-
-    def draw(self, *args: Any) -> None:
-        Thing.drawn += 1
-
-    setPos = draw  # noqa: N815  # as Panda3D has it
 
     def __getattr__(self, name: str) -> Any:
         if name.startswith("_"):
@@ -47,14 +45,72 @@ class Thing:
         return lambda *args, **more: Thing()
 
 
-def pyglet() -> None:
+class Flat:
+    """What a stand-in for an engine in two dimensions has drawn since it cleared its window."""
+
+    circles: ClassVar[list[Point]] = []
+    size = (0, 0)
+
+    @classmethod
+    def clear(cls) -> None:
+        cls.circles = []
+
+    @classmethod
+    def draw(cls, x: float, y: float, radius: float, colour: object = None) -> None:
+        cls.circles.append((x, y))
+
+    @classmethod
+    def lit(cls) -> list[Point]:
+        """The middles of circles, in heights of the window, from its middle."""
+        width, height = cls.size
+        return [(x / height - width / height / 2, y / height - 0.5) for x, y in cls.circles]
+
+
+class Body(Thing):
+    """A body of a stand-in for an engine in three dimensions; x east, y north, z up."""
+
+    bodies: ClassVar[list["Body"]] = []
+    camera: "Body"
+
+    def __init__(self, *args: Any, **more: Any) -> None:
+        self.at = (0.0, 0.0, 0.0)
+        Body.bodies.append(self)
+
+    def setPos(self, x: float, y: float, z: float) -> None:  # noqa: N802  # as Panda3D has it
+        self.at = (x, y, z)
+
+    def removeNode(self) -> None:  # noqa: N802  # likewise
+        Body.bodies.remove(self)
+
+    @classmethod
+    def lit(cls) -> list[Point]:
+        """Where the bodies are as the camera sees them, which looks straight down."""
+        (x, y, z), seen = cls.camera.at, [body.at for body in cls.bodies if body is not cls.camera]
+        assert all(z > above for _, _, above in seen), "the camera is above all"
+        return [((east - x) / (z - above), (north - y) / (z - above)) for east, north, above in seen]
+
+
+def pyglet() -> Callable[[], list[Point]]:
     frames: list[Callable[[float], None]] = []
     draws: list[Callable[[], None]] = []
 
     class Window(Thing):
+        def __init__(self, width: int, height: int) -> None:
+            Flat.size = width, height
+
         def event(self, call: Callable[[], None]) -> None:
             assert call.__name__ == "on_draw"
             draws.append(call)
+
+        def clear(self) -> None:
+            Flat.clear()
+
+    class Circle:
+        def __init__(self, *args: float) -> None:
+            self.args = args
+
+        def draw(self) -> None:
+            Flat.draw(*self.args)
 
     class Held(dict[int, bool]):
         def __missing__(self, key: int) -> bool:
@@ -66,20 +122,22 @@ def pyglet() -> None:
     module("pyglet")
     module("pyglet.window", Window=Window)
     module("pyglet.window.key", KeyStateHandler=Held, A=97, D=100, S=115, W=119, SPACE=32)
-    module("pyglet.shapes", Circle=Thing)
+    module("pyglet.shapes", Circle=Circle, Line=Thing)
     module("pyglet.clock", schedule_interval=lambda call, every: frames.append(call))
     module("pyglet.app", run=loop)
+    return Flat.lit
 
 
-def arcade() -> None:
+def arcade() -> Callable[[], list[Point]]:
     windows: list[Any] = []
 
     class Window:
         def __init__(self, width: int, height: int) -> None:
+            Flat.size = width, height
             windows.append(self)
 
         def clear(self) -> None:
-            pass
+            Flat.clear()
 
     def loop() -> None:
         windows[0].on_key_press(100, 0)
@@ -87,15 +145,18 @@ def arcade() -> None:
         ever(lambda: (windows[0].on_update(1 / 60), windows[0].on_draw()))
 
     color = SimpleNamespace(WHITE=(255, 255, 255))
-    module("arcade", Window=Window, run=loop, draw_circle_filled=Thing().draw, color=color)
+    module("arcade", Window=Window, run=loop, draw_circle_filled=Flat.draw, draw_line=Thing, color=color)
     module("arcade.key", A=97, D=100, S=115, W=119, SPACE=32)
+    return Flat.lit
 
 
-def panda3d() -> None:
+def panda3d() -> Callable[[], list[Point]]:
     tasks: list[Callable[[Any], Any]] = []
+    Body.camera = Body()
 
     class ShowBase:
-        loader = render = camera = Thing()
+        camera, render = Body.camera, Thing()
+        loader = SimpleNamespace(loadModel=Body)
         taskMgr = SimpleNamespace(add=lambda call, name: tasks.append(call))  # noqa: N815  # as Panda3D has it
 
         def accept(self, key: str, call: Callable[..., None], more: list[Any]) -> None:
@@ -110,33 +171,84 @@ def panda3d() -> None:
     module("direct")
     module("direct.showbase")
     module("direct.showbase.ShowBase", ShowBase=ShowBase)
+    module("panda3d")
+    module("panda3d.core", LineSegs=Thing)
+    return Body.lit
 
 
-def ursina() -> None:
-    entities: list[Any] = []
+def ursina() -> Callable[[], list[Point]]:
+    games: list[Any] = []
 
-    class Entity(Thing):
+    class Entity:
         def __init__(self, **more: Any) -> None:
-            entities.append(self)
+            self._body = Body() if more.get("model") in ("cube", "camera") else None
+            if not more:
+                games.append(self)
 
-        def update(self) -> None:
-            pass
+        def __setattr__(self, name: str, value: Any) -> None:
+            if name == "position" and self._body is not None:
+                x, up, north = value
+                self._body.setPos(x, north, up)
+            object.__setattr__(self, name, value)
 
     class Ursina:
         def run(self) -> None:
-            ever(lambda: [entity.update() for entity in list(entities)])
+            ever(lambda: [game.update() for game in games])
 
-    held = dict.fromkeys(["w", "a", "s", "d", "space"], 0)
-    module("ursina", Entity=Entity, Ursina=Ursina, camera=Thing(), destroy=entities.remove, held_keys=held)
+    def destroy(entity: Entity) -> None:
+        assert entity._body is not None
+        entity._body.removeNode()
+
+    camera, held = Entity(model="camera"), dict.fromkeys(["w", "a", "s", "d", "space"], 0)
+    assert camera._body is not None
+    Body.camera = camera._body
+    names = {"Entity": Entity, "Ursina": Ursina, "camera": camera, "destroy": destroy, "held_keys": held}
+    module("ursina", **names, Grid=lambda width, height: "grid", color=SimpleNamespace(gray=None))
+    return Body.lit
 
 
-def prepare(engine: str) -> bool:
-    """Makes an engine run without a display; whether it is the real one."""
+def shown(engine: str) -> list[Point]:
+    """Where a real engine shows anything but its background and thin lines, in heights of its window, from the middle:
+    x to the right, y up."""
+    pixels = _pixels(engine)
+    colours, counts = np.unique(pixels.reshape(-1, 3), axis=0, return_counts=True)
+    lit = (abs(pixels.astype(int) - colours[counts.argmax()].astype(int)) > 12).any(axis=2)
+    for axis in (0, 1):
+        lit = np.logical_and.reduce([np.roll(lit, by, axis) for by in range(FIGURE_PIXELS)])
+    height, width = lit.shape
+    back = (FIGURE_PIXELS - 1) / 2  # the mark of a figure's pixels is its last one
+    return [
+        ((x - back + 0.5 - width / 2) / height, 0.5 - (y - back + 0.5) / height) for y, x in np.argwhere(lit).tolist()
+    ]
+
+
+def _pixels(engine: str) -> npt.NDArray[np.uint8]:
+    """What the window shows, [row from the top, column, colour]."""
+    if engine == "pygame-ce":
+        import pygame
+
+        surface = pygame.display.get_surface()
+        assert surface is not None
+        found: npt.NDArray[np.uint8] = pygame.surfarray.array3d(surface).transpose(1, 0, 2)
+        return found
+    if engine in ("Panda3D", "ursina"):
+        base: Any = importlib.import_module("builtins")
+        texture = base.base.win.getScreenshot()
+        size = texture.getYSize(), texture.getXSize(), texture.getNumComponents()
+        return np.frombuffer(bytes(texture.getRamImage()), np.uint8).reshape(size)[::-1, :, :3]
+    if engine == "arcade":
+        return np.asarray(importlib.import_module("arcade").get_image())[:, :, :3]
+    image = importlib.import_module("pyglet.image").get_buffer_manager().get_color_buffer().get_image_data()
+    data = image.get_data("RGB", 3 * image.width)
+    return np.frombuffer(data, np.uint8).reshape(image.height, image.width, 3)[::-1]
+
+
+def prepare(engine: str) -> tuple[bool, Callable[[], list[Point]]]:
+    """Makes an engine run without a display; whether it is the real one, and what tells where figures are shown."""
     os.environ |= {"SDL_VIDEODRIVER": "dummy", "PYGAME_HIDE_SUPPORT_PROMPT": "1", "ARCADE_HEADLESS": "True"}
     package = {"pygame-ce": "pygame", "Panda3D": "direct"}.get(engine, engine)
     if importlib.util.find_spec(package) is None:
-        {"pyglet": pyglet, "arcade": arcade, "Panda3D": panda3d, "ursina": ursina}[engine]()
-        return False
+        return False, {"pyglet": pyglet, "arcade": arcade, "Panda3D": panda3d, "ursina": ursina}[engine]()
     if engine == "pyglet":
         importlib.import_module("pyglet").options["headless"] = True
     if engine in ("Panda3D", "ursina"):
@@ -146,4 +258,4 @@ def prepare(engine: str) -> bool:
         real: Any = importlib.import_module("ursina")
         without = real.Ursina
         real.Ursina = lambda: without(window_type="offscreen", development_mode=False)
-    return True
+    return True, lambda: shown(engine)

@@ -1,19 +1,25 @@
 """Runs a program of the pages until its player has walked: `python -m tests.readme.run_snippet HEADING`.
 
-Loops, in an engine or bare, play in a game within this process, at 30 frames per second by their own clock, however
-long a frame takes; the others on the server whose address is the second argument. An engine's keys are held by nobody,
-so the wish is looked at and another one takes its place.
+Loops, in an engine or bare, play in a game within this process, in the scene that a server plays by default, with
+company. They play at 30 frames per second by their own clock, however long a frame takes; the other programs play on
+the server whose address is the second argument. An engine's keys are held by nobody, so the wish is looked at and
+another one takes its place. What an engine shows in the end must be the figures that are there, and in their places.
 """
 
 import asyncio
 import itertools
+import math
 import sys
 import time
+from collections.abc import Callable
 from types import SimpleNamespace
 from typing import Any
 
 from sovereign_netcode.client_sdk import AsyncClient, Client, Loopback, View, client
 from sovereign_netcode.server.game import Game
+from sovereign_netcode.server.rules import Rules
+from sovereign_netcode.server.session import Player
+from sovereign_netcode.server.settings import Settings
 from sovereign_netcode.shared.scene import load_scene
 from tests.readme import engines
 from tests.readme.pages import programs
@@ -21,6 +27,9 @@ from tests.readme.pages import programs
 LOOP = "In your game's loop"
 URL = "ws://127.0.0.1:8765"
 FAR_BLOCKS = 3.0
+COMPANY = ((9, 0), (0, 6))
+NEAR = 0.07
+"""Of the window's height: the own figure is shown no further from the middle than this."""
 FRAMES_MAX = 3000
 
 
@@ -28,39 +37,72 @@ class EnoughError(Exception):
     """The player has got somewhere."""
 
 
-def in_this_process(wish: tuple[float, float, bool]) -> None:
-    """Makes `Client` one of a game within this process; the program is to wish that."""
+class Company(Rules):
+    """Puts one who stands still to the east of each player, and one to the north."""
+
+    def on_join(self, player: Player) -> None:
+        x, y, z = self.game.position(player.entity)
+        for i, j in COMPANY:
+            self.game.spawn("player", (x + i, y + j, z))
+
+
+def in_this_process(wish: tuple[float, float, bool], done: Callable[[View], None]) -> None:
+    """Makes `Client` one of a game within this process.
+
+    Args:
+        wish: what the program is to wish.
+        done: called once the player has walked, with what the program has drawn last.
+    """
     frames = itertools.count()
     now = [0.0]
     start: list[float] = []
+    drawn: list[View] = []
     poll, set_input, view = Client.poll, Client.set_input, Client.view
 
     def connect(url: str, *, name: str) -> Client:
         assert url == URL
-        return Loopback(Game(load_scene("flat"))).join(name)
+        return Loopback(Game(load_scene(Settings().scene), rules=Company())).join(name)
 
     def counted(self: Client) -> list[Any]:
+        if drawn and start[-1] > start[0] + FAR_BLOCKS and len(drawn[-1].others) == len(COMPANY):
+            done(drawn[-1])
+            raise EnoughError
         now[0] = next(frames) / 30
         assert now[0] < FRAMES_MAX / 30, "the player did not walk"
         return poll(self)
 
     def wished(self: Client, x: float, y: float, *, jump: bool) -> None:
         assert (x, y, jump) == wish
-        set_input(self, 1, 0)
+        set_input(self, 1, 0, jump=True)  # the ground is not even
 
     def looked(self: Client) -> View:
         found = view(self)
         if found.me is not None:
-            assert found.figures == [found.me]
             start.append(found.me.position[0])
-            if found.me.position[0] > start[0] + FAR_BLOCKS:
-                raise EnoughError
+            drawn.append(found)
         return found
 
     module: Any = client
     module.time = SimpleNamespace(monotonic=lambda: now[0])
     patched: Any = Client
     patched.connect, patched.poll, patched.set_input, patched.view = connect, counted, wished, looked
+
+
+def compare(lit: list[engines.Point], view: View) -> None:
+    """Fails unless something is lit where each figure is, and nowhere else: the own one in the middle, north up."""
+    assert view.me is not None
+    x, y, _ = view.me.position
+    ways = [math.atan2(other.position[1] - y, other.position[0] - x) for other in view.others]
+    near = [point for point in lit if math.hypot(*point) < NEAR]
+    assert near, f"the own figure is not in the middle: {lit}"
+    off = [
+        [abs(math.remainder(math.atan2(north, east) - way, math.tau)) for way in ways]
+        for east, north in lit
+        if math.hypot(east, north) >= NEAR
+    ]
+    for i, way in enumerate(ways):
+        assert any(angles[i] < 0.15 for angles in off), f"nobody is shown at {math.degrees(way):.0f} degrees"
+    assert all(min(angles) < 0.3 for angles in off), f"something else is shown: {lit}"
 
 
 def on_a_server(url: str) -> None:
@@ -97,12 +139,17 @@ def main(name: str, url: str = "") -> None:
         on_a_server(url)
         exec(program, space)
         return
-    real = name == LOOP or engines.prepare(name)
-    in_this_process((1, 0, False) if name == LOOP else (0, 0, False))
+    if name == LOOP:
+        said = "walked"
+        in_this_process((1, 0, False), lambda view: None)
+    else:
+        real, lit = engines.prepare(name)
+        said = f"walked, and all are shown by {'the engine' if real else 'a stand-in'}"
+        in_this_process((0, 0, False), lambda view: compare(lit(), view))
     try:
         exec(program, space)
     except EnoughError:
-        print("walked, in", "the engine" if real else f"a stand-in; it has drawn {bool(engines.Thing.drawn)}")
+        print(said)
 
 
 if __name__ == "__main__":
