@@ -4,7 +4,7 @@ from sovereign_netcode.shared.scene import Scene
 
 
 class Freeze(Rules):
-    """The first to join freezes the others by touching them; who is not frozen thaws those who are."""
+    """The first player freezes the others by touching them; players who are free thaw the frozen ones."""
 
     scene = "meadow"
 

@@ -20,7 +20,7 @@ from tests.client_sdk.servers import real_server
 from tests.packaging.bare import ROOT, build, environment, run
 from tests.packaging.test_rewriting import imported
 from tests.readme.pages import programs
-from tests.readme.run_snippet import LOOP
+from tests.readme.run_snippet import LOOPS
 from tests.readme.test_snippets import A_FILE, ALONE, ENGINES, ON_A_SERVER
 
 pytestmark = pytest.mark.e2e
@@ -210,7 +210,7 @@ def test_a_match(installed: Installed) -> None:
 
 
 @pytest.mark.parametrize(
-    "name", [LOOP, ENGINES[0], *(pytest.param(name, marks=pytest.mark.slow) for name in ENGINES[1:])]
+    "name", [*LOOPS, ENGINES[0], *(pytest.param(name, marks=pytest.mark.slow) for name in ENGINES[1:])]
 )
 def test_a_program_with_a_loop(installed: Installed, name: str) -> None:
     assert "walked" in installed.run("-m", "tests.readme.run_snippet", name)
@@ -223,7 +223,7 @@ def test_the_other_programs(installed: Installed) -> None:
             assert "walked" in installed.run("-m", "tests.readme.run_snippet", name, url)
     for name in ALONE:
         installed.run("-c", f"from tests.readme.pages import programs; exec(programs()[{name!r}])")
-    assert len(programs()) == len([LOOP, A_FILE, *ENGINES, *ON_A_SERVER, *ALONE])
+    assert len(programs()) == len([*LOOPS, A_FILE, *ENGINES, *ON_A_SERVER, *ALONE])
 
 
 def test_five_bots(installed: Installed) -> None:

@@ -24,12 +24,13 @@ from sovereign_netcode.shared.scene import load_scene
 from tests.readme import engines
 from tests.readme.pages import programs
 
-LOOP = "In your game's loop"
+LOOPS = ("A client", "In your game's loop")
+"""The programs that are a bare loop and walk east. The others are run by an engine, whose keys are not pressed."""
 URL = "ws://127.0.0.1:8765"
 FAR_BLOCKS = 3.0
 COMPANY = ((9, 0), (0, 6))
 NEAR = 0.07
-"""Of the window's height: the own figure is shown no further from the middle than this."""
+"""The own figure is shown at most this far from the middle, in heights of the window."""
 FRAMES_MAX = 3000
 
 
@@ -139,7 +140,7 @@ def main(name: str, url: str = "") -> None:
         on_a_server(url)
         exec(program, space)
         return
-    if name == LOOP:
+    if name in LOOPS:
         said = "walked"
         in_this_process((1, 0, False), lambda view: None)
     else:

@@ -9,20 +9,23 @@ import re
 import subprocess
 import sys
 from pathlib import Path
+from random import Random
 from typing import Any
 
 import pytest
 
 from client_sdk import Loopback
+from client_sdk.bots import Follow, Wander
 from server.game import Game
 from shared.scene import Scene, Template, load_scene
+from sovereign_netcode.playtest import Match, bot
 from tests.client_sdk.servers import ROOT, real_server
 from tests.readme.pages import programs
-from tests.readme.run_snippet import LOOP
+from tests.readme.run_snippet import LOOPS
 
 ENGINES = ["pygame-ce", "pyglet", "arcade", "Panda3D", "ursina"]
 ON_A_SERVER = ["asyncio", "A bot"]
-ALONE = ["Without a socket", "Testing it", "Agents that learn"]
+ALONE = ["A game", "Without a socket", "Testing it", "Agents that learn"]
 A_FILE = "Your own game"
 
 
@@ -34,7 +37,7 @@ def run(*arguments: str) -> str:
 
 
 def test_there_are_no_others() -> None:
-    assert sorted(programs()) == sorted([*ENGINES, LOOP, *ON_A_SERVER, *ALONE, A_FILE])
+    assert sorted(programs()) == sorted([*ENGINES, *LOOPS, *ON_A_SERVER, *ALONE, A_FILE])
 
 
 @pytest.mark.parametrize("engine", ENGINES)
@@ -44,10 +47,11 @@ def test_an_engines_loop(engine: str) -> None:
     assert engine != "pygame-ce" or said.endswith("the engine")
 
 
-def test_a_bare_loop() -> None:
-    said = run(LOOP).splitlines()
-    assert said[0].startswith("in hills as ")
-    assert said[-1] == "walked"
+@pytest.mark.parametrize(("name", "says"), list(zip(LOOPS, ("Joined(entity=1", "in hills as "), strict=True)))
+def test_a_bare_loop(name: str, says: str) -> None:
+    lines = run(name).splitlines()
+    assert any(line.startswith(says) for line in lines)
+    assert lines[-1] == "walked"
 
 
 @pytest.mark.e2e
@@ -60,7 +64,7 @@ def test_asyncio_and_bots() -> None:
 
 
 def alone(name: str) -> dict[str, Any]:
-    """What is there after a program that needs nothing else."""
+    """Runs a program that needs nothing else. Returns its global variables."""
     assert name in ALONE
     space: dict[str, Any] = {}
     exec(compile(programs()[name], name, "exec"), space)
@@ -81,8 +85,22 @@ def test_agents() -> None:
     assert alone("Agents that learn")["truncations"] == {f"player_{i}": True for i in range(4)}
 
 
+def test_the_smallest_game() -> None:
+    """Bots play it; two that touch get a point each."""
+    rules = alone("A game")["Bounce"]()
+    match = Match(load_scene(rules.scene), seed=1, rules=rules)
+    match.join(bot(Follow(Random(1))))
+    match.join(bot(Wander(Random(2))))
+    match.run(20)
+    game = match.game.stage
+    scores = [game.get(entity, "score") for entity in game.entities("player")]
+    assert len(scores) == 2
+    assert scores[0] == scores[1] > 0
+    assert match.game.counters.rules_failed == 0
+
+
 def test_a_game() -> None:
-    """Who plays it is in tests/examples/test_freeze.py."""
+    """The README shows the whole example; tests/examples/test_freeze.py plays it."""
     text = (ROOT / "sovereign_netcode" / "examples" / "freeze.py").read_text("utf-8")
     assert len(text.splitlines()) < 30
     assert programs()[A_FILE] == text
