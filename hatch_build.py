@@ -1,7 +1,7 @@
 """Build hook of hatchling: makes the wheel's one top-level package, `sovereign_netcode`.
 
 In the repository, server/, client_sdk/ and shared/ stand at the root and import each other by these names. A wheel with
-such top-level packages would collide with a user's own `server.py` or `shared/`. So the wheel has them under
+such top-level packages would collide with a user's own `server.py` or `shared/`. The wheel therefore has them under
 `sovereign_netcode`, with their imports rewritten; every other file is carried as it is. Line numbers stay the same.
 
 An editable install uses the repository itself, where `sovereign_netcode` is an alias (sovereign_netcode/_checkout.py).
@@ -32,15 +32,15 @@ ALIAS = "_checkout.py"
 
 _NAMES = "|".join(FOLDERS)
 _IN_TEXT = re.compile(rf"(?<=`)(?=(?:{_NAMES})\.[a-z_])|(?<=python -m )(?=(?:{_NAMES})\b)")
-"""Where a docstring, comment or message names a module. Neither pattern can occur in code outside of them."""
+"""Matches where a docstring, comment or message names a module. Neither alternative can occur in other code."""
 
 
 class RewriteError(Exception):
-    """A source uses a module's name in a way that cannot be rewritten. The text says where, and what to write."""
+    """A source uses a module's name in a way that cannot be rewritten. The message has the place and what to write."""
 
 
 class StaleError(Exception):
-    """The prebuilt kernels are not those of the sources."""
+    """The prebuilt kernels were not built from the current sources."""
 
 
 class Hook(BuildHookInterface[Any]):
@@ -86,10 +86,10 @@ def stage(root: Path, place: Path) -> None:
 
 
 def refuse_stale_kernels(root: Path) -> None:
-    """Compares the prebuilt kernels with the sources that go into the wheel with them.
+    """Checks that the prebuilt kernels were built from the sources that go into the same wheel.
 
     Raises:
-        StaleError: they are not those of the sources. The text says what to do.
+        StaleError: they were not, or a file differs from the manifest. The message says what to do.
     """
     spec = importlib.util.spec_from_file_location("freshness", root / "shared" / "freshness.py")
     assert spec is not None
@@ -103,18 +103,18 @@ def refuse_stale_kernels(root: Path) -> None:
         raise StaleError("shared/prebuilt is not made from shared/kernel.py and shared/bulk.py: run scripts/kernels")
     for name, told in manifest["files"].items():
         if hashlib.sha256((folder / name).read_bytes()).hexdigest() != told["sha256"]:
-            raise StaleError(f"shared/prebuilt/{name} is not as manifest.json has it: run scripts/kernels")
+            raise StaleError(f"shared/prebuilt/{name} differs from its hash in manifest.json: run scripts/kernels")
 
 
 def files(folder: Path) -> Iterator[Path]:
-    """All files below a folder but caches, in a fixed order."""
+    """Yields all files below a folder in a fixed order. Caches and hidden files are left out."""
     for path in sorted(folder.rglob("*")):
         if path.is_file() and "__pycache__" not in path.parts and not path.name.startswith("."):
             yield path
 
 
 def module_names(root: Path) -> Iterator[str]:
-    """The dotted name of every module in `FOLDERS`, as the repository has it."""
+    """Yields the dotted name of every module in `FOLDERS`, as in the repository (`server.game`)."""
     for folder in FOLDERS:
         for file in files(root / folder):
             if file.suffix == ".py":
@@ -122,20 +122,20 @@ def module_names(root: Path) -> Iterator[str]:
 
 
 def docstring_alone(source: str) -> str:
-    """The source of a module without all but its docstring: the wheel's package needs no alias."""
+    """Returns a module's source reduced to its docstring. The wheel's package needs no alias."""
     return f'"""{ast.get_docstring(ast.parse(source))}"""\n'
 
 
 def rewritten(source: str, name: str, modules: Collection[str]) -> str:
-    """A source that imports the modules of `FOLDERS` from within `PACKAGE`.
+    """Returns a module's source with the imports of `FOLDERS` changed to imports from `PACKAGE`.
 
     Args:
         source: the text of a module.
-        name: what to call it in an error.
+        name: file name for error messages.
         modules: the dotted names of all modules of `FOLDERS`.
 
     Raises:
-        RewriteError: it uses a module's name in a way that cannot be rewritten.
+        RewriteError: the source uses a module's name in a way that cannot be rewritten.
     """
     tree = ast.parse(source, name)
     lines = io.StringIO(source).readlines()
@@ -144,7 +144,7 @@ def rewritten(source: str, name: str, modules: Collection[str]) -> str:
         starts.append(starts[-1] + len(line))
 
     def offset(line: int, column_bytes: int) -> int:
-        """Turns a position of the syntax tree, which counts bytes of UTF-8, to one in the text."""
+        """Converts a position of the syntax tree, which counts bytes of UTF-8, to an index into the text."""
         return starts[line - 1] + len(lines[line - 1].encode()[:column_bytes].decode())
 
     names_at = _names_after_from(source, starts)
@@ -163,7 +163,7 @@ def rewritten(source: str, name: str, modules: Collection[str]) -> str:
 
 
 def _names_after_from(source: str, starts: list[int]) -> dict[int, int]:
-    """The place of the name after each `from`, by the place of the `from`."""
+    """Returns the index of the name after each `from`, by the index of the `from`."""
     tokens = tokenize.generate_tokens(io.StringIO(source).readline)
     places = [(token.string, starts[token.start[0] - 1] + token.start[1]) for token in tokens]
     return {at: after for (text, at), (_, after) in pairwise(places) if text == "from"}
@@ -174,7 +174,7 @@ def _is_ours(module: str) -> bool:
 
 
 def _refuse(node: ast.AST, name: str, modules: Collection[str]) -> None:
-    """Raises if a node names a module so that the name would be wrong in the wheel."""
+    """Raises `RewriteError` if a node names a module in a way that would be wrong in the wheel."""
     match node:
         case ast.Import(names=names):
             for part in names:
@@ -196,7 +196,7 @@ def _refuse(node: ast.AST, name: str, modules: Collection[str]) -> None:
 
 
 def write_stubs(root: Path) -> None:
-    """Writes a stub `sovereign_netcode/server/rules.pyi` for each module like server/rules.py, for type checkers."""
+    """Writes one stub per module for type checkers, like `sovereign_netcode/server/rules.pyi` for server/rules.py."""
     stubs: dict[Path, str] = {}
     for module in module_names(root):
         path = root / PACKAGE / module.replace(".", "/")

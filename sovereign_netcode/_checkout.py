@@ -20,7 +20,7 @@ HINT = f"rename the module, or install {PACKAGE} instead of using its checkout (
 
 
 class AliasFinder(MetaPathFinder):
-    """Finds `sovereign_netcode.server...` as `server...`, and `server` in this checkout wherever the program is."""
+    """Finds `sovereign_netcode.server...` as `server...`, and `server` in this checkout from any current folder."""
 
     def find_spec(
         self, fullname: str, path: Sequence[str] | None = None, target: ModuleType | None = None
@@ -40,7 +40,7 @@ class AliasFinder(MetaPathFinder):
 
 
 class AliasLoader(InspectLoader):
-    """Puts the module that `own` describes in the place of an alias."""
+    """Puts the module that `own` describes in place of the alias module."""
 
     def __init__(self, own: ModuleSpec) -> None:
         self.own = own
@@ -64,16 +64,16 @@ class AliasLoader(InspectLoader):
 
 
 def install() -> None:
-    """Makes the import system use `AliasFinder` first. Warns if that hides a module of the program.
+    """Makes the import system ask `AliasFinder` first. Warns if that hides a module of the program.
 
     Raises:
-        ImportError: a module with the name of one of `FOLDERS` is imported already.
+        ImportError: another module with the name of one of `FOLDERS` is already imported.
     """
     for name in FOLDERS:
         there, place = sys.modules.get(name), ROOT / name
         if there is not None and not _is_at(place, getattr(there, "__path__", None)):
             raise ImportError(
-                f"{PACKAGE} in a checkout needs the name {name!r} for {place}, but {there!r} has it: {HINT}"
+                f"{PACKAGE} in a checkout needs the name {name!r} for {place}, but it is {there!r}: {HINT}"
             )
         found = PathFinder.find_spec(name)
         if found is not None and not _is_at(place, found.submodule_search_locations):
@@ -83,5 +83,5 @@ def install() -> None:
 
 
 def _is_at(place: Path, locations: Iterable[str] | None) -> bool:
-    """Whether a package is the folder `place`."""
+    """Returns whether one of a package's `locations` is the folder `place`."""
     return any(Path(location).resolve() == place for location in locations or ())

@@ -1,4 +1,4 @@
-"""The installed commands, `sovereign-server` and others: what pyproject.toml's `[project.scripts]` name."""
+"""Entry points of the installed commands, `sovereign-server` and others (`[project.scripts]` in pyproject.toml)."""
 
 import importlib
 import sys
@@ -32,10 +32,10 @@ def replay() -> int:
 
 
 def _run(module: str, extra: str = "") -> int:
-    """Calls a module's `main`, in the conditions of `python -m`: modules in the current folder can be imported.
+    """Calls a module's `main` as `python -m` would: modules in the current folder can be imported.
 
     Args:
-        extra: of `pyproject.toml`, with what the module needs.
+        extra: the extra in pyproject.toml that installs the packages which the module needs.
 
     Raises:
         SystemExit: a package that the module needs is not installed.

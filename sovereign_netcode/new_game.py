@@ -1,4 +1,4 @@
-"""Begins a game: writes NAME.py (its rules) and test_NAME.py (bots play it) to the current folder."""
+"""Starts a new game: writes NAME.py (its rules) and test_NAME.py (bots play it) to the current folder."""
 
 import argparse
 import importlib.util
@@ -12,8 +12,8 @@ RULES = '''\
 
     sovereign-server --game {name}:{title}
 
-All hooks are described in `sovereign_netcode.server.rules`, and all that they may do (`self.game`) in
-`sovereign_netcode.server.stage`.
+`sovereign_netcode.server.rules` describes all hooks. `sovereign_netcode.server.stage` describes what the hooks can do
+with the game (`self.game`).
 """
 
 from typing import Any
@@ -29,15 +29,15 @@ class {title}(Rules):
     scene = "meadow"
 
     def prepare(self, scene: Scene) -> Scene:
-        # Another template: like that of players, except for the fields given here. Clients predict it exactly.
+        # Adds a template that equals the players' one except for the fields given here. Clients predict it exactly.
         return scene.with_template("runner", walk_speed=7.0)
 
     def on_start(self) -> None:
-        # Shared values are sent to all clients: `client.shared`.
+        # All clients receive shared values, as `client.shared`.
         self.game.share("points_to_win", 10)
 
     def on_join(self, player: Player) -> None:
-        # Attributes of an entity are sent to all who see it: `Figure.attributes`. "name" is there already.
+        # All clients that see an entity receive its attributes, as `Figure.attributes`. "name" is set already.
         self.game.set(player.entity, "points", 0)
 
     def on_contact(self, a: int, b: int) -> None:
@@ -46,11 +46,11 @@ class {title}(Rules):
             self.game.set(entity, "points", points)
             if points == self.game.shared["points_to_win"]:
                 self.game.change(entity, "runner")
-                # The clients receive this event as `Happened`.
+                # All clients receive this event as `Happened`.
                 self.game.send("winner", {{"entity": entity}})
 
     def on_command(self, player: Player, name: str, payload: Any) -> bool | None:
-        # A client sends `client.command("boost")`. False refuses it.
+        # A client calls `client.command("boost")`. Returning False rejects the command.
         if name != "boost":
             return False
         self.game.throw(player.entity, (0.0, 0.0, 12.0))
@@ -91,7 +91,7 @@ def test_two_bots_play() -> None:
     ann, bob = match.join(bot(seek), Path(0.05)), match.join(bot(seek), Path(0.05))  # 50 ms each way
     match.run(20)
 
-    game = match.game.stage  # what is `self.game` in the rules
+    game = match.game.stage  # the object that the rules have as `self.game`
     assert game.get(ann.core.entity, "points") == game.get(bob.core.entity, "points") > 0
     for player in (ann, bob):
         assert player.core.state == "playing"
@@ -126,22 +126,24 @@ def test_a_boost_goes_up() -> None:
 
 
 def main() -> int:
-    """Writes the two files and says what to do with them. Returns the exit code."""
+    """Writes the two files and prints how to use them. Returns the exit code."""
     parser = argparse.ArgumentParser(prog="sovereign-new-game", description=__doc__)
-    parser.add_argument("name", metavar="NAME", help="of the game: small letters, digits and _, like king_of_the_hill")
+    parser.add_argument(
+        "name", metavar="NAME", help="the game's name: lower-case letters, digits and _, like king_of_the_hill"
+    )
     name = parser.parse_args().name
     title = "".join(part.capitalize() for part in name.split("_"))
     if not name.isidentifier() or name != name.lower() or keyword.iskeyword(name):
-        return failed(f"{name!r}: must be small letters, digits and _, like king_of_the_hill")
+        return failed(f"NAME = {name!r}: must be lower-case letters, digits and _, like king_of_the_hill")
     files = {Path(f"{name}.py"): RULES, Path(f"test_{name}.py"): TEST}
     for path in files:
         if path.exists():
-            return failed(f"{path} is there already, and stays as it is")
+            return failed(f"{path} exists already and was not changed")
     if importlib.util.find_spec(name) is not None:
-        return failed(f"{name!r}: there is a module of that name already")
+        return failed(f"NAME = {name!r}: a module of that name exists already")
     for path, text in files.items():
         path.write_text(text.format(name=name, title=title), encoding="utf-8")
-    print(f"Here are {' and '.join(map(str, files))}. Now try:")
+    print(f"Wrote {' and '.join(map(str, files))}. Now try:")
     if importlib.util.find_spec("pytest") is None:
         print(f"  {sys.executable} -m pip install pytest")
     print(f"  {sys.executable} -m pytest test_{name}.py")
@@ -151,7 +153,7 @@ def main() -> int:
 
 
 def command(name: str) -> str:
-    """Returns how to run an installed command: by its name alone if the search path leads to this environment."""
+    """Returns the command line of an installed command: its name alone if PATH leads to this environment."""
     found = shutil.which(f"sovereign-{name}")
     if found is not None and Path(found).parent == Path(sys.executable).parent:
         return f"sovereign-{name}"

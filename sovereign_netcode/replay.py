@@ -1,6 +1,6 @@
-"""Replays a recording of the server (--record FILE) and compares every tick with it; shows what happened around one.
+"""Replays a recording of the server (--record FILE) and compares every tick. With --tick, shows what happened then.
 
-Exits with 0 if all is as recorded, 1 if a tick comes out otherwise, 2 if the file cannot be read as a recording.
+Exits with 0 if all ticks are as recorded, 1 if a tick differs, and 2 if the file cannot be read as a recording.
 """
 
 import argparse
@@ -38,7 +38,7 @@ from shared.world import World
 SEGMENT_CALLS = {LOAD: "loaded", UNLOAD: "unloaded", WRITE: "written"}
 NEAR_BLOCKS = 4.0
 FILE_WIDTH = 160
-"""Columns of what does not go to a terminal."""
+"""Width of the output in columns where it does not go to a terminal."""
 FACES = (("west", 0, -1), ("east", 0, 1), ("south", 1, -1), ("north", 1, 1), ("below", 2, -1), ("above", 2, 1))
 
 
@@ -51,7 +51,9 @@ def arguments(argv: list[str] | None = None) -> argparse.Namespace:
     )
     parser.add_argument("file", type=Path, metavar="FILE", help="a recording")
     parser.add_argument("--tick", type=int, metavar="T", help="show what happened around this tick")
-    parser.add_argument("--entity", type=int, metavar="ID", help="whose neighbourhood (default: all that changed at T)")
+    parser.add_argument(
+        "--entity", type=int, metavar="ID", help="show what is near this entity (default: near each that changed at T)"
+    )
     parser.add_argument("--around", type=int, default=8, metavar="N", help="ticks before and after (default: 8)")
     options = parser.parse_args(argv)
     if options.tick is None and options.entity is not None:
@@ -62,7 +64,7 @@ def arguments(argv: list[str] | None = None) -> argparse.Namespace:
 
 
 class Scene(NamedTuple):
-    """One tick, kept for the table: its world and what led to it."""
+    """One tick of the recording, kept for the table: the world after it, and the inputs and calls that led to it."""
 
     world: World
     inputs: dict[int, Input]
@@ -96,7 +98,11 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def play(recording: Recording, file: BinaryIO, out: Console, options: argparse.Namespace, kept: list[Scene]) -> int:
-    """Replays to the end; what --tick asks for is put into `kept`, also if a later tick differs."""
+    """Replays to the end. Returns the exit code.
+
+    Args:
+        kept: receives the ticks that --tick selects, even if a later tick differs.
+    """
     size = options.file.stat().st_size
     world, ticks, hashes, ended = recording.world, 0, 0, False
     wanted = range(0)
@@ -118,17 +124,17 @@ def play(recording: Recording, file: BinaryIO, out: Console, options: argparse.N
                 progress.update(task, completed=file.tell(), tick=world.tick)
     out.print(
         f"[green]{ticks:,} ticks as recorded[/green], to tick {world.tick}: {hashes} hashes of the whole world, "
-        f"{len(world)} entities, the last {world.state_hash().hex()}",
+        f"{len(world)} entities, the last hash {world.state_hash().hex()}",
         soft_wrap=True,
     )
     if not ended:
-        rest = f" ({recording.torn} bytes of an unfinished record are left out)" if recording.torn else ""
-        out.print(f"The recording was not ended: it breaks off after tick {world.tick}{rest}.")
+        rest = f" ({recording.torn} bytes of an unfinished record were ignored)" if recording.torn else ""
+        out.print(f"The recording has no end record: it breaks off after tick {world.tick}{rest}.")
     return 0
 
 
 def show(kept: list[Scene], options: argparse.Namespace, out: Console) -> None:
-    """Prints the neighbourhood of the entity that was asked for, or of all that changed."""
+    """Prints a table of what is near the entity of --entity, or near each entity that changed at the tick."""
     if options.entity is not None:
         wanted = [options.entity]
     else:
@@ -148,14 +154,16 @@ def show(kept: list[Scene], options: argparse.Namespace, out: Console) -> None:
                 table.add_row(*row, style=marked)
             table.add_section()
         out.print(table)
-    out.print("Input: east, north, jump; * where it is new. All within 4 blocks, nearest first; blocks and blocks/s.")
+    out.print(
+        "Input: east, north, jump; * if new in this tick. Entities within 4 blocks, nearest first. Blocks and blocks/s."
+    )
 
 
 def rows(scene: Scene, entity: int) -> Iterator[tuple[str, ...]]:
-    """The lines of one tick: the entity, then who is near, nearest first."""
+    """Yields the lines of one tick: the entity, then the entities near it, nearest first."""
     world, tick = scene.world, str(scene.world.tick)
     if entity not in world:
-        yield tick, f"{entity} is not there", "", "", "", "", ""
+        yield tick, f"{entity} does not exist", "", "", "", "", ""
         return
     states = world.states()
     centre = states[states[:, ID] == entity][0, X : X + 3]
@@ -178,7 +186,7 @@ def rows(scene: Scene, entity: int) -> Iterator[tuple[str, ...]]:
 
 
 def contacts(world: World, entity: int) -> list[str]:
-    """What touches each face of an entity's box with an area: `below: block 3, east: #7`."""
+    """Returns what touches each face of an entity's box, as in `below: block 3` and `east: #7`. Edges do not count."""
     found = []
     low, high, ids = boxes(world)
     me = int(np.flatnonzero(ids == entity)[0])
@@ -196,14 +204,14 @@ def contacts(world: World, entity: int) -> list[str]:
             spans[axis] = range(layer, layer + 1)
             kinds = {world.blocks.get(x, y, z) for x in spans[0] for y in spans[1] for z in spans[2]}
             names += [f"block {kind}" for kind in sorted(kind for kind in kinds if kind)]
-            names += ["what is not loaded"] * (None in kinds)
+            names += ["terrain that is not loaded"] * (None in kinds)
         if names:
             found.append(f"{name}: {' '.join(names)}")
     return found
 
 
 def boxes(world: World) -> tuple[Int64s, Int64s, Int64s]:
-    """Low and high corners of all entities ([n, 3], grid steps) and their ids."""
+    """Returns the low and high corners of all entities ([n, 3], grid steps) and their ids."""
     states = world.states()
     template = world.scene.kernel_tables()[0][states[:, TEMPLATE]]
     low = states[:, X : X + 3] + template[:, :3]
@@ -211,7 +219,7 @@ def boxes(world: World) -> tuple[Int64s, Int64s, Int64s]:
 
 
 def described(call: Call) -> str:
-    """A call in words."""
+    """Returns a call as a readable text."""
     match call:
         case [int(op), *numbers] if op == PUT:
             places = (numbers[i : i + 12] for i in range(0, len(numbers), 12))
@@ -225,9 +233,9 @@ def described(call: Call) -> str:
         case [int(op), x, y, z, *_] if op in (LOAD, UNLOAD, WRITE):
             return f"segment {x} {y} {z} {SEGMENT_CALLS[op]}"
         case [int(op), tick] if op == REBASE:
-            return f"declared to be tick {tick}"
+            return f"tick number set to {tick}"
         case [int(op), bytes(value)] if op == NOTE:
-            return f"noted: {msgpack.unpackb(value, strict_map_key=False)}"
+            return f"note: {msgpack.unpackb(value, strict_map_key=False)}"
     return str(call)
 
 

@@ -1,11 +1,11 @@
-"""The stderr of a child process: passed on as it comes, and its last line kept, to name the cause of a failure."""
+"""The stderr of a child process: passes it on at once and keeps its last line, to name the cause of a failure."""
 
 import os
 import sys
 import threading
 
 JOIN_S = 2.0
-"""Time for the last words of a child that has ended."""
+"""Seconds to wait for the last output of a child that has ended."""
 LINE_MAX = 500
 
 
@@ -19,16 +19,24 @@ class Stderr:
         self._thread.start()
 
     def started(self) -> None:
-        """The child has its copy of the pipe, so that the pipe ends with the child."""
+        """Closes this process's write end of the pipe. The child has its own copy, so the pipe ends with the child."""
         os.close(self.pipe)
 
     def cause(self, code: int | None) -> str:
-        """Why a child failed: its last line, or else its exit code; None: it still runs, but does not answer."""
+        """Returns why a child failed: its last line on stderr, or its exit code if it wrote none.
+
+        Args:
+            code: the exit code; None if the child still runs but does not answer.
+        """
         if code is not None:
             self._thread.join(JOIN_S)
         if self._last:
             return self._last.removeprefix("error: ")
-        return "it still runs, but says nothing" if code is None else f"it ended with {code}, without a word"
+        return (
+            "it still runs, but does not answer"
+            if code is None
+            else f"it ended with exit code {code} and wrote no error"
+        )
 
     def _pass_on(self, read: int) -> None:
         with open(read, encoding="utf-8", errors="replace") as lines:

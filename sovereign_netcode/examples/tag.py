@@ -1,9 +1,9 @@
-"""Tag: whoever is "it" is a little faster, and hands it over by touching. Who is it for the least time wins the round.
+"""Tag: the player who is "it" is a little faster and tags another by touching. The least time as "it" wins the round.
 
     sovereign-server --game sovereign_netcode.examples.tag:Tag
 
-Nothing is remembered in variables, so a saved game goes on where it was: who is "it" is a template (clients predict
-its speed), scores and the like are attributes, the end of the round is a shared value.
+The rules keep no state in Python variables, so a saved game continues where it was. The player who is "it" has another
+template (clients predict its speed), scores are attributes, and the end of the round is a shared value.
 """
 
 import contextlib
@@ -21,14 +21,15 @@ NAMES = ("Ada", "Bo", "Cleo", "Dag", "Elif", "Finn", "Gus", "Hana", "Ivo", "Juno
 
 
 class Tag(Rules):
-    """Attributes: "name", "score" (seconds of not being it), "safe" (cannot be tagged before that tick).
+    """The rules of tag.
 
+    Attributes: "name", "score" (seconds of not being it), "safe" (the entity cannot be tagged before this tick).
     Shared: "ends" (the tick at which the round ends). Events: "tagged" with {"by", "who"}, "round" with {"winner"}.
     """
 
     scene = "meadow"
     players_min = 6
-    """So many play at least: runners of the server fill up."""
+    """Least number of entities that play. The server adds runners of its own while fewer players are connected."""
     round_s = 120.0
     safe_s = 2.0
 
@@ -76,7 +77,7 @@ class Tag(Rules):
             game.set(entity, "score", 0)
 
     def _fill_up(self) -> None:
-        """Keeps as many runners as players are missing."""
+        """Adds or removes the server's own runners, so that at least `players_min` entities play."""
         game = self.game
         runners = [entity for entity in game.entities() if entity not in game.players]
         for entity in runners[max(self.players_min - len(game.players), 0) :]:
@@ -84,7 +85,7 @@ class Tag(Rules):
         for _ in range(self.players_min - len(game.players) - len(runners)):
             place = game.random.choice(game.scene.spawns)
             free = [name for name in NAMES if name not in [game.get(entity, "name") for entity in game.entities()]]
-            with contextlib.suppress(OverlapError):  # somebody falls just there: in the next tick, then
+            with contextlib.suppress(OverlapError):  # the spawn is occupied: try again in the next tick
                 game.spawn("player", place, name=game.random.choice(free or NAMES), score=0)
 
     def _steer(self) -> None:
@@ -106,7 +107,7 @@ class Tag(Rules):
             x, y = min(max(x, west + 1), west + width - 2), min(max(y, south + 1), south + depth - 2)
             top = next((z for z in range(low + height - 1, low - 1, -1) if game.block(x, y, z)), None)
             if top is None or top > low + height - 8 or game.block(x, y, top) == LEAVES:
-                continue  # no ground, no room below the world's ceiling, or a tree
+                continue  # no ground, no room below the top of the world, or a tree
             ground = top + 1
             for z in range(ground, ground + 4):
                 game.set_block(x, y, z, TRUNK)

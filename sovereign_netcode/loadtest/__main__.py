@@ -1,4 +1,4 @@
-"""`python -m sovereign_netcode.loadtest`: see `--help`."""
+"""Runs the load test: `python -m sovereign_netcode.loadtest --help`."""
 
 import sys
 

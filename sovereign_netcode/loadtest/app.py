@@ -1,11 +1,11 @@
-"""Bots on real sockets against a real server process, and what they saw.
+"""Connects bots over real sockets to a real server process, and reports what they measured.
 
-Starts a server of its own unless --url is given. The bots are spread over --processes, each with an event loop of its
-own. While they play, it shows what has happened since the last look: clients, ticks, how late they began (p50 / p99 /
-max), bytes, late inputs, corrections, and how late the bots are themselves, in the worst of their processes (p99). The
-figures in the end are of the whole window in which all clients are playing; quantiles are of all processes' samples
-put together. Exits with 1 if a bot or a process died, a message was malformed, or the server did not end well; with 2
-if nothing could start.
+Starts a server of its own unless --url is given. The bots are spread over --processes, each with its own event loop.
+While they play, the output shows the figures since the last line: clients, ticks, tick lateness (p50 / p99 / max),
+bytes, late inputs, corrections, and the lateness of the bots themselves (p99, in the worst of their processes). The
+final figures cover the whole window in which all clients are playing. Quantiles are taken over the samples of all
+processes together. Exits with 1 if a bot or a process died, a message was malformed, or the server's exit code was not
+0. Exits with 2 if the test could not start.
 """
 
 import argparse
@@ -40,11 +40,11 @@ from sovereign_netcode.loadtest.processes import (
 
 JOINS_PER_S = 100.0
 JOIN_S_MAX = 30.0
-"""What the joins may take beyond their pace."""
+"""Seconds that the joins may take beyond `clients / JOINS_PER_S`."""
 SETTLE_S = 0.5
-"""After the last join: the bots' garbage has been collected, and what was late for its sake is over."""
+"""Seconds from the last join to the window: the bots collect garbage meanwhile, which delays them."""
 LINES_MAX = 20
-"""Lines of figures, at most, where the output is no terminal."""
+"""Most lines of figures while the bots play, where the output is no terminal."""
 
 
 def arguments(argv: list[str] | None = None) -> argparse.Namespace:
@@ -56,19 +56,28 @@ def arguments(argv: list[str] | None = None) -> argparse.Namespace:
     )
     parser.add_argument("--clients", type=_positive, default=50, metavar="N", help="bots (default: %(default)s)")
     parser.add_argument("--seconds", type=_duration, default=10.0, metavar="S", help="window (default: %(default)g)")
-    parser.add_argument("--url", help="a running server, like ws://localhost:8765, instead of one of its own")
+    parser.add_argument("--url", help="URL of a running server, like ws://localhost:8765 (default: starts one)")
     parser.add_argument("--policy", choices=sorted(POLICIES), default="wander", help="default: %(default)s")
-    parser.add_argument("--scene", default="hills", help="of the own server (default: %(default)s)")
-    parser.add_argument("--tick-rate", type=_positive, metavar="HZ", help="of the own server, not the scene's")
-    parser.add_argument("--seed", type=int, default=1, help="of the bots (default: %(default)s)")
-    parser.add_argument("--processes", type=_positive, default=1, metavar="N", help="for the bots (default: 1)")
+    parser.add_argument("--scene", default="hills", help="scene of the server that is started (default: %(default)s)")
+    parser.add_argument(
+        "--tick-rate",
+        type=_positive,
+        metavar="HZ",
+        help="tick rate of the server that is started (default: the scene's)",
+    )
+    parser.add_argument("--seed", type=int, default=1, help="seed of the bots (default: %(default)s)")
+    parser.add_argument(
+        "--processes", type=_positive, default=1, metavar="N", help="processes for the bots (default: 1)"
+    )
     parser.add_argument("--json", type=Path, metavar="OUT", help="write all figures to this file")
-    parser.add_argument("--verdict", action="store_true", help="say in words what is good and what is not")
+    parser.add_argument(
+        "--verdict", action="store_true", help="print in words which figures are good and which are bad"
+    )
     return parser.parse_args(argv)
 
 
 async def test(args: argparse.Namespace, console: Console) -> int:
-    """The whole test; returns the exit code."""
+    """Runs the whole test. Returns the exit code."""
     server: Process | None = None
     async with contextlib.AsyncExitStack() as stack:
         url = args.url
@@ -78,7 +87,7 @@ async def test(args: argparse.Namespace, console: Console) -> int:
             Worker(await stack.enter_async_context(child(*order, patience_s=2.0))) for order in orders(args, url)
         ]
         for worker in workers:
-            stack.callback(worker.leave)  # all of them, before any is waited for
+            stack.callback(worker.leave)  # tell all of them to end before waiting for any
         watched = {
             "a process of bots": [worker.process for worker in workers],
             "the server": [server] if server else [],
@@ -89,7 +98,7 @@ async def test(args: argparse.Namespace, console: Console) -> int:
     if server is not None:
         measured["server_exit_code"] = server.returncode
         if server.returncode != 0 and os.name != "nt":
-            failed.append(f"the server ended with {server.returncode}: {cause(server)}")
+            failed.append(f"the server ended with exit code {server.returncode}: {cause(server)}")
     measured["failures"] = failed
     if args.json is not None:
         args.json.write_text(json.dumps(measured, indent=2) + "\n", "utf-8")
@@ -98,24 +107,31 @@ async def test(args: argparse.Namespace, console: Console) -> int:
 
 
 def check(watched: dict[str, list[Process]]) -> None:
-    """Nobody has ended.
+    """Checks that all processes still run.
+
+    Args:
+        watched: processes by the name that errors give them.
 
     Raises:
-        DiedError: somebody has.
+        DiedError: a process has ended.
     """
     for name, processes in watched.items():
         for process in processes:
             if process.returncode is not None:
-                raise DiedError(f"{name} ended in the middle, with {process.returncode}: {cause(process)}")
+                raise DiedError(f"{name} ended during the test with exit code {process.returncode}: {cause(process)}")
 
 
 async def measure(
     args: argparse.Namespace, url: str, workers: list[Worker], check: Callable[[], None], console: Console
 ) -> Figures:
-    """Waits for everybody to play, then measures.
+    """Waits until all bots play, then measures.
 
     Args:
-        check: raises if one of the processes is gone.
+        check: raises if one of the processes has ended.
+
+    Raises:
+        CannotStartError: no bot could join.
+        DiedError: a process has ended.
     """
     with Stage(console) as stage:
         stage.begin(f"{args.clients} clients join", args.clients)
@@ -129,7 +145,9 @@ async def measure(
         playing = sum(worker.told["playing"] for worker in workers)
         if not playing:
             reasons = {left["reason"] for worker in workers for left in worker.told["ended"]}
-            raise CannotStartError("; ".join(sorted(reasons)) or "no client could join in time")
+            raise CannotStartError(
+                "; ".join(sorted(reasons)) or f"no client joined within {args.clients / JOINS_PER_S + JOIN_S_MAX:.0f} s"
+            )
 
         stage.begin(f"{playing} play", args.seconds)
         for worker in workers:
@@ -162,7 +180,7 @@ async def measure(
 
 
 def orders(args: argparse.Namespace, url: str) -> list[tuple[str, ...]]:
-    """The command of each process of bots."""
+    """Returns the command line of each process of bots."""
     processes = min(args.processes, args.clients)
     found: list[tuple[str, ...]] = []
     first = 0
@@ -188,7 +206,7 @@ def show(measured: Figures, args: argparse.Namespace, console: Console) -> None:
             mark = "[green]good[/]" if judgement.good else "[red]bad [/]"
             console.print(f"{mark}  {judgement.text}", highlight=False, soft_wrap=True)
         bad = sum(not judgement.good for judgement in judgements)
-        console.print("all is well" if not bad else f"{bad} of {len(judgements)} not as it should be", style="bold")
+        console.print("all is well" if not bad else f"{bad} of {len(judgements)} figures are bad", style="bold")
     elif held_up := bottleneck(measured):
         console.print(held_up, style="yellow", highlight=False, soft_wrap=True)
     for failure in measured["failures"]:
@@ -210,7 +228,7 @@ def _duration(text: str) -> float:
 
 
 async def until_signal(args: argparse.Namespace, console: Console) -> int:
-    """Runs the test until its end, SIGTERM or SIGINT, which a script's background process ignores otherwise."""
+    """Runs the test until it ends or SIGTERM or SIGINT arrives. A script's background process would ignore SIGINT."""
     task = asyncio.ensure_future(test(args, console))
     with contextlib.suppress(NotImplementedError):  # Windows
         for number in (signal.SIGINT, signal.SIGTERM):

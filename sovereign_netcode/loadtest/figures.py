@@ -1,4 +1,4 @@
-"""What a load test has measured: from raw counts to figures, a table and a verdict in words. Nothing runs here."""
+"""The figures of a load test: turns raw counts into figures, a table and a verdict in words. No I/O happens here."""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -12,11 +12,12 @@ SNAPSHOTS_SHARE_MIN = 0.95
 LATE_SHARE_MAX = 0.01
 PACE_MIN = 0.98
 BOTS_CPU_SHARE_MAX = 0.9
-"""Of one core, in any process of bots: with more, they are what is measured."""
+"""Greatest share of one core that a process of bots may use. Above it, the test measures the bots, not the server."""
 MEMORY_MB_MAX = 5.0
 MEMORY_SETTLED_S = 10
 LATENESS = "tick_lateness_counts"
-"""Of `/stats`: how many ticks have been how late."""
+"""Key in `/stats` of the histogram of tick lateness."""
+UNKNOWN = "not reported"
 
 Figures = dict[str, Any]
 
@@ -29,7 +30,7 @@ class Judgement(NamedTuple):
 
 
 def quantiles(values: Sequence[float]) -> dict[str, float]:
-    """p50, p99 and max; zeros for no values."""
+    """Returns p50, p99 and max; zeros if there are no values."""
     if not values:
         return {"p50": 0.0, "p99": 0.0, "max": 0.0}
     ordered = sorted(values)
@@ -40,11 +41,13 @@ def quantiles(values: Sequence[float]) -> dict[str, float]:
 def figures(
     results: Sequence[Figures], seconds: float, before: Figures, after: Figures, rss_mb: list[float]
 ) -> Figures:
-    """The figures of the window.
+    """Returns the figures of the window.
 
     Args:
-        results: what each process of bots counted in the window (the last thing that a `swarm` says).
-        before, after: `/stats` at its ends; empty if the server does not tell.
+        results: the counts of each process of bots in the window (the last line that a `swarm` writes).
+        seconds: length of the window.
+        before, after: `/stats` at the start and end of the window; empty if the server does not provide it.
+        rss_mb: samples of the server's memory in the window.
     """
     clients = [client for result in results for client in result["clients"]]
     bots_cpu_s = sum(result["cpu_s"] for result in results)
@@ -111,13 +114,13 @@ def figures(
 
 
 def rows(f: Figures) -> list[tuple[str, str]]:
-    """The table: what, and how much."""
+    """Returns the rows of the table: names and values."""
     lateness, sizes, bytes_s = f["tick_lateness_ms"], f["correction_blocks"], f["bytes_per_client_per_s"]
     memory, (lag_ms, share) = f["server_rss_mb"], _worst(f["bots"])
     return [
         ("clients", f"{f['clients']} for {f['seconds']:.1f} s at {f['tick_rate'] or '?'} ticks/s"),
         ("server ticks", _or_unknown(f["server_ticks"], "")),
-        ("tick lateness", _three(lateness, "ms") if lateness else "not told"),
+        ("tick lateness", _three(lateness, "ms") if lateness else UNKNOWN),
         (
             "snapshots per client",
             f"{f['snapshots_per_client_per_s']:.1f} /s (worst {f['snapshots_share']['worst']:.1%})",
@@ -131,13 +134,13 @@ def rows(f: Figures) -> list[tuple[str, str]]:
         ("bots' CPU", _or_unknown(f["bots_cpu_us_per_client_tick"], " us per client and tick")),
         ("bots' own lag", _three(f["bots_lag_ms"], "ms")),
         ("in the worst process", f"{lag_ms:.2f} ms (p99); the busiest took {share:.0%} of a core"),
-        ("server memory", f"{memory[0]:.0f} to {memory[-1]:.0f} MB" if memory else "not told"),
+        ("server memory", f"{memory[0]:.0f} to {memory[-1]:.0f} MB" if memory else UNKNOWN),
         ("disconnects", str(f["disconnects"])),
     ]
 
 
 def verdict(f: Figures) -> list[Judgement]:
-    """In words, what is good and what is not."""
+    """Returns the verdict: a sentence per figure that is good or bad."""
     n = f["clients"]
     good_clients, worst = f["clients_with_95_percent"], f["snapshots_share"]["worst"]
     judgements = [
@@ -149,7 +152,7 @@ def verdict(f: Figures) -> list[Judgement]:
             f["disconnects"] == 0,
             "no client lost its connection"
             if f["disconnects"] == 0
-            else f"{f['disconnects']} of {n} clients are gone: " + "; ".join(f["reasons"]),
+            else f"{f['disconnects']} of {n} clients lost their connection: " + "; ".join(f["reasons"]),
         ),
     ]
     if f["server_ticks"] is not None:
@@ -157,7 +160,7 @@ def verdict(f: Figures) -> list[Judgement]:
     late = f["inputs_late_share"]
     judgements.append(
         Judgement(
-            late <= LATE_SHARE_MAX, f"{late:.2%} of the inputs came too late (up to {LATE_SHARE_MAX:.0%} is good)"
+            late <= LATE_SHARE_MAX, f"{late:.2%} of the inputs arrived too late (up to {LATE_SHARE_MAX:.0%} is good)"
         )
     )
     judgements.append(_corrections(f))
@@ -176,24 +179,24 @@ def verdict(f: Figures) -> list[Judgement]:
 
 
 def bottleneck(f: Figures) -> str:
-    """Why the figures tell of the bots and not of the server; empty if nothing says so."""
+    """Returns why the bots and not the server limited the figures; empty if they did not."""
     lag_ms, share = _worst(f["bots"])
     period_ms = 1e3 / (f["tick_rate"] or 32)
     always = max(bots["lag_ms"]["p50"] for bots in f["bots"]) > period_ms
     if always or share > BOTS_CPU_SHARE_MAX:
-        cause = f"they have more to do than a process can ({share:.0%} of a core): more --processes, or fewer --clients"
+        cause = f"each process has too many bots ({share:.0%} of a core): use more --processes or fewer --clients"
     elif lag_ms > period_ms:
-        cause = f"other work keeps this machine busy, for they took no more than {share:.0%} of a core each"
+        cause = f"other work keeps this machine busy: the bots used at most {share:.0%} of a core each"
     else:
         return ""
     return (
-        f"the bots themselves were too slow, by {lag_ms:.0f} ms and more for 1 % of the time; {cause}. Late inputs and "
-        "corrections tell of that, not of the server"
+        f"the bots themselves were late, by {lag_ms:.0f} ms or more for 1 % of the time; {cause}. Late inputs and "
+        "corrections are due to the bots, not to the server"
     )
 
 
 def failures(f: Figures) -> list[str]:
-    """Why the test has failed; empty if it has not."""
+    """Returns why the test has failed; empty if it has not."""
     found = []
     if f["disconnects"]:
         found.append(f"{f['disconnects']} bot(s) died: " + "; ".join(f["reasons"]))
@@ -203,24 +206,24 @@ def failures(f: Figures) -> list[str]:
 
 
 def _worst(bots: Sequence[Figures]) -> tuple[float, float]:
-    """How late the latest process was (p99, in ms), and the share of a core that the busiest took."""
+    """Returns the lag of the latest process (p99, in ms), and the share of a core that the busiest one used."""
     return max(each["lag_ms"]["p99"] for each in bots), max(each["cpu_share"] for each in bots)
 
 
 def _pace(f: Figures) -> Judgement:
     wanted = f["tick_rate"] * f["seconds"]
     pace, period_ms = f["server_ticks"] / wanted, 1e3 / f["tick_rate"]
-    text, good = f"the server made {pace:.1%} of its ticks", pace >= PACE_MIN
+    text, good = f"the server ran {pace:.1%} of its ticks", pace >= PACE_MIN
     if f["tick_lateness_ms"]:
         p99 = f["tick_lateness_ms"]["p99"]
-        text += f"; 99 % began within {p99:.1f} ms (a tick is {period_ms:.0f} ms)"
+        text += f"; 99 % began within {p99:.1f} ms of their time (the period is {period_ms:.0f} ms)"
         good = good and p99 < period_ms
     return Judgement(good, text)
 
 
 def _corrections(f: Figures) -> Judgement:
     if not f["corrections"]:
-        return Judgement(True, "no prediction had to be corrected")
+        return Judgement(True, "no prediction was corrected")
     causes: Counter[str] = Counter(f["corrections_by_cause"])
     by_late, unexplained = causes["late input"], causes[NONDETERMINISM]
     text = (
@@ -229,7 +232,7 @@ def _corrections(f: Figures) -> Judgement:
         + ", ".join(f"{cause} {n}" for cause, n in causes.most_common())
     )
     if unexplained:
-        text += f"; {unexplained} without a cause, which must never be: please report it"
+        text += f"; {unexplained} without a cause, which must never happen: please report it"
     elif by_late > LATE_SHARE_MAX * f["inputs_sent"]:
         text += "; too many after late inputs"
     return Judgement(not unexplained and by_late <= LATE_SHARE_MAX * f["inputs_sent"], text)
@@ -240,4 +243,4 @@ def _three(values: dict[str, float], unit: str) -> str:
 
 
 def _or_unknown(value: float | None, unit: str) -> str:
-    return "not told" if value is None else f"{value:g}{unit}"
+    return UNKNOWN if value is None else f"{value:g}{unit}"

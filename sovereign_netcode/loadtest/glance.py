@@ -1,4 +1,4 @@
-"""What a load test shows while it runs: the figures between two looks, and the place where they are shown."""
+"""The display of a running load test: the figures between two samples, and the place where they are shown."""
 
 from typing import NamedTuple
 
@@ -14,21 +14,21 @@ Row = tuple[str, str]
 
 
 class Look(NamedTuple):
-    """What both sides have said at one moment; all counts go on from look to look."""
+    """A sample of both sides at one moment. All counts are totals, so two samples give the figures between them."""
 
     server: Figures
-    """`/stats`; empty if the server does not tell."""
+    """The server's `/stats`; empty if the server does not provide it."""
     bots: list[Figures]
-    """Of each process of bots, what it has said last."""
+    """The latest report of each process of bots."""
 
 
 def rows(before: Look, now: Look) -> list[Row]:
-    """What has happened between two looks: names and values."""
+    """Returns the figures between two samples: names and values."""
     found = [("clients", _clients(now))]
     if before.server and now.server:
         found += _server(before.server, now.server)
     pairs = list(zip(before.bots, now.bots, strict=True))
-    if silent := sum(a.get("at") == b.get("at") for a, b in pairs):  # they have no time to speak
+    if silent := sum(a.get("at") == b.get("at") for a, b in pairs):  # too busy to report
         found.append(("bots silent", f"{silent} of {len(pairs)} processes"))
     pairs = [(a, b) for a, b in pairs if "at" in a and b["at"] > a["at"]]
     return found + (_bots(pairs) if pairs else [])
@@ -41,7 +41,7 @@ def _clients(now: Look) -> str:
 
 def _server(before: Figures, now: Figures) -> list[Row]:
     seconds = now["uptime_s"] - before["uptime_s"]
-    if seconds <= 0:  # it has been started anew
+    if seconds <= 0:  # the server was restarted
         return []
     lateness = between(before[LATENESS], now[LATENESS])
     return [
@@ -73,7 +73,7 @@ def _bots(pairs: list[tuple[Figures, Figures]]) -> list[Row]:
 
 
 class Stage:
-    """What goes on right now: a bar and figures on a terminal, otherwise one line for each of them."""
+    """The display: a progress bar and figures on a terminal, otherwise one line for each phase and each sample."""
 
     def __init__(self, console: Console) -> None:
         self._console = console
@@ -100,7 +100,7 @@ class Stage:
         self._progress.update(self._task, completed=done)
 
     def show(self, seconds: float, figures: list[Row]) -> None:
-        """The figures of the last moments, `seconds` after the beginning."""
+        """Shows the latest figures, `seconds` after the start of the window."""
         if self._live is None:
             text = ", ".join(f"{name} {value}" for name, value in figures)
             self._console.print(f"{seconds:6.0f} s  {text}", highlight=False, soft_wrap=True)

@@ -1,4 +1,4 @@
-"""The processes of a load test: a server, its `/stats`, and processes full of bots. None of them outlives its block."""
+"""The processes of a load test: a server, its `/stats`, and processes of bots. No process outlives its `with` block."""
 
 import argparse
 import asyncio
@@ -14,9 +14,9 @@ from weakref import WeakKeyDictionary
 from sovereign_netcode.stderr import Stderr
 
 START_S_MAX = 120.0
-"""A server's first start compiles the physics."""
+"""Seconds in which a server must start. Its first start may compile the physics."""
 END_S = 10.0
-"""A process that has not ended by then, though asked to, is killed."""
+"""Seconds that a process has to end after it was asked to. Then it is killed."""
 RESULT_S_MAX = 30.0
 LINE_BYTES_MAX = 1 << 24
 
@@ -26,49 +26,49 @@ _stderr: WeakKeyDictionary[Process, Stderr] = WeakKeyDictionary()
 
 
 class CannotStartError(Exception):
-    """The test cannot begin; the text says why."""
+    """The test cannot start. The message says why."""
 
 
 class DiedError(Exception):
-    """A process has ended that should not have; the text says which, and how."""
+    """A process has ended that should still run. The message says which, and with what exit code."""
 
 
 class Worker:
-    """The other end of a process of bots (`sovereign_netcode.loadtest.swarm`)."""
+    """The load test's side of a process of bots (`sovereign_netcode.loadtest.swarm`)."""
 
     def __init__(self, process: Process) -> None:
         self.process = process
         self.told: Figures = {"playing": 0, "ended": []}
-        """What it has said last; its docstring says what that is."""
+        """The latest report of the process; the docstring of the module `swarm` lists its fields."""
         self._result: Figures | None = None
         self._reading = asyncio.create_task(self._read())
 
     async def tell(self, command: str) -> None:
         assert self.process.stdin is not None
-        with contextlib.suppress(ConnectionError):  # it is dead, which is found out elsewhere
+        with contextlib.suppress(ConnectionError):  # it has ended, which `app.check` reports
             self.process.stdin.write(f"{command}\n".encode())
             await self.process.stdin.drain()
 
     async def result(self) -> Figures:
-        """What its bots counted.
+        """Returns the counts of the bots in the window.
 
         Raises:
-            DiedError: the process died.
+            DiedError: the process ended without reporting them.
         """
         with contextlib.suppress(TimeoutError):
             await asyncio.wait_for(self._reading, RESULT_S_MAX)
         if self._result is None:
-            raise DiedError(f"a process of bots has not told its figures: {cause(self.process)}")
+            raise DiedError(f"a process of bots has not reported its figures: {cause(self.process)}")
         return self._result
 
     def leave(self) -> None:
-        """Its end may begin."""
+        """Tells the process to end, by closing its input."""
         assert self.process.stdin is not None
         self.process.stdin.close()
 
     async def _read(self) -> None:
         assert self.process.stdout is not None
-        while (line := await self.process.stdout.readline()).endswith(b"\n"):  # else it died while it spoke
+        while (line := await self.process.stdout.readline()).endswith(b"\n"):  # else it died within a line
             told = json.loads(line)
             if "clients" in told:
                 self._result = told
@@ -78,14 +78,15 @@ class Worker:
 
 @contextlib.asynccontextmanager
 async def child(*command: str, patience_s: float = 0.0) -> AsyncIterator[Process]:
-    """A process that has ended when this has, whatever happens. Ctrl-C goes to this process alone.
+    """Runs a process of this Python within the block. Ctrl-C reaches only the parent process.
 
-    At the end its input is closed, which ends bots; after `patience_s` it gets SIGTERM, which ends a server.
+    At the end of the block the child's input is closed, which ends bots. After `patience_s` the child gets SIGTERM,
+    which ends a server. After a further `END_S` it is killed.
     """
     errors = Stderr()
     try:
         process = await asyncio.create_subprocess_exec(
-            *(sys.executable, "-P", *command),  # -P: modules in the current folder do not matter
+            *(sys.executable, "-P", *command),  # -P: modules in the current folder cannot hide others
             stdin=asyncio.subprocess.PIPE,
             stdout=asyncio.subprocess.PIPE,
             stderr=errors.pipe,
@@ -111,12 +112,12 @@ async def child(*command: str, patience_s: float = 0.0) -> AsyncIterator[Process
 
 
 def cause(process: Process) -> str:
-    """Why a `child` failed, in its own words if it has said something."""
+    """Returns why a `child` failed: the last line that it wrote on stderr, or its exit code."""
     return _stderr[process].cause(process.returncode)
 
 
 async def ended(process: Process, seconds: float) -> bool:
-    """Waits for a process to end, at most so long; whether it has."""
+    """Waits at most `seconds` for a process to end. Returns whether it has ended."""
     with contextlib.suppress(TimeoutError):
         await asyncio.wait_for(process.wait(), seconds)
     return process.returncode is not None
@@ -124,10 +125,10 @@ async def ended(process: Process, seconds: float) -> bool:
 
 @contextlib.asynccontextmanager
 async def own_server(args: argparse.Namespace) -> AsyncIterator[tuple[Process, str]]:
-    """A server on a port that the system picks, once it listens.
+    """Runs a server on a free port. Yields its process and URL once it listens.
 
     Raises:
-        CannotStartError: it does not; the text says why.
+        CannotStartError: the server did not start. The message says why.
     """
     rate = ("--tick-rate", str(args.tick_rate)) if args.tick_rate else ()
     command = (
@@ -154,7 +155,7 @@ async def own_server(args: argparse.Namespace) -> AsyncIterator[tuple[Process, s
 
 
 async def stats(url: str) -> Figures:
-    """The server's `/stats`; empty if it does not tell."""
+    """Returns the server's `/stats`; empty if the server does not provide it."""
 
     def get() -> Figures:
         address = urlsplit(url)

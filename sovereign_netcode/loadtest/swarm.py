@@ -1,13 +1,13 @@
-"""One process full of bots, told what to do over its pipes; the load test starts it.
+"""A process of bots. The load test starts it and controls it over its pipes.
 
 argument  {"url", "first", "clients", "seed", "policy", "joins_per_s"}, as JSON
-stdin     "settle": all have joined, tidy up; "measure": the window begins; "stop": it ends, say goodbye; the end of the
-          pipe: give up
+stdin     a command per line: "settle": all have joined, collect garbage; "measure": the window begins; "stop": the
+          window ends, report and disconnect. The end of the pipe: disconnect without a report
 stdout    a JSON object per line: {"playing", "ended"} while joining, and from "measure" on also {"at", "cpu_s",
-          "lag_counts", ...}, the counters of all its bots since their start; after "stop" {"clients", "cpu_s",
-          "lag_counts"}, of the window
+          "lag_counts", ...}, the counters of all its bots since their start. After "stop" {"clients", "cpu_s",
+          "lag_counts"}, counted in the window
 
-Counts of lags are a `Histogram`'s: those of several processes can be added up.
+`lag_counts` are the counts of a `Histogram`; the counts of several processes can be added.
 """
 
 import asyncio
@@ -42,7 +42,7 @@ class Player:
     name: str
     client: AsyncClient | None = None
     left: dict[str, Any] | None = None
-    """Why it is no longer there; None: it is, or nobody has tried yet."""
+    """Close code and reason of the ended connection; None while it lasts or has not been tried."""
     before: dict[str, float] = field(default_factory=dict)
     causes_before: dict[str, int] = field(default_factory=dict)
     tick_before: int = 0
@@ -52,7 +52,7 @@ class Player:
         return self.client is not None and self.client.core.state == "playing"
 
     async def play(self, url: str, bot: Bot) -> None:
-        """Connects, and lives until it is over."""
+        """Connects, and plays until the connection ends for good."""
         try:
             self.client = await AsyncClient.connect(url, name=self.name, before_update=bot, timeout=20.0)
         except ConnectError as error:
@@ -63,15 +63,15 @@ class Player:
                 self.left = {"code": event.code, "reason": event.reason}
 
     def mark(self) -> None:
-        """The window begins."""
+        """Remembers all counters at the start of the window."""
         if self.client is not None:
             self.before = counters(self.client.stats)
             self.causes_before = dict(self.client.stats.corrections_by_cause)
             self.tick_before = self._tick()
 
     def figures(self) -> dict[str, Any]:
-        """What has happened since `mark`."""
-        left = self.left or (None if self.playing else {"code": 0, "reason": "it never got to play"})
+        """Returns the counts since `mark`."""
+        left = self.left or (None if self.playing else {"code": 0, "reason": "the bot did not join in time"})
         base: dict[str, Any] = {"name": self.name, "left": left, "ticks": 0} | dict.fromkeys(COUNTERS, 0)
         if self.client is None or not self.before:
             return base | {"correction_blocks": [], "causes": {}, "lead_ticks": 0.0, "rtt_ms": 0.0}
@@ -96,7 +96,7 @@ class Player:
         )
 
     def _tick(self) -> int:
-        """The newest tick that the server has told of."""
+        """Returns the newest tick that the bot has received from the server."""
         prediction = self.client.core.prediction if self.client is not None else None
         return prediction.confirmed.tick if prediction is not None else 0
 
@@ -106,7 +106,7 @@ def counters(stats: Stats) -> dict[str, float]:
 
 
 async def swarm(order: dict[str, Any]) -> int:
-    """Runs the bots until told to stop."""
+    """Runs the bots until "stop" or the end of stdin. Returns the exit code."""
     commands = listen()
     players = [Player(f"bot {order['first'] + i}") for i in range(order["clients"])]
     make = POLICIES[order["policy"]]
@@ -145,7 +145,7 @@ async def swarm(order: dict[str, Any]) -> int:
 
 
 def so_far(players: list[Player], lags: Histogram) -> dict[str, Any]:
-    """What a look at the bots shows while they play."""
+    """Returns the totals of all bots since their start."""
     totals = [counters(player.client.stats) for player in players if player.client is not None]
     return {
         "at": time.monotonic(),
@@ -156,7 +156,7 @@ def so_far(players: list[Player], lags: Histogram) -> dict[str, Any]:
 
 
 async def join(order: dict[str, Any], players: list[Player], make: Any, lives: list[asyncio.Task[None]]) -> None:
-    """Starts the bots one by one, at a bounded pace."""
+    """Starts the bots one by one, `joins_per_s` of them per second."""
     begun = time.monotonic()
     for i, player in enumerate(players):
         bot = Bot(make(random.Random(f"{order['seed']} {player.name}")))
@@ -165,7 +165,7 @@ async def join(order: dict[str, Any], players: list[Player], make: Any, lives: l
 
 
 async def lag(found: Histogram) -> None:
-    """How late this process is with everything it does, looked at every 20 ms."""
+    """Records every 20 ms how late the event loop is."""
     while True:
         due = time.monotonic() + LAG_S
         await asyncio.sleep(LAG_S)
@@ -173,7 +173,7 @@ async def lag(found: Histogram) -> None:
 
 
 def listen() -> asyncio.Queue[str]:
-    """The lines of stdin, then "" at its end. A thread reads them, for pipes are no sockets everywhere."""
+    """Returns a queue of the lines of stdin, with "" at its end. A thread reads it: not all event loops can."""
     commands: asyncio.Queue[str] = asyncio.Queue()
     loop = asyncio.get_running_loop()
 
@@ -191,7 +191,7 @@ def say(what: dict[str, Any]) -> None:
 
 
 def run(order: dict[str, Any]) -> int:
-    """The process's whole life."""
+    """Runs the whole process. Returns the exit code."""
     try:
         import uvloop
     except ImportError:

@@ -1,1 +1,1 @@
-"""The window: a game to play, by default on a server of its own, with bots."""
+"""The desktop window in which a person plays a game, by default on a server of its own, with bots."""

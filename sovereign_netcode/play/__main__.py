@@ -1,4 +1,4 @@
-"""`python -m sovereign_netcode.play`: see `--help`."""
+"""Opens the window: `python -m sovereign_netcode.play --help`."""
 
 import sys
 

@@ -1,4 +1,4 @@
-"""Opens a window and plays: by default tag, on a server of its own, with bots."""
+"""Opens a window to play a game in. By default the game is tag, on a server of its own, with bots."""
 
 import argparse
 import contextlib
@@ -20,21 +20,27 @@ from sovereign_netcode.play.window import CLOSED, Window, keyboard
 GAME = "sovereign_netcode.examples.tag:Tag"
 FRAMES_PER_S = 60
 SCRIPT_S = 120.0
-"""A scripted session that is not through by then has failed."""
+"""Longest time of a scripted session, in seconds. A session that takes longer has failed."""
 UNSEEN = ("dummy", "offscreen")
-"""The drivers of SDL that open windows nobody sees. SDL takes one of them where there is no display."""
+"""Drivers of SDL whose windows are invisible. SDL uses one of them where there is no display."""
 
 
 def arguments(argv: list[str] | None = None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(prog="sovereign-play", description=__doc__, allow_abbrev=False)
-    parser.add_argument("--url", metavar="ws://...", help="play on that server (default: starts one)")
-    parser.add_argument("--game", default=GAME, metavar="MODULE:CLASS", help="what the own server plays (default: tag)")
-    parser.add_argument("--scene", help="where (default: where the game wants to be played)")
-    parser.add_argument("--bots", type=int, metavar="N", help="bots that join (default: 4 on the own server, else 0)")
-    parser.add_argument("--name", default="You", help="shown to others (default: %(default)s)")
-    parser.add_argument("--lag", type=float, default=0, metavar="MS", help="latency to begin with (keys [ and ])")
+    parser.add_argument("--url", metavar="ws://...", help="URL of the server to play on (default: starts one)")
     parser.add_argument(
-        "--script-demo", metavar="OUT.png", help="a scripted session, also without a display: saves a picture and ends"
+        "--game", default=GAME, metavar="MODULE:CLASS", help="game of the server that is started (default: tag)"
+    )
+    parser.add_argument("--scene", help="scene of the server that is started (default: the game's)")
+    parser.add_argument(
+        "--bots", type=int, metavar="N", help="number of bots (default: 4 on a server that is started, else 0)"
+    )
+    parser.add_argument("--name", default="You", help="player's name (default: %(default)s)")
+    parser.add_argument(
+        "--lag", type=float, default=0, metavar="MS", help="latency to add at the start; the keys [ and ] change it"
+    )
+    parser.add_argument(
+        "--script-demo", metavar="OUT.png", help="run a scripted session, save a picture, and exit; needs no display"
     )
     return parser.parse_args(argv)
 
@@ -42,12 +48,12 @@ def arguments(argv: list[str] | None = None) -> argparse.Namespace:
 def main(argv: list[str] | None = None) -> int:
     options = arguments(argv)
     if options.script_demo and (options.game != GAME or options.url):
-        print("error: --script-demo plays tag on a server of its own, and nothing else", file=sys.stderr)
+        print("error: --script-demo plays tag on a server of its own; it takes no --game or --url", file=sys.stderr)
         return 2
     script = Script(options.script_demo) if options.script_demo else None
     if script:
         os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
-    signal.signal(signal.SIGTERM, signal.default_int_handler)  # as Ctrl-C: the server and the bots end as well
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # like Ctrl-C, so that the server and the bots end, too
     try:
         open_display(unseen=script is not None)
         with contextlib.ExitStack() as stack:
@@ -68,10 +74,13 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def open_display(*, unseen: bool) -> None:
-    """Makes pygame ready to open a window.
+    """Prepares pygame to open a window.
+
+    Args:
+        unseen: the window may be invisible.
 
     Raises:
-        RuntimeError: nobody would see the window, and that is not wanted (`unseen`).
+        RuntimeError: the window would be invisible although `unseen` is false.
     """
     try:
         pygame.display.init()
@@ -84,7 +93,7 @@ def open_display(*, unseen: bool) -> None:
 
 
 def play(client: Client, lag_s: float, script: Script | None, title: str) -> int:
-    """Plays until somebody ends it; returns the exit code."""
+    """Plays until the player, the server or the script ends the session. Returns the exit code."""
     pygame.font.init()
     window = Window(client, script or keyboard, title)
     window.lag(lag_s)

@@ -1,4 +1,4 @@
-"""Players as they are drawn: small round figures with a shadow, a face that looks where they go, and a name."""
+"""The drawing of players: small round figures with a shadow, a face in the direction of movement, and a name."""
 
 import functools
 import math
@@ -11,12 +11,13 @@ from shared.checks import Vec
 from sovereign_netcode.play.iso import HALF, QUARTER, RISE, Colour, Ground, Point, mixed, project
 
 FINE = 4
-"""Figures are drawn so many times as large, and scaled down: smooth edges."""
+"""Factor by which figures are drawn larger and then scaled down, for smooth edges."""
 UNIT = HALF / 20
-"""What figures are made of, in pixels."""
+"""Size of the unit in which the parts of a figure are measured, in pixels."""
 WIDTH, HEIGHT, FEET = round(40 * UNIT), round(66 * UNIT), round(56 * UNIT)
-"""Of a figure's picture, in pixels; its feet are so far below the upper edge, in the middle."""
+"""Width and height of a figure's picture, and the distance of the feet from its upper edge, in pixels."""
 HIGH = 1.8
+"""Height of a figure in the world, in blocks."""
 IT: Colour = (232, 64, 58)
 WHITE: Colour = (255, 255, 255)
 INK: Colour = (22, 28, 44)
@@ -32,7 +33,7 @@ Solid = Callable[[int, int, int], int | None]
 
 @functools.cache
 def font(size: int, *, bold: bool = False) -> pygame.font.Font:
-    """The one that comes with pygame, so that it looks alike everywhere."""
+    """Returns pygame's own font, which looks the same on every machine."""
     made = pygame.font.Font(None, size)
     made.set_bold(bold)
     return made
@@ -40,7 +41,7 @@ def font(size: int, *, bold: bool = False) -> pygame.font.Font:
 
 @functools.lru_cache(512)
 def label(text: str, ground: Colour, ink: Colour = WHITE, size: int = 20) -> pygame.Surface:
-    """A name on a rounded plate."""
+    """Returns a picture of a name on a rounded plate."""
     words = font(size).render(text, True, ink)
     width, height = words.get_width() + 14, words.get_height() + 6
     large = pygame.Surface((width * 3, height * 3), pygame.SRCALPHA)
@@ -52,7 +53,12 @@ def label(text: str, ground: Colour, ink: Colour = WHITE, size: int = 20) -> pyg
 
 @functools.lru_cache(512)
 def body(tone: Colour, looks: int, alpha: int = 255) -> pygame.Surface:
-    """A figure; `looks` is where it looks in eighths of a turn on the screen, from the right by way of below."""
+    """Returns the picture of a figure.
+
+    Args:
+        looks: direction of the face on the screen, in eighths of a turn: 0 is right, 2 is down.
+        alpha: opacity, from 0 to 255.
+    """
     f = FINE * UNIT
     large = pygame.Surface((WIDTH * FINE, HEIGHT * FINE), pygame.SRCALPHA)
     x, feet, outline = WIDTH * FINE // 2, FEET * FINE, 2 * f
@@ -72,7 +78,7 @@ def body(tone: Colour, looks: int, alpha: int = 255) -> pygame.Surface:
     pygame.draw.circle(large, skin, (x, head), 11 * f)
     angle = looks * math.pi / 4
     gaze = math.cos(angle), math.sin(angle)
-    if gaze[1] > -0.6:  # else it shows its back
+    if gaze[1] > -0.6:  # otherwise the figure is seen from behind
         for eye in (-1, 1):
             at = x + gaze[0] * 6 * f + eye * 4.2 * f * (1 - 0.3 * abs(gaze[0])), head + gaze[1] * 3 * f + 1 * f
             pygame.draw.circle(large, WHITE, at, 2.9 * f)
@@ -84,7 +90,7 @@ def body(tone: Colour, looks: int, alpha: int = 255) -> pygame.Surface:
 
 @functools.lru_cache(64)
 def disc(width: int, colour: Colour, alpha: int, ring: int = 0) -> pygame.Surface:
-    """An ellipse on the ground, or (ring > 0) only its rim of that width."""
+    """Returns the picture of an ellipse on the ground; if `ring` is not 0, only its rim of that width in pixels."""
     size = width, width * QUARTER // HALF
     large = pygame.Surface((size[0] * FINE, size[1] * FINE), pygame.SRCALPHA)
     pygame.draw.ellipse(large, (*colour, alpha), large.get_rect(), ring * FINE)
@@ -92,7 +98,7 @@ def disc(width: int, colour: Colour, alpha: int, ring: int = 0) -> pygame.Surfac
 
 
 class Actor:
-    """A figure and how it is to be drawn."""
+    """A figure and the way in which it is drawn."""
 
     def __init__(self, figure: Figure, tone: Colour, *, it: bool, own: bool, safe: bool) -> None:
         self.figure, self.it, self.own, self.safe = figure, it, own, safe
@@ -100,12 +106,12 @@ class Actor:
 
     @property
     def depth(self) -> float:
-        """Who is further away is drawn first."""
+        """Sort key of the drawing order: figures that are further away have a lower value and are drawn first."""
         x, y, z = self.figure.position
         return x - y + z
 
     def draw(self, target: pygame.Surface, camera: Point, ground: Ground, solid: Solid, looks: int) -> None:
-        """The shadow, the figure, and what covers it."""
+        """Draws the shadow, the figure, and the blocks that cover it."""
         x, y, z = self.figure.position
         below = ground_below(solid, (x, y, z))
         rings = [disc(40 - min(int(2 * (z - below)), 16), (20, 40, 20), 110)]
@@ -120,11 +126,11 @@ class Actor:
         target.blit(body(self.tone, looks), box)
         target.set_clip(box.clip(clip))
         if ground.cover(target, camera, (x - 0.3, y - 0.3, z), (x + 0.3, y + 0.3, z + HIGH)):
-            target.blit(body(self.tone, looks, 70), box)  # seen through what hides it
+            target.blit(body(self.tone, looks, 70), box)  # faintly visible through the blocks that cover it
         target.set_clip(clip)
 
     def draw_name(self, target: pygame.Surface, camera: Point) -> None:
-        """The name, over everything else."""
+        """Draws the name, over everything else."""
         name = str(self.figure.attributes.get("name") or f"#{self.figure.entity}")
         px, py = screen(self.figure.position, camera)
         text = ("You are it!" if self.own else f"{name} is it!") if self.it else name
@@ -133,18 +139,18 @@ class Actor:
 
 
 def draw_ghost(target: pygame.Surface, camera: Point, at: Vec, own: Vec, looks: int) -> None:
-    """Where the server's newest word has oneself, and how far that is behind."""
+    """Draws the player's newest confirmed position, and a line from it to the predicted position."""
     px, py = screen(at, camera)
     pygame.draw.line(target, WHITE, (px, py - RISE), (screen(own, camera)[0], screen(own, camera)[1] - RISE), 2)
     _centred(target, disc(56, WHITE, 160, 2), (px, py))
     target.blit(body((225, 232, 245), looks, 150), (px - WIDTH // 2, py - FEET))
-    plate = label("the server's word", (245, 247, 252), INK, 17)
+    plate = label("confirmed by the server", (245, 247, 252), INK, 17)
     left = screen(own, camera)[0] >= px
     target.blit(plate, (px - plate.get_width() - 30 if left else px + 30, py - FEET // 2))
 
 
 def ground_below(solid: Solid, at: Vec) -> float:
-    """The height of the ground under a place."""
+    """Returns the height of the ground below a position."""
     x, y, z = int(at[0] // 1), int(at[1] // 1), int((at[2] + 0.01) // 1)
     while z > at[2] - 12 and not solid(x, y, z - 1):
         z -= 1
@@ -152,7 +158,7 @@ def ground_below(solid: Solid, at: Vec) -> float:
 
 
 def screen(at: Vec, camera: Point) -> tuple[int, int]:
-    """A place in blocks as a pixel of the window."""
+    """Converts a position in blocks to a pixel of the window."""
     x, y = project(*at)
     return round(x - camera[0]), round(y - camera[1])
 

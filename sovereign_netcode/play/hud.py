@@ -1,4 +1,4 @@
-"""What is written over the picture: the round, the scores, what the network does, what has just happened."""
+"""The text over the picture: the round, the scores, the figures of the network, and recent events."""
 
 import functools
 from collections.abc import Sequence
@@ -10,7 +10,7 @@ from sovereign_netcode.play.iso import Colour
 
 KEYS = (
     "WASD / arrows: walk    Space: jump    left / right mouse: dig / place    1-6: colour    "
-    "G: the server's word    [ ]: latency    Esc: quit"
+    "G: confirmed position    [ ]: latency    Esc: quit"
 )
 FAINT: Colour = (168, 182, 206)
 TOAST_S = 4.0
@@ -18,7 +18,7 @@ MARGIN = 14
 
 
 class Slider:
-    """A value from 0 to `top`, set with the mouse."""
+    """A value from 0 to `top` that the player sets with the mouse."""
 
     def __init__(self, top: float) -> None:
         self._top = top
@@ -26,7 +26,7 @@ class Slider:
         self.track = pygame.Rect(0, 0, 0, 0)
 
     def draw(self, target: pygame.Surface, area: pygame.Rect, value: float) -> None:
-        """A track on a plate, and a knob where the value is."""
+        """Draws a track on a plate, with a knob at the value."""
         target.blit(_plate(*area.size), area)
         self.track = pygame.Rect(area.x + 16, area.centery - 3, area.width - 32, 6)
         pygame.draw.rect(target, FAINT, self.track, border_radius=3)
@@ -34,7 +34,7 @@ class Slider:
         pygame.draw.circle(target, WHITE, knob, 9)
 
     def handle(self, event: pygame.event.Event) -> float | None:
-        """The value that the mouse sets with this event; None: it is not about the slider."""
+        """Returns the value that the mouse sets with this event; None if the event does not concern the slider."""
         x, y = pygame.mouse.get_pos()
         if event.type == pygame.MOUSEBUTTONDOWN and event.button == 1:
             self._held = self.track.inflate(24, 24).collidepoint(x, y)
@@ -47,14 +47,14 @@ class Slider:
 
 
 class Hud:
-    """Panels in the window's corners."""
+    """The panels at the edges of the window."""
 
     def __init__(self, lag_max_s: float) -> None:
         self.slider = Slider(lag_max_s)
         self._toasts: list[tuple[float, str]] = []
 
     def say(self, text: str, now: float) -> None:
-        """Shows a line for a few seconds."""
+        """Shows a line of text for `TOAST_S` seconds."""
         self._toasts = [*self._toasts[-3:], (now + TOAST_S, text)]
 
     def draw(
@@ -69,7 +69,7 @@ class Hud:
         lag_s: float,
         choice: Colour,
     ) -> None:
-        """All of it; `left_s` is the time that is left of a round, if there is one."""
+        """Draws all panels. `left_s` is the rest of the round in seconds; None if the game has no rounds."""
         width, height = target.get_size()
         clock = "" if left_s is None else f"{int(left_s) // 60}:{int(left_s) % 60:02}"
         top = _panel(title, clock, 30)
@@ -95,7 +95,7 @@ class Hud:
 
 
 def _scores(actors: Sequence[Actor]) -> list[tuple[str, str, Colour]]:
-    """Name, score and colour of those who have a score, the best first."""
+    """Returns name, score and colour of the figures that have a score, the best first, at most 12."""
     found = [
         (int(actor.figure.attributes["score"]), str(actor.figure.attributes.get("name") or "?"), actor)
         for actor in actors
@@ -113,7 +113,7 @@ def _plate(width: int, height: int) -> pygame.Surface:
 
 @functools.lru_cache(64)
 def _panel(text: str, more: str, size: int) -> pygame.Surface:
-    """A line on a plate; `more` stands behind it, in another colour."""
+    """Returns a picture of a line on a plate. `more` follows the text in another colour."""
     words = font(size).render(text, True, WHITE)
     rest = font(size).render(more, True, (255, 214, 120)) if more else None
     width = words.get_width() + (rest.get_width() + 14 if rest else 0)
@@ -126,7 +126,7 @@ def _panel(text: str, more: str, size: int) -> pygame.Surface:
 
 @functools.lru_cache(64)
 def _table(title: str, rows: tuple[tuple[str, str], ...], marks: tuple[Colour, ...]) -> pygame.Surface:
-    """Names to the left, values to the right, and coloured marks before them, if there are."""
+    """Returns a picture of a table: names on the left, values on the right, coloured marks before them if given."""
     line, width, indent = 21, 196, 18 if marks else 0
     plate = _plate(width, 38 + line * len(rows))
     plate.blit(font(22).render(title, True, WHITE), (12, 10))

@@ -1,10 +1,10 @@
-"""Blocks seen from the south-east and above: where things are on the screen, and a cached picture of each segment.
+"""The view of the blocks, from the south-east and above: projection, and a cached picture of each segment.
 
     screen x = (x + y) * HALF            north-west is up, north-east is right
     screen y = (x - y) * QUARTER - z * RISE
 
-A picture is drawn anew when its blocks, or those that throw shadows on them, have changed. The faces of each block
-are kept beside it, so that what stands behind a block can be covered by it.
+A picture is drawn again when its blocks, or the blocks that cast shadows on them, have changed. The faces of each block
+are kept beside the picture, so that a block can be drawn again over a figure that stands behind it.
 """
 
 import zlib
@@ -24,11 +24,11 @@ from sovereign_netcode.examples.tag import LEAVES, TRUNK
 HALF, QUARTER, RISE = 24, 12, 26
 """Half the width and half the height of a block's top, and the height of its sides, in pixels."""
 AROUND = 6
-"""Blocks that far outside of a segment count for its shadows."""
+"""Distance up to which blocks outside a segment cast shadows on it, in blocks."""
 SUN = [(round(-0.45 * step), round(-0.21 * step), round(0.6 * step)) for step in range(1, 11)]
-"""The ways from a block towards the sun on which there may be another that throws its shadow; within `AROUND`."""
+"""Offsets from a block towards the sun, within `AROUND`. A block at one of them casts its shadow on the first."""
 SKY = (1, 2, 3)
-"""The colour of a picture that is not drawn."""
+"""Transparent colour of the pictures."""
 
 Colour = tuple[int, int, int]
 Point = tuple[float, float]
@@ -41,7 +41,7 @@ PALETTE: dict[int, Colour] = {
 CHOICE: tuple[Colour, ...] = (
     (226, 122, 84), (240, 196, 96), (96, 172, 214), (154, 124, 206), (236, 236, 232), (84, 92, 110),
 )  # fmt: skip
-"""Colours of the kinds from `FIRST_KIND` on, in turn: those that players place."""
+"""Colours of the kinds that players place: those from `FIRST_KIND` on, in turn."""
 FIRST_KIND = 7
 
 
@@ -53,34 +53,35 @@ class Face(NamedTuple):
 
 
 def project(x: float, y: float, z: float) -> Point:
-    """Blocks to pixels."""
+    """Converts a position in blocks to a point of the picture plane in pixels."""
     return (x + y) * HALF, (x - y) * QUARTER - z * RISE
 
 
 def unproject(px: float, py: float, z: float) -> Point:
-    """The x and y, in blocks, that are seen at a pixel at the height z."""
+    """Returns the x and y, in blocks, of the position at height `z` that appears at a pixel."""
     a, b = px / HALF, (py + z * RISE) / QUARTER
     return (a + b) / 2, (a - b) / 2
 
 
 def colour_of(kind: int) -> Colour:
-    """The colour of a kind of block in full light."""
+    """Returns the colour of a kind of block in full light."""
     return PALETTE.get(kind) or CHOICE[(kind - FIRST_KIND) % len(CHOICE)]
 
 
 def mixed(colour: Sequence[int], share: float, other: Sequence[int] = (0, 0, 0)) -> Colour:
-    """`share` of a colour and the rest of another (black, if not said)."""
+    """Returns a mixture of `share` of a colour and `1 - share` of another."""
     r, g, b = (min(255, max(0, round(a * share + c * (1 - share)))) for a, c in zip(colour, other, strict=True))
     return r, g, b
 
 
 class Picture(NamedTuple):
-    """A segment as it looks."""
+    """The picture of a segment."""
 
     check: int
+    """CRC-32 of the blocks that the picture shows, with those around it."""
     surface: pygame.Surface
     corner: Point
-    """Its left upper corner on the plane that `project` maps to."""
+    """The picture's upper left corner, on the plane that `project` maps to."""
     faces: dict[Cell, list[Face]]
 
 
@@ -92,7 +93,7 @@ class Ground:
         self._seen: dict[Cell, tuple[int, ...]] = {}
 
     def refresh(self, blocks: Blocks, pictures_max: int) -> None:
-        """Draws at most so many pictures that are not up to date, the nearest to none before any other."""
+        """Draws at most `pictures_max` of the pictures that are missing or out of date, the furthest first."""
         for segment in self.pictures.keys() - blocks.rows.keys():
             del self.pictures[segment], self._seen[segment]
         for segment in sorted(blocks, key=_depth):
@@ -109,16 +110,18 @@ class Ground:
             self._seen[segment] = seen
 
     def draw(self, target: pygame.Surface, camera: Point) -> None:
-        """All of it; `camera` is the point of the plane at the target's left upper corner."""
+        """Draws all pictures. `camera` is the point of the plane at the target's upper left corner."""
         for segment in sorted(self.pictures, key=_depth):
             picture = self.pictures[segment]
             place = round(picture.corner[0] - camera[0]), round(picture.corner[1] - camera[1])
             target.blit(picture.surface, place)
 
     def cover(self, target: pygame.Surface, camera: Point, low: Sequence[float], high: Sequence[float]) -> bool:
-        """Draws again whatever is in front of the box between two corners, in blocks, where it is; whether there was.
+        """Draws again all faces in front of a box, so that they cover the figure in it. Returns whether there are any.
 
-        What was drawn in that place is clipped to the box's outline on the screen by the caller.
+        Args:
+            target: what to draw on; the caller clips it to the figure's outline.
+            low, high: corners of the box, in blocks.
         """
         left, right = project(low[0], low[1], 0)[0], project(high[0], high[1], 0)[0]
         top, bottom = project(low[0], high[1], high[2])[1], project(high[0], low[1], low[2])[1]
@@ -135,7 +138,7 @@ class Ground:
         return found
 
     def _ahead(self, low: Sequence[float], high: Sequence[float]) -> Iterable[Cell]:
-        """The cells that may hide a box, the furthest first: along the line of sight, and beside it."""
+        """Returns the cells that may hide a box, the furthest first: cells on the line of sight and next to it."""
         x0, y0, z0 = (int(part // 1) for part in low)
         cells = []
         for step in range(7):
@@ -149,7 +152,11 @@ class Ground:
 
 
 def target_of(blocks: Blocks, at: Point, height: float) -> tuple[Cell, Cell] | None:
-    """The first block that is seen at a point of the plane, looked for near a height, and the free cell before it."""
+    """Returns the visible block at a point of the plane, and the free cell in front of it; None if there is none.
+
+    Args:
+        height: the search covers 9 blocks above this height, and 11 below it.
+    """
     before: Cell | None = None
     for step in range(500):
         z = height + 9 - step * 0.04
@@ -165,13 +172,13 @@ def target_of(blocks: Blocks, at: Point, height: float) -> tuple[Cell, Cell] | N
 
 
 def top_of(cell: Cell) -> tuple[Point, ...]:
-    """The upper face of a block: its west, south, east and north corners as seen."""
+    """Returns the corners of a block's top on the plane: the left, bottom, right and top one on the screen."""
     x, y, z = cell
     return project(x, y, z + 1), project(x + 1, y, z + 1), project(x + 1, y + 1, z + 1), project(x, y + 1, z + 1)
 
 
 def _depth(cell: Cell) -> tuple[int, int, int, int]:
-    """What is further away comes first."""
+    """Returns the sort key of the drawing order: cells that are further away come first."""
     x, y, z = cell
     return x - y + z, x, -y, z
 
@@ -182,7 +189,7 @@ def _neighbours(segment: Cell) -> list[Cell]:
 
 
 def _surroundings(blocks: Blocks, segment: Cell) -> Bytes:
-    """The kinds of a segment and AROUND blocks more to each side and above, [z, y, x]; 0 where nothing is loaded."""
+    """Returns the kinds of a segment and of `AROUND` more blocks at each side and above, [z, y, x]; 0 if not loaded."""
     wide = SEGMENT + 2 * AROUND
     kinds = np.zeros((SEGMENT + AROUND, wide, wide), np.uint8)
     for other in _neighbours(segment):
@@ -193,7 +200,12 @@ def _surroundings(blocks: Blocks, segment: Cell) -> Bytes:
 
 
 def _overlap(way: int, upright: bool) -> tuple[slice, slice]:
-    """Where a neighbour that many segments away lies in the surroundings, and which part of it."""
+    """Returns the part of the surroundings that a neighbour fills along one axis, and which part of the neighbour.
+
+    Args:
+        way: the neighbour's distance, in segments: -1, 0 or 1.
+        upright: the axis is z, where the surroundings have nothing below the segment.
+    """
     before = 0 if upright else AROUND
     start, end = before + way * SEGMENT, before + (way + 1) * SEGMENT
     low, high = max(start, 0), min(end, before + SEGMENT + AROUND)
@@ -232,7 +244,7 @@ def _drawn(kinds: Bytes, segment: Cell, check: int) -> Picture:
 
 
 def _light(solid: npt.NDArray[np.bool_]) -> npt.NDArray[np.float64]:
-    """How bright the top of each block of the segment is: shadows of the sun, and corners that see less of the sky."""
+    """Returns the brightness of each block's top: lower in the sun's shadow and in corners that see less of the sky."""
     deep, wide = solid.shape[0], SEGMENT + 2 * AROUND
     dark = np.zeros((SEGMENT, SEGMENT, SEGMENT))
     for i, j, k in SUN:
@@ -250,7 +262,7 @@ def _light(solid: npt.NDArray[np.bool_]) -> npt.NDArray[np.float64]:
 
 
 def _faces(cell: Cell, kind: int, seen: Sequence[bool], light: float) -> list[Face]:
-    """The faces of a block that can be seen: top, south, east."""
+    """Returns the faces of a block that can be seen: of top, south and east those that `seen` selects."""
     x, y, z = cell
     grain = 1 + ((x * 73 ^ y * 151 ^ z * 57) * 2654435761 >> 7) % 16 / 200 - 0.04
     base = mixed(colour_of(kind), grain)
@@ -271,6 +283,6 @@ def _faces(cell: Cell, kind: int, seen: Sequence[bool], light: float) -> list[Fa
 
 
 def _upright(a: Point, b: Point, z: float, height: float, colour: Colour, above: float = 0.0) -> Face:
-    """A strip of a side, between two corners on the ground, so high and so far above its foot."""
+    """Returns a strip of a side between two corners, of the given height, `above` the block's lower edge."""
     low, high = z + above, z + above + height
     return Face((project(*a, low), project(*b, low), project(*b, high), project(*a, high)), colour)

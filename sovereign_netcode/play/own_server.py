@@ -1,4 +1,4 @@
-"""What the window needs besides: a server of its own, and bots on it. Both end with it."""
+"""The processes that the window starts: a server, and bots on it. Both end with the window."""
 
 import asyncio
 import contextlib
@@ -17,14 +17,15 @@ from sovereign_netcode.examples.tag_brain import TagPlayer
 from sovereign_netcode.stderr import Stderr
 
 START_S = 120.0
-"""The first start compiles the physics."""
+"""Seconds in which the server must start. Its first start may compile the physics."""
 END_S = 10.0
+"""Seconds that a process has to end after SIGTERM. Then it is killed."""
 NAMES = ("Kim", "Lou", "Mio", "Nia", "Oz", "Pia", "Quin", "Rex", "Sol", "Tess", "Uma", "Vic")
 
 
 @contextlib.contextmanager
 def process(*command: str) -> Iterator[tuple[subprocess.Popen[str], Stderr]]:
-    """A process of this Python, whose output is read; it is told to end, and made to."""
+    """Runs a process of this Python within the block. At the end it gets SIGTERM, and is killed after `END_S`."""
     errors = Stderr()
     try:
         running = subprocess.Popen(
@@ -47,10 +48,10 @@ def process(*command: str) -> Iterator[tuple[subprocess.Popen[str], Stderr]]:
 
 @contextlib.contextmanager
 def server(game: str, scene: str | None) -> Iterator[str]:
-    """A server on a free port of this machine; its address.
+    """Runs a server on a free port of this machine. Yields its URL.
 
     Raises:
-        RuntimeError: it does not start; the text says why.
+        RuntimeError: the server did not start. The message says why.
     """
     options = ["--port", "0", "--game", game, "--log-level", "warning", *(["--scene", scene] if scene else [])]
     with process("-m", "sovereign_netcode.server", *options) as (running, errors):
@@ -69,7 +70,7 @@ def server(game: str, scene: str | None) -> Iterator[str]:
 
 @contextlib.contextmanager
 def bots(url: str, count: int) -> Iterator[None]:
-    """So many bots on a server, in one process."""
+    """Runs a process of `count` bots that play on a server."""
     if count == 0:
         yield
         return
@@ -78,13 +79,13 @@ def bots(url: str, count: int) -> Iterator[None]:
 
 
 def policy(seed: int) -> Callable[[Core], None]:
-    """Plays tag where that is played, else strolls."""
+    """Returns a policy that plays tag if the server does, and wanders otherwise."""
     tag, stroll = Bot(TagPlayer()), Bot(Wander(random.Random(seed)))
     return lambda core: (tag if core.scene is not None and "it" in core.scene.index_of else stroll)(core)
 
 
 async def play(url: str, count: int) -> None:
-    """Plays until the server ends."""
+    """Plays with `count` bots until the server ends."""
 
     async def one(number: int) -> None:
         name = NAMES[number % len(NAMES)]

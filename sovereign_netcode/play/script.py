@@ -1,4 +1,4 @@
-"""A player without hands, for tests and for the picture in the README: walks, jumps, builds, sees a hand-over."""
+"""A scripted player for tests and for the picture in the README: walks, jumps, builds, and waits for a tag."""
 
 import math
 
@@ -11,20 +11,21 @@ from sovereign_netcode.play.iso import FIRST_KIND
 from sovereign_netcode.play.window import Window, Wish
 
 TOWER = ((2, 0), (2, -1), (2, -2))
-"""Where blocks are placed, from the player; one, two and three high."""
+"""Offsets from the player, in blocks, of the columns that it builds: one, two and three blocks high."""
 WALK_BLOCKS, JUMP_BLOCKS = 3.0, 1.2
 LAG_S = 0.15
 TOGETHER = 5
-"""So many figures should be in the picture."""
+"""Number of figures that should be in the picture."""
 PATIENCE_S = 45.0
+"""Seconds after which the picture is taken without waiting for a good moment."""
 
 
 class Script:
-    """What is done so far; the picture is taken at a good moment after a hand-over."""
+    """The script and its progress. It takes the picture at a good moment after one figure has tagged another."""
 
     def __init__(self, path: str) -> None:
         self.done: dict[str, float] = {}
-        """What has been seen to happen, with how far, how high, how many."""
+        """The steps that are done, with the distance or height in blocks or the count."""
         self._path = path
         self._plan: list[Cell] = []
         self._asked: set[int] = set()
@@ -47,7 +48,7 @@ class Script:
             self._start, self._began = place, now
             window.lag(LAG_S)
             window.ghost = True
-        if "walked" not in self.done:  # up on the screen, over what is in the way
+        if "walked" not in self.done:  # up on the screen, jumping over obstacles
             way = math.dist(place[:2], self._start[:2])
             if way > WALK_BLOCKS:
                 self.done["walked"] = way
@@ -73,7 +74,7 @@ class Script:
         return self._play(window)
 
     def _play(self, window: Window) -> Wish:
-        """Plays tag, like everybody else."""
+        """Plays tag like the bots."""
         prediction = window.core.prediction
         assert prediction is not None
         if window.core.entity not in prediction.predicted:
@@ -83,7 +84,7 @@ class Script:
         return wish.move_x / MOVE_MAX, wish.move_y / MOVE_MAX, bool(wish.buttons & JUMP)
 
     def _take_picture(self, window: Window, view: View, now: float) -> None:
-        """Soon after a hand-over, with many in sight and on the move; or else as it comes."""
+        """Takes the picture soon after a tag, with many figures in sight and in motion, or after `PATIENCE_S`."""
         if "tagged" not in self.done or view.me is None:
             return
         me, ghost = view.me.position, window.core.prediction

@@ -1,4 +1,4 @@
-"""The window: a client's picture of the world, and the keyboard and mouse of who plays."""
+"""The window: draws a client's view of the world, and reads the player's keyboard and mouse."""
 
 import functools
 import math
@@ -20,43 +20,43 @@ SIZE = 1280, 800
 SKY = (122, 184, 232), (222, 240, 250)
 LAG_STEP_S, LAG_MAX_S = 0.05, 1.0
 CLOSED = "closed by the player"
-"""Why it is over when the player has ended it."""
+"""Reason of the end (`Window.over`) when the player has closed the window."""
 Wish = tuple[float, float, bool]
 """A direction (east, north), and whether to jump."""
 KEYS: dict[int, Point] = {
     pygame.K_w: (-1, 1), pygame.K_UP: (-1, 1), pygame.K_s: (1, -1), pygame.K_DOWN: (1, -1),
     pygame.K_d: (1, 1), pygame.K_RIGHT: (1, 1), pygame.K_a: (-1, -1), pygame.K_LEFT: (-1, -1),
 }  # fmt: skip
-"""Up on the screen is north-west."""
+"""Direction (east, north) of each key. North-west is up on the screen."""
 
 
 class Pilot(Protocol):
-    """Who plays: a person at the keyboard, or a script."""
+    """The source of a player's inputs: a person at the keyboard, or a script."""
 
     def __call__(self, window: "Window", view: View, now: float) -> Wish:
-        """The wish from now on; called once per frame while playing."""
+        """Returns the input from now on. It is called once per frame while playing."""
 
 
 class Window:
     """One player's window.
 
     Args:
-        client: connects, or has joined; the keys [ and ] change its link.
-        pilot: decides where to go.
-        title: shown above.
+        client: a client that is connecting or has joined; the keys [ and ] change its simulated link.
+        pilot: decides on the inputs.
+        title: text at the top of the window.
     """
 
     def __init__(self, client: Client, pilot: Pilot, title: str) -> None:
         self.client, self.core, self.title = client, client.core, title
         self.events: list[Event] = []
-        """Those of the latest frame."""
+        """Events of the latest frame."""
         self.actors: list[Actor] = []
-        """Everybody in sight."""
+        """All figures in sight."""
         self.ghost = False
         self.lag_s = 0.0
         self.kind = FIRST_KIND
         self.over = ""
-        """Why it is over."""
+        """Reason of the session's end; empty while it lasts."""
         self._pilot = pilot
         self._screen = pygame.display.set_mode(SIZE, pygame.RESIZABLE)
         self._ground, self._hud = Ground(), Hud(LAG_MAX_S)
@@ -69,7 +69,7 @@ class Window:
     # -- a frame ---------------------------------------------------------------------------------------------
 
     def frame(self, now: float) -> None:
-        """Reads, wishes, predicts and draws."""
+        """Runs one frame: receives, reads the input, predicts, and draws."""
         self.events = self.client.poll(now)
         view = self.client.view(now)
         for event in self.events:
@@ -84,20 +84,20 @@ class Window:
         self._at = now
 
     def lag(self, seconds: float) -> None:
-        """Adds so much to the round trip."""
+        """Sets the latency that the simulated link adds to the round trip."""
         self.lag_s = seconds
         self.client.link = Path(seconds / 2) if seconds else None
 
     def save(self, path: str) -> None:
-        """Saves what is shown as a picture."""
+        """Saves the window's content to an image file."""
         pygame.image.save(self._screen, path)
 
     def shown(self, place: Vec, margin: int = 120) -> bool:
-        """Whether a place, in blocks, is well within the window."""
+        """Returns whether a position, in blocks, is at least `margin` pixels inside the window."""
         area = self._screen.get_rect().inflate(-2 * margin, -2 * margin)
         return self._camera is not None and area.collidepoint(screen(place, self._camera))
 
-    # -- what comes in ---------------------------------------------------------------------------------------
+    # -- events and keys -------------------------------------------------------------------------------------
 
     def _take(self, event: Event, view: View, now: float) -> None:
         match event:
@@ -106,13 +106,13 @@ class Window:
             case Happened(name=name, data=data):
                 self._hud.say(_sentence(name, data, view), now)
             case Answered(done=False, verdict=verdict):
-                self._hud.say(f"not possible: {verdict}", now)
+                self._hud.say(f"rejected: {verdict}", now)
             case Disconnected(reason=reason, wait_s=wait_s):
-                self._hud.say(f"{reason}: back in {wait_s:.0f} s", now)
+                self._hud.say(f"connection lost ({reason}): reconnecting in {wait_s:.0f} s", now)
             case Resumed(away_s=away_s):
-                self._hud.say(f"back after {away_s:.1f} s", now)
+                self._hud.say(f"reconnected after {away_s:.1f} s", now)
             case Diverged(what=what):
-                self._hud.say(f"ALARM, the two worlds differ: {what}", now)
+                self._hud.say(f"ALARM: the predicted world differs from the server's: {what}", now)
             case _:
                 pass
 
@@ -138,7 +138,7 @@ class Window:
                 self.client.edit(*cell, kind)
 
     def _pointed(self, view: View) -> tuple[Cell, Cell] | None:
-        """The block under the mouse that is within reach, and the free cell before it."""
+        """Returns the block under the mouse and the free cell in front of it; None if there is none within reach."""
         prediction = self.core.prediction
         if prediction is None or view.me is None or self._camera is None:
             return None
@@ -149,7 +149,7 @@ class Window:
         centre = [part + 0.5 for part in found[0]]
         return found if math.dist(centre, view.me.position) <= prediction.predicted.scene.reach else None
 
-    # -- what is drawn ---------------------------------------------------------------------------------------
+    # -- drawing ---------------------------------------------------------------------------------------------
 
     def _draw(self, view: View, now: float) -> None:
         target, prediction, scene = self._screen, self.core.prediction, self.core.scene
@@ -191,7 +191,7 @@ class Window:
         pygame.display.flip()
 
     def _cast(self, view: View) -> list[Actor]:
-        """The figures in sight, with what the game says of them."""
+        """Returns the figures in sight, with their state in the game."""
         found = []
         for figure in view.figures:
             own = figure is view.me
@@ -205,7 +205,7 @@ class Window:
         return found
 
     def _tone(self, entity: int) -> Colour:
-        """A colour that stays while its figure is in sight, and that nobody else has while there are enough."""
+        """Returns a figure's colour, which stays while it is in sight, and is unique while there are enough colours."""
         if entity not in self._tones:
             counts = [0] * len(TONES)
             for tone in self._tones.values():
@@ -214,14 +214,14 @@ class Window:
         return TONES[self._tones[entity]]
 
     def _look(self, figure: Figure) -> int:
-        """Where a figure looks, in eighths of a turn on the screen: where it went last."""
+        """Returns the direction in which a figure last moved, in eighths of a turn on the screen."""
         vx, vy, _ = figure.velocity
         if vx or vy:
             self._looks[figure.entity] = round(math.atan2(vx - vy, vx + vy) * 4 / math.pi) % 8
         return self._looks.get(figure.entity, 2)
 
     def _follow(self, me: Vec, now: float) -> Point:
-        """The camera goes after the own figure, gently."""
+        """Moves the camera smoothly towards the player's own figure. Returns its position."""
         width, height = self._screen.get_size()
         x, y = project(*me)
         wanted = x - width / 2, y - height / 2 - 20
@@ -234,7 +234,7 @@ class Window:
 
 
 def keyboard(window: Window, view: View, now: float) -> Wish:
-    """What the keys that are held say."""
+    """Returns the input of the keys that are held."""
     held = pygame.key.get_pressed()
     x = sum(way[0] for key, way in KEYS.items() if held[key])
     y = sum(way[1] for key, way in KEYS.items() if held[key])
@@ -244,7 +244,7 @@ def keyboard(window: Window, view: View, now: float) -> Wish:
 
 @functools.lru_cache(1)
 def _sky(size: tuple[int, int]) -> pygame.Surface:
-    """A gradient from above to below."""
+    """Returns a picture of the sky: a gradient from top to bottom."""
     strip = pygame.Surface((1, 2))
     strip.set_at((0, 0), SKY[0])
     strip.set_at((0, 1), SKY[1])
@@ -252,12 +252,12 @@ def _sky(size: tuple[int, int]) -> pygame.Surface:
 
 
 def _sentence(name: str, data: Any, view: View) -> str:
-    """What has happened, in words; other games than tag say it as it came."""
+    """Returns an event as a sentence; an event that tag does not have is shown with its name and data."""
     figures = {figure.entity: figure for figure in view.figures}
 
     def called(entity: Any) -> str:
         figure = figures.get(entity)
-        return str(figure.attributes.get("name", f"#{entity}")) if figure else "somebody"
+        return str(figure.attributes.get("name", f"#{entity}")) if figure else "a player"
 
     match name, data:
         case "tagged", {"by": by, "who": who}:

@@ -1,8 +1,8 @@
-"""Plays a game to test it: the real server and real clients in simulated time, with bots and bad connections.
+"""Tests of a game: the real server and real clients in simulated time, with bots and simulated connections.
 
     from sovereign_netcode.playtest import Match, Path, bot
 
-Nothing sleeps and nothing depends on the machine. One seed reproduces a match, message by message.
+Nothing sleeps, and the result does not depend on the machine. A seed reproduces a match message by message.
 """
 
 from client_sdk.links import PRESETS, Path

@@ -1,7 +1,8 @@
 """A match in simulated time: the real server core and real SDK cores, one `now`, one seed.
 
-Nothing sleeps and nothing depends on the machine: every delivery, tick and frame is an entry in one queue, ordered
-by simulated time. The wires are those of `client_sdk.links`: TCP, nothing lost or reordered, but sometimes late.
+Nothing sleeps, and the result does not depend on the machine. Every delivery, tick and frame is an entry in one queue,
+ordered by simulated time. The wires (`client_sdk.links`) model TCP: a message may be late, but is not lost or
+reordered.
 """
 
 import math
@@ -26,7 +27,7 @@ Policy = Callable[[Core, random.Random], Input]
 
 
 class Player:
-    """One client: its core, its clock, its policy, its two wires. It is the server's `Link`, too."""
+    """One client: its core, its clock, its policy and its two wires. It also serves as the server's `Link`."""
 
     def __init__(self, match: "Match", core: Core, path: Path, policy: Policy, seed: int) -> None:
         self.match, self.core, self.policy = match, core, policy
@@ -41,13 +42,13 @@ class Player:
         self._connect_wires()
         self._acted = -1
         self.frame_s = 0.0
-        """The program draws, reads and updates only so often; 0: at once when something is due."""
+        """Seconds between two frames, in which the client reads and updates; 0: whenever something is due."""
         self._inbox: list[bytes] = []
         self._away = False
 
     @property
     def local(self) -> float:
-        """The time on the client's own clock."""
+        """Time on the client's own clock."""
         return self.clock_start + self.match.now * (1 + self.drift)
 
     def _connect_wires(self) -> None:
@@ -62,7 +63,7 @@ class Player:
         self._update()
 
     def disconnect(self) -> None:
-        """Pulls the plug: what is on the way is lost. The client comes back if it has the patience."""
+        """Breaks the connection. Messages in transit are lost. The client reconnects if its core has `patience_s`."""
         assert self.session is not None
         self.match.game.lost(self.session, self.match.now)
         self.session = None
@@ -74,7 +75,7 @@ class Player:
         self._update()
 
     def suspend(self, seconds: float) -> None:
-        """The program stands still; what comes in meanwhile waits."""
+        """Suspends the client's program. Messages that arrive meanwhile wait until it continues."""
         self._away = True
         self.match.at(self.match.now + seconds, self._resume)
 
@@ -83,7 +84,7 @@ class Player:
         self._read()
         self._update()
 
-    # As the server's link:
+    # -- the server's `Link` ---
 
     def send(self, message: bytes) -> None:
         self.down.send(message)
@@ -150,12 +151,13 @@ class Player:
 
 
 class Match:
-    """A server, its players and the time.
+    """A server, its players and the simulated time.
 
     Args:
-        scene: the rules.
-        seed: everything random comes from it.
-        rules: what is played; they prepare the scene.
+        scene: the scene of the world.
+        seed: source of everything random.
+        limits: the server's limits; None: the defaults.
+        rules: rules of the game, which may change the scene (`Rules.prepare`); None: players only walk and edit.
     """
 
     def __init__(self, scene: Scene, seed: int, *, limits: Limits | None = None, rules: Rules | None = None) -> None:
@@ -172,7 +174,13 @@ class Match:
         self.at(0.0, self._tick)
 
     def join(self, policy: Policy, path: Path | None = None, core: Core | None = None) -> Player:
-        """A further player."""
+        """Adds a player. Its client connects at once.
+
+        Args:
+            policy: called once per predicted tick; returns the input.
+            path: properties of its link; None: no latency.
+            core: its client; None: a new one.
+        """
         seed = self.seed * 1_000_003 + len(self.players) * 7919
         player = Player(self, core or Core(f"player {len(self.players)}"), path or Path(), policy, seed)
         self.players.append(player)
@@ -180,25 +188,29 @@ class Match:
         return player
 
     def at(self, when: float, act: Callable[[], None], key: object = None) -> None:
-        """Files something for a time; a later entry with the same key replaces an earlier one."""
+        """Schedules a call for a time. An entry with a key replaces the earlier entry with that key."""
         number = next(self._number)
         if key is not None:
             self._latest[key] = number
         heappush(self._queue, (when, number, act, key))
 
     def run(self, seconds: float) -> None:
-        """Lets time pass."""
+        """Runs for that many simulated seconds."""
         until = self.now + seconds
         self._advance(until)
         self.now = until
 
     def run_until(self, condition: Callable[[], bool], seconds: float) -> None:
-        """Lets time pass until a condition holds; fails if it does not within so many simulated seconds."""
+        """Runs until a condition holds.
+
+        Raises:
+            AssertionError: it does not hold within that many simulated seconds.
+        """
         if not self._advance(self.now + seconds, condition):
-            raise AssertionError(f"seed {self.seed}: not within {seconds} simulated seconds")
+            raise AssertionError(f"seed {self.seed}: the condition did not hold within {seconds} simulated seconds")
 
     def _advance(self, until: float, condition: Callable[[], bool] | None = None) -> bool:
-        """Does all that comes up to `until`, or until a condition holds; whether it does."""
+        """Runs all entries up to `until`, or until the condition holds. Returns whether it holds."""
         queue, latest = self._queue, self._latest
         while queue and queue[0][0] <= until:
             when, number, act, key = heappop(queue)
@@ -219,7 +231,7 @@ class Match:
 
 
 def bot(policy: bots.Policy) -> Policy:
-    """A policy of `client_sdk.bots`, or of one's own, for a player of a match."""
+    """Turns a policy of `client_sdk.bots`, or one of that form, into a policy for a player of a match."""
     drive = bots.Bot(policy)
 
     def plays(core: Core, rng: random.Random) -> Input:
@@ -230,7 +242,7 @@ def bot(policy: bots.Policy) -> Policy:
 
 
 def wander(core: Core, rng: random.Random) -> Input:
-    """Walks about, jumps and stops, changing its mind about once a second."""
+    """A policy that walks, jumps and stops, and chooses anew about once a second."""
     if rng.random() < 0.04:
         angle = rng.choice(
             [(127, 0), (-127, 0), (0, 127), (0, -127), (90, 90), (-90, 90), (90, -90), (-90, -90), (0, 0)]

@@ -135,5 +135,5 @@ def test_the_death_of_a_process_ends_it_at_once_with_nothing_left_behind(
     os.kill(next(pid for pid, command in started.items() if killed in command), signal.SIGKILL)
     out, _ = process.communicate(timeout=20)  # of the 60 s that it was to last
     assert process.returncode == 1
-    assert f"failed: {name} ended in the middle, with -9" in out
+    assert f"failed: {name} ended during the test with exit code -9" in out
     assert "Traceback" not in out

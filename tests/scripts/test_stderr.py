@@ -45,7 +45,7 @@ def said(program: str) -> tuple[Stderr, int]:
         ("import sys; sys.stderr.write('first\\nlast without an end')", "last without an end"),
         ("import sys; sys.stderr.write('the cause\\n\\n  \\n'); sys.exit(3)", "the cause"),
         ("import os; os.write(2, b'\\xff\\n'); os._exit(1)", "\ufffd"),
-        ("import sys; sys.exit(3)", "it ended with 3, without a word"),
+        ("import sys; sys.exit(3)", "it ended with exit code 3 and wrote no error"),
     ],
 )
 def test_the_last_line_is_the_cause_and_all_is_passed_on(
@@ -54,7 +54,7 @@ def test_the_last_line_is_the_cause_and_all_is_passed_on(
     errors, code = said(program)
     assert errors.cause(code) == cause
     shown = capfd.readouterr().err
-    assert (cause in shown) == ("without a word" not in cause)
+    assert (cause in shown) == ("wrote no error" not in cause)
 
 
 def test_one_that_still_runs_is_not_waited_for() -> None:
@@ -62,7 +62,7 @@ def test_one_that_still_runs_is_not_waited_for() -> None:
     command = [sys.executable, "-c", "input()"]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stderr=errors.pipe) as process:
         errors.started()
-        assert errors.cause(process.poll()) == "it still runs, but says nothing"
+        assert errors.cause(process.poll()) == "it still runs, but does not answer"
 
 
 async def test_a_load_test_names_why_there_is_no_server() -> None:
