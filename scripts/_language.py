@@ -25,6 +25,7 @@ COMPLIANT = (
     "docs/client.md",
     "docs/games.md",
     "docs/glossary.md",
+    "docs/protocol.md",
     "docs/server.md",
     "hatch_build.py",
     "scripts/_language.py",
