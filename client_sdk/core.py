@@ -17,8 +17,18 @@ from typing import Any, SupportsIndex
 from client_sdk.advice import advised
 from client_sdk.clock import ServerClock, Timeline
 from client_sdk.comeback import Comeback
-from client_sdk.events import Disconnected, Event, Happened, Joined, Left, Resumed, SegmentLoaded
+from client_sdk.events import (
+    Disconnected,
+    Event,
+    EventsDropped,
+    Happened,
+    Joined,
+    Left,
+    Resumed,
+    SegmentLoaded,
+)
 from client_sdk.orders import Orders
+from client_sdk.pending_events import PendingEvents
 from client_sdk.picture import NOTHING, View
 from client_sdk.play import RECONNECTED, Play
 from client_sdk.prediction import Prediction
@@ -35,7 +45,6 @@ COME_AGAIN = (messages.TOO_SLOW, messages.GOING_AWAY, messages.NO_HELLO)
 """The connection was at fault, not the player."""
 NAME_MAX = 1 << 16
 """The longest name that is taken; what goes beyond `messages.NAME_MAX` characters is not sent."""
-EVENTS_MAX = 1000
 READ_BYTES = 64 * 1024
 
 
@@ -87,7 +96,11 @@ class Core:
         self._play: Play | None = None
         self._orders = Orders()
         self._out: list[bytes] = []
-        self._events: deque[Event] = deque(maxlen=EVENTS_MAX)
+        self._events = PendingEvents()
+        self._held = PendingEvents()
+        """What the game has told before the player is in, or back in."""
+        self._told = 0
+        """Events of the game for this player that have come, or are known to be lost."""
         self._pings: deque[float] = deque(maxlen=16)
 
     @property
@@ -236,11 +249,7 @@ class Core:
 
     def events(self) -> list[Event]:
         """What has happened since the last call."""
-        if not self._events:
-            return []
-        events = list(self._events)
-        self._events.clear()
-        return events
+        return self._events.take() if self._events else []
 
     def view(self, now: float) -> View:
         """What to draw now: the own entity predicted, the others as they were a moment ago."""
@@ -271,8 +280,13 @@ class Core:
             case messages.Welcome():
                 self._welcome(message, now)
             case messages.Happened():
+                self._told += 1
                 data = messages.unpack_value(message.payload)
-                self._events.append(Happened(message.tick, message.name, data))
+                self._tell(Happened(message.tick, message.name, data))
+            case messages.NextHappened():
+                if message.number > self._told:
+                    self._tell(EventsDropped(message.number - self._told))
+                self._told = message.number
             case messages.Shared():
                 self.shared = message.values
             case messages.Bye():
@@ -298,7 +312,10 @@ class Core:
         if self._play and welcome.entity == self.entity:
             self._out += self._orders.again()
         elif self._play:
-            self._events += self._orders.give_up()
+            for answered in self._orders.give_up():
+                self._events.append(answered)
+            self._release()
+            self._told = 0
         self._filled = world
 
     def _speed_up(self) -> None:
@@ -353,9 +370,18 @@ class Core:
         self.stats.reconnects += old is not None
         tick, away_s = world.prediction.predicted.tick, self.comeback.away_s(now)
         self._events.append(Resumed(tick, away_s) if same else Joined(self.entity, world.scene, tick))
+        self._release()
         self.comeback.back()
         for inputs in play.unheard() if same else ():
             self._send(inputs)
+
+    def _tell(self, event: Event) -> None:
+        """Hands out what the game tells, behind the `Joined` or `Resumed` that is still to come after a welcome."""
+        (self._held if self._filled and self.state != "playing" else self._events).append(event)
+
+    def _release(self) -> None:
+        for event in self._held.take():
+            self._events.append(event)
 
     def _cut_off(self, left: Left, now: float) -> None:
         """The connection is gone, and there may be another one."""
@@ -391,4 +417,6 @@ class Core:
         if self.state != "closed":
             self.state = "closed"
             self._open = False
+            if self._play:
+                self._release()
             self._events.append(left)

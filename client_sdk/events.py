@@ -9,7 +9,7 @@ from shared.scene import Scene
 
 @dataclass(frozen=True)
 class Joined:
-    """The player is in: inputs count from here on."""
+    """The player is in: inputs count from here on. No event comes before it, but for `SegmentLoaded` and `Left`."""
 
     entity: int
     scene: Scene
@@ -73,11 +73,26 @@ class Answered:
 
 @dataclass(frozen=True)
 class Happened:
-    """The game's rules tell something: what `name` and `data` mean is theirs."""
+    """The game's rules tell something: what `name` and `data` mean is theirs.
+
+    It comes once the world is known here as it was at the end of `tick`: an entity that it names is there.
+    """
 
     tick: int
     name: str
     data: Any
+
+
+@dataclass(frozen=True)
+class EventsDropped:
+    """Here `count` events are missing: more waited than are kept.
+
+    They are the game's (`Happened`). They waited at the server for a slow or lost connection, or here because the
+    program did not ask for 10,000 of them. Only then are other events among them, and `Joined`, `Disconnected`,
+    `Resumed` and `Left` never.
+    """
+
+    count: int
 
 
 @dataclass(frozen=True)
@@ -118,5 +133,15 @@ class SegmentLoaded:
 
 
 Event = (
-    Joined | Disconnected | Resumed | Left | Corrected | Answered | Happened | Diverged | Resynchronised | SegmentLoaded
+    Joined
+    | Disconnected
+    | Resumed
+    | Left
+    | Corrected
+    | Answered
+    | Happened
+    | EventsDropped
+    | Diverged
+    | Resynchronised
+    | SegmentLoaded
 )

@@ -9,11 +9,11 @@
 """
 
 import math
-from collections import deque
 from struct import iter_unpack
 
 from client_sdk.clock import PricedLead, Timeline, jump_ticks
-from client_sdk.events import Diverged, Event, Resynchronised
+from client_sdk.events import Diverged, Resynchronised
+from client_sdk.pending_events import PendingEvents
 from client_sdk.picture import View
 from client_sdk.prediction import NONDETERMINISM, NOTHING
 from client_sdk.replica import Replica
@@ -50,7 +50,7 @@ class Play:
         stats, events: are told what happens.
     """
 
-    def __init__(self, world: Replica, stats: Stats, events: deque[Event], now: float) -> None:
+    def __init__(self, world: Replica, stats: Stats, events: PendingEvents, now: float) -> None:
         self.world = world
         self._lead = PricedLead()
         self.timeline = Timeline(world.clock.rate, self._lead.start(world.clock, now), now)

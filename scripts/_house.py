@@ -164,8 +164,7 @@ class House:
             assert max(len(player.inputs.margins), len(player.inputs.fates)) <= bound.fates
             assert len(player.verdicts) <= 32 * limits.messages_per_tick * (1 + limits.stalled_s)
             assert len(player.tokens) <= 2
-        for session in game.sessions:
-            assert len(session.outbox) <= limits.outbox_max + 64
+            assert len(player.outbox) <= limits.outbox_max
 
 
 def _is_message(data: bytes) -> bool:

@@ -28,6 +28,8 @@ class Counters:
     closed: dict[int, int] = field(default_factory=dict)
     """Clients told to go, by close code."""
     rules_failed: int = 0
+    events_dropped: int = 0
+    """Events of the rules that waited too long for a slow client, which is told so."""
     corrections: int = 0
     """As the clients report them."""
 

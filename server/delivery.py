@@ -3,11 +3,12 @@
 Theory of operation. Once a tick each session is served, or not: if more is on the way to it than `pacing` allows, it
 is left out, and gets the union of what it missed with its next snapshot. What goes into that is `sight`'s choice; the
 bytes of a segment's changes are `replication`'s, made once for all. A segment's blocks follow in pieces, behind the
-snapshot, as far as there is room: terrain never makes a snapshot late.
+snapshot, as far as there is room: terrain never makes a snapshot late. What the rules tell goes behind the snapshot
+that has what it speaks of (`outbox`).
 """
 
 from collections import deque
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 
 import numpy as np
 
@@ -24,6 +25,8 @@ from shared.world import World
 
 GAPS_S = 2.0
 """Gaps between a client's snapshots are kept for this time, in seconds: longer than lag compensation reaches back."""
+EVENT_BYTES = 128
+"""About so many bytes of events may go with each snapshot, however much terrain waits."""
 SNAPSHOT_BYTES = messages.MESSAGE_MAX // 2
 """What more there is waits for the next snapshot, however wide the path; the own segment and one more never do."""
 
@@ -43,16 +46,15 @@ class Delivery:
         if not near or near[0] != centre:
             self._look_around(session, centre)
         window = pacing.window(session.snapshot_bytes, self._tick_s, now)
+        plain = window
         if session.acked < 0:
             window = max(window, self._limits.first_bytes)
         if (outstanding := pacing.outstanding) > window:
             self._counters.snapshots_skipped += 1
             return
         session.sent_at = now
-        for message in session.outbox:
-            session.send(message)
-        session.outbox.clear()
         self._send_snapshot(session, min(pacing.room(window), SNAPSHOT_BYTES))
+        self._send_told(session, plain)
         if outstanding == 0 and session.probe is None:
             session.probe = (self._world.tick, now, session.snapshot_bytes)
         if session.terrain_now or session.terrain_due:
@@ -73,8 +75,7 @@ class Delivery:
     def forget(self, session: Session) -> None:
         """Begins anew with what a client sees: keyframes and terrain."""
         session.sight.forget()
-        session.terrain_now = None
-        session.terrain_due = self._nearest(session, sorted(s for s in session.sight.sees if s in self._world.blocks))
+        self._renew_terrain(session, session.sight.sees)
 
     def _look_around(self, session: Session, centre: Cell) -> None:
         """The entity is in another segment."""
@@ -83,11 +84,18 @@ class Delivery:
         near = interest.around(centre, self._limits.see_radius, exists)
         if self._around.get(centre) != near:
             self._around[centre] = near
-        added, dropped = sight.move(self._around[centre], self._limits.keep_radius)
+        added, dropped = sight.move(self._around[centre], self._limits.keep_radius, self._world.tick)
         due = [segment for segment in session.terrain_due if segment in sight.sees] + [s for s in added if exists(s)]
         session.terrain_due = self._nearest(session, due)
         if session.terrain_now and session.terrain_now[0] in dropped:
             session.terrain_now = None
+
+    def _renew_terrain(self, session: Session, segments: Collection[Cell]) -> None:
+        """The blocks of these segments are to be sent, or sent again."""
+        if session.terrain_now and session.terrain_now[0] in segments:
+            session.terrain_now = None
+        due = {segment for segment in segments if segment in self._world.blocks}
+        session.terrain_due = self._nearest(session, sorted(due.union(session.terrain_due)))
 
     def _nearest(self, session: Session, segments: Iterable[Cell]) -> deque[Cell]:
         """Segments in the order in which their blocks are sent."""
@@ -97,7 +105,7 @@ class Delivery:
     def _send_snapshot(self, session: Session, room: int) -> None:
         tick, inputs, sight = self._world.tick, session.inputs, session.sight
         if sight.lost_track(tick, self._log.history):
-            self.forget(session)
+            self._renew_terrain(session, sight.lose(tick, self._log.history))
         drops = np.array(sight.drops, "<i4").tobytes() if sight.drops else b""
         n, parts = sight.take(self._log, tick, room)
         player, verdicts = session.player, b""
@@ -117,6 +125,27 @@ class Delivery:
         size = session.snapshot_bytes = len(message)
         self._counters.snapshots_sent += 1
         self._counters.snapshot_bytes += size
+
+    def _send_told(self, session: Session, window: int) -> None:
+        """Sends what the rules have told: shared values, and events as far as they fit into what may be on the way.
+
+        Where terrain is due, half of that is left to it. A client that has not acknowledged anything is still joining
+        and would only keep the events: they do not go until nothing has to wait for them.
+        """
+        if session.shared_due:
+            session.send(session.shared_due)
+            session.shared_due = b""
+        assert session.player is not None
+        outbox, pacing = session.player.outbox, session.pacing
+        if not outbox.due:
+            return
+        room, terrain = window - pacing.outstanding, session.terrain_now or session.terrain_due
+        if session.acked < 0 and (terrain or room <= 0):
+            return
+        for message in outbox.take(
+            session.sight.known, max(room // 2, EVENT_BYTES) if terrain else pacing.room(window)
+        ):
+            session.send(message)
 
     def _send_terrain(self, session: Session, room: int) -> None:
         """Terrain behind the snapshot, as far as it fits into what may be on the way.

@@ -226,6 +226,7 @@ class Game:
         player, new = self.roster.find(session.hello.resume, session.subject), False
         if player is not None:
             self.counters.resumed += 1
+            player.outbox.reconnect()
             if player.session is not None and not player.session.closed:
                 self._end(player.session, messages.TAKEN_OVER, "the player goes on over another connection")
             session.seat(player)
@@ -255,20 +256,20 @@ class Game:
 
     def _send(self, now: float) -> None:
         self.orders.answer()
+        self.stage.tell(self.limits.outbox_max)
         for session in tuple(self.sessions):
             if session.allowance < 0:  # what exceeds the burst has been found excusable
                 most = self.limits.messages_per_tick
                 session.allowance = min(max(session.allowance, -self._burst) + most, 0.0)
             if session.entity and not session.closed:
                 try:
-                    self.stage.tell(session)
+                    self.stage.show(session)
                     if session.greeting is None or self._greeted(session, *session.greeting):
                         self.delivery.serve(session, now)
                     else:
                         session.sent_at = now  # it waits for the disk, and nobody for it
                 except Exception:
                     self._break(session, "serving a client")
-        self.stage.told()
 
     def _greeted(self, session: Session, tick: int, welcome: bytes) -> bool:
         """Lets a client in once its token will last; at once, if it cannot be saved: then it plays all the same."""
@@ -285,8 +286,6 @@ class Game:
             if not session.entity:
                 if session.hello is None and now - session.opened > self.limits.hello_s:
                     self._kick(session, messages.NO_HELLO, f"no hello within {self.limits.hello_s:g} s")
-            elif len(session.outbox) > self.limits.outbox_max:
-                self._kick(session, messages.TOO_SLOW, f"{len(session.outbox)} messages behind")
             elif now - session.heard > self.limits.silence_s:
                 self._kick(session, messages.TOO_SLOW, f"nothing heard for {self.limits.silence_s:g} s")
             elif now - session.sent_at > self.limits.stalled_s:

@@ -62,7 +62,7 @@ class Limits:
     joins_per_tick: int = 8
     """More wait for the next tick: a spawn costs a millisecond or two."""
     outbox_max: int = 1024
-    """A client that is so many of the rules' messages behind is closed."""
+    """Events of the rules that wait for one player; of more, the oldest are dropped, and the client is told."""
     first_bytes: int = 4 * 1024
     """So much may be on its way to a client of which nothing is known yet."""
     terrain_chunk_bytes: int = 1024

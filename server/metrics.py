@@ -36,6 +36,7 @@ COUNTERS = {
     "resumed": "Players that have come back after a lost connection.",
     "corrections": "Corrections of their prediction that clients have reported.",
     "rules_failed": "Exceptions of the game's rules.",
+    "events_dropped": "Events of the game's rules that were dropped because a client's path was full.",
     "malformed": "Messages that were none.",
     "kicked": "Clients closed for what they did, or did not do.",
     "snapshots_sent": "Snapshots sent.",

@@ -253,7 +253,7 @@ class Past:
 
 
 def _between(old: Int64s, new: Int64s, share: float, placed: set[int]) -> tuple[Int64s, Floats]:
-    """Who is there in `old`, and where: on the way to `new`, unless it is not there any more or was `placed`."""
+    """Returns the entities of `old` and their places: on the way to `new`, unless they are gone or were `placed`."""
     places = old[:, 2:] / BLOCK
     if share > 0:
         moves = old[:, 0] == new[:, 0]

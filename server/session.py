@@ -8,6 +8,7 @@ from collections import deque
 from functools import lru_cache
 from typing import Protocol
 
+from server.outbox import Outbox
 from server.pacing import Pacing
 from server.sight import Sight
 from shared.bounds import Bounds, bounds
@@ -185,6 +186,8 @@ class Player:
         self.away_until = math.inf
         """While there is no connection: when the entity goes."""
         self.session: Session | None = None
+        self.outbox = Outbox()
+        """What the rules have sent, to be told."""
 
     def heard(self) -> None:
         """The client has got its newest token: it may throw away the one before, and so is that one worth nothing."""
@@ -226,10 +229,10 @@ class Session:
         self.terrain_due: deque[Cell] = deque()
         self.terrain_now: tuple[Cell, bytes, int] | None = None
         """The packed segment that is being sent, and how much of it has been."""
-        self.outbox: list[bytes] = []
-        """Messages of the rules that go ahead of the next snapshot."""
         self.shared = 0
-        """The version of the game's shared values that it has been sent."""
+        """The version of the game's shared values that it has been sent, or that waits:"""
+        self.shared_due = b""
+        """The message with the shared values that goes behind the next snapshot; empty: there is none."""
         self.resynced_at = now
         self.pacing = Pacing(link.outstanding)
         self.probe: tuple[int, float, int] | None = None

@@ -24,33 +24,44 @@ class Sight:
         """What the client knows and does not see any more: to be told with the next snapshot."""
         self._rest: tuple[Cell, ...] = ()
         self._knows: set[Cell] = set()
-        self._fresh: set[Cell] = set()  # no keyframe sent yet
+        self._fresh: dict[Cell, int] = {}  # no keyframe sent yet; in sight, and unknown, since this tick
         self._behind: dict[Cell, int] = {}  # sent last with this tick, which is before `_tick`
         self._tick = -1
 
-    def move(self, near: tuple[Cell, ...], keep: int) -> tuple[list[Cell], list[Cell]]:
-        """The entity is in another segment: what is seen from now on, nearest first, and what is let go."""
+    def move(self, near: tuple[Cell, ...], keep: int, tick: int = -1) -> tuple[list[Cell], list[Cell]]:
+        """The entity is in another segment as of `tick`: what is seen from then on, nearest first, and is let go."""
         added, dropped = interest.update(self.sees, near, keep)
         self.near = near
+        self._fresh.update(dict.fromkeys(added, tick if self.sees else -1))  # the first ones: as far back as can be
         self.sees.difference_update(dropped)
-        self._fresh.difference_update(dropped)
         for segment in dropped:
+            self._fresh.pop(segment, None)
             self._behind.pop(segment, None)
         self.sees.update(added)
-        self._fresh.update(added)
         self._rest = tuple(self.sees.difference(near))
         self.drops = sorted(self._knows - self.sees)
         return added, dropped
 
     def forget(self) -> None:
         """Everything is to be sent anew."""
-        self._fresh = set(self.sees)
+        self._fresh = dict.fromkeys(self.sees, -1)
         self._behind.clear()
         self._tick = -1
 
     def lost_track(self, tick: int, history: int) -> bool:
         """Whether something waits for longer than its changes are kept: `history` ticks."""
         return self._tick >= 0 and self.waits(tick) > history
+
+    def lose(self, tick: int, history: int) -> list[Cell]:
+        """Gives up on what waits for longer than its changes are kept: it is to be sent whole. Returns the segments."""
+        if tick - self._tick > history:
+            self.forget()
+            return list(self.sees)
+        lost = {segment: since for segment, since in self._behind.items() if tick - since > history}
+        for segment, since in lost.items():
+            del self._behind[segment]
+            self._fresh[segment] = since + 1
+        return list(lost)
 
     def begun(self, segment: Cell) -> bool:
         """Whether a segment that is seen has been sent whole."""
@@ -60,6 +71,11 @@ class Sight:
     def complete(self) -> bool:
         """Whether the latest snapshot had all there was."""
         return not (self._behind or self._fresh)
+
+    @property
+    def known(self) -> int:
+        """The newest tick of which the client has been sent all that was in its sight at the end of it."""
+        return min((self._tick, *self._behind.values(), *(since - 1 for since in self._fresh.values())))
 
     def waits(self, tick: int) -> int:
         """For how many ticks the segment that was sent longest ago, of those known, has not been sent."""
@@ -83,8 +99,8 @@ class Sight:
         if sum(map(len, parts.values())) > room:
             parts = self._urgent(parts, due, tick, log.history, room)
         if self._fresh or self.drops:
-            self._knows = self._knows.difference(self.drops) | (self._fresh & parts.keys())
-            self._fresh.difference_update(parts)
+            self._knows = self._knows.difference(self.drops) | (self._fresh.keys() & parts.keys())
+            self._fresh = {segment: since for segment, since in self._fresh.items() if segment not in parts}
             self.drops = []
         self._behind = (
             {segment: since for segment, since in due.items() if segment not in parts and since != KEYFRAME}

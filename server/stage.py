@@ -318,18 +318,20 @@ class Stage:
         if self._told_contacts:
             self._contacts.stepped()
 
-    def tell(self, session: Session) -> None:
-        """Files what the rules have said since the last tick for a client."""
+    def tell(self, most: int) -> None:
+        """Queues the events of this tick for the players, at most `most` for each; also for those who are away."""
         for entities, message in self._outgoing:
-            if entities is None or session.entity in entities:
-                session.outbox.append(message)
+            for entity in self.players if entities is None else entities & self.players.keys():
+                player = self.players[entity]
+                if player.inputs.wheel is None:  # to a player inside the server, nothing is sent
+                    self._counters.events_dropped += player.outbox.add(self._world.tick, message, most)
+        self._outgoing.clear()
+
+    def show(self, session: Session) -> None:
+        """Files the shared values for a client, if it does not have them as they are."""
         if session.shared != self._version:
             session.shared = self._version
-            session.outbox.append(self._shared_message)
-
-    def told(self) -> None:
-        """Everybody has been told."""
-        self._outgoing.clear()
+            session.shared_due = self._shared_message
 
     def _say(self, entity: int, attributes: Mapping[str, Any]) -> None:
         self._attributes[entity] = dict(attributes)

@@ -11,6 +11,7 @@ travels as packed little-endian records in a MessagePack `bin`.
       5 Command  number tick seen name payload             20 Pong      sent tick
       6 Resync                                             21 Happened  tick name payload
       7 Restart  tick                                      22 Shared    values
+                                                           23 NextHappened  number
                                                             4 Bye       code reason wait
 
     Inputs.rows    n * [i8 move_x, i8 move_y, u8 buttons], for the ticks first, first + 1, ...
@@ -25,6 +26,8 @@ travels as packed little-endian records in a MessagePack `bin`.
     Hello.token    proves who the client is, where the server asks for it. Hello.resume is the one of the latest
                    `Welcome`, to go on as the player that one was about.
     Happened       something that the game's rules tell, once. Its payload is MessagePack, as a command's.
+    NextHappened   the number of the `Happened` that comes next, where the client may expect another one: some were
+                   dropped, or lost with a connection. The first one that a player is told has the number 0.
     Shared         values of the game that all clients know, by name: a score, the time left. All of them, each time.
     Ping           `corrections`: how often the client has corrected its prediction so far, for the operator.
     Pong.tick      the server's time in ticks when it answered: 17.25 is a quarter of a tick after tick 17.
@@ -210,8 +213,27 @@ class Shared(NamedTuple):
     values: dict[str, Any]
 
 
+class NextHappened(NamedTuple):
+    """The number of the next `Happened`, counted from the player's first: what was not received before it is lost."""
+
+    number: int
+
+
 Message = (
-    Hello | Inputs | Ping | Bye | Command | Resync | Restart | Welcome | Snapshot | Terrain | Pong | Happened | Shared
+    Hello
+    | Inputs
+    | Ping
+    | Bye
+    | Command
+    | Resync
+    | Restart
+    | Welcome
+    | Snapshot
+    | Terrain
+    | Pong
+    | Happened
+    | Shared
+    | NextHappened
 )
 Check = Callable[[Any], bool]
 
@@ -284,9 +306,10 @@ KINDS: dict[int, tuple[type[Any], tuple[Check, ...]]] = {
     20: (Pong, (_finite, _finite)),
     21: (Happened, (_tick, _text(NAME_MAX), _bytes(PAYLOAD_MAX))),
     22: (Shared, (_named,)),
+    23: (NextHappened, (_whole(0, TICK_MAX),)),
 }
 CLIENT_KINDS = frozenset({1, 2, 3, 4, 5, 6, 7})
-SERVER_KINDS = frozenset({4, 17, 18, 19, 20, 21, 22})
+SERVER_KINDS = frozenset({4, 17, 18, 19, 20, 21, 22, 23})
 _KIND_OF = {kind: number for number, (kind, _) in KINDS.items()}
 _INPUTS_HEAD = bytes((0x94, _KIND_OF[Inputs]))
 _SNAPSHOT_HEAD, _SNAPSHOT_KIND = b"\xdc", bytes((_KIND_OF[Snapshot],))

@@ -11,17 +11,17 @@ import asyncio
 import socket
 import ssl
 import time
-from collections import deque
 from collections.abc import Callable
 from types import TracebackType
 from typing import Any, cast
 
 from client_sdk.base import BaseClient
 from client_sdk.compiling import COMPILER
-from client_sdk.core import EVENTS_MAX, READ_BYTES, Core
+from client_sdk.core import READ_BYTES, Core
 from client_sdk.events import Event
 from client_sdk.linked import LinkedCore
 from client_sdk.links import Path
+from client_sdk.pending_events import PendingEvents
 from client_sdk.picture import View
 from client_sdk.transports.connection import (
     CLOSE_S,
@@ -44,8 +44,8 @@ WAIT_S_MAX = 1.0
 class AsyncClient(BaseClient):
     """A player on a server, which lives in an event loop: it predicts and sends by itself.
 
-    Use `connect`. `async for event in client` gives what happens and ends after `Left`; whoever does not ask
-    misses the oldest events.
+    Use `connect`. `async for event in client` gives what happens and ends after `Left`. Too many events that wait are
+    dropped, see `EventsDropped`.
 
     Args:
         before_update: called with the core before each tick is predicted, so that it can set the input.
@@ -68,7 +68,7 @@ class AsyncClient(BaseClient):
         self._timer: asyncio.TimerHandle | None = None
         self._due = 0.0
         self._state = self.core.state
-        self._events: deque[Event] = deque(maxlen=EVENTS_MAX)
+        self._events = PendingEvents()
         self._news = asyncio.Event()
         self._answered: asyncio.Future[None] = self._loop.create_future()
         self._gone: asyncio.Future[None] = self._loop.create_future()
@@ -153,7 +153,7 @@ class AsyncClient(BaseClient):
                 raise StopAsyncIteration
             self._news.clear()
             await self._news.wait()
-        return self._events.popleft()
+        return self._events.next()
 
     async def __aenter__(self) -> "AsyncClient":
         return self
@@ -262,9 +262,8 @@ class AsyncClient(BaseClient):
         data = connection.data_to_send(now)
         if self._transport is not None and data:
             self._transport.write(data)
-        events = core.events()
-        if events:
-            self._events.extend(events)
+        for event in core.events():
+            self._events.append(event)
             self._news.set()
         if not self._answered.done():
             if connection.refused is not None:

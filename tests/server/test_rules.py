@@ -12,8 +12,9 @@ from server.session import Player
 from server.stage import ATTRIBUTES_MAX
 from shared import messages
 from shared.checks import SceneError
-from shared.messages import Command, Happened, Hello, Shared, Snapshot
-from tests.tables import FakeLink, Table, gone, order, whole
+from shared.inputs import NEUTRAL
+from shared.messages import Command, Happened, Hello, Inputs, NextHappened, Shared, Snapshot, Welcome
+from tests.tables import HELLO, FakeLink, Table, gone, order, whole
 from tests.worlds import scene
 
 
@@ -235,7 +236,7 @@ def test_events_go_to_whom_they_are_for_once(table: Table) -> None:
     assert bob.got(Happened) == [Happened(tick, "all", msgpack.packb({"n": 1}))]
 
 
-def test_events_wait_for_who_is_slow_and_not_for_ever() -> None:
+def test_events_wait_for_who_is_slow_and_the_oldest_of_too_many_are_dropped_and_counted() -> None:
     table = Table(Limits(outbox_max=5), rules=Rules())
     link = table.join()
     link.waiting = 1 << 20
@@ -247,10 +248,50 @@ def test_events_wait_for_who_is_slow_and_not_for_ever() -> None:
     table.tick()
     assert [msgpack.unpackb(happened.payload) for happened in link.got(Happened)] == list(range(5))
     link.waiting = 1 << 20
-    for n in range(6):
+    link.sent.clear()
+    for n in range(7):
         table.game.stage.send("n", n)
+        table.tick()
+    link.waiting = 0
     table.tick()
-    assert link.refusal() == (messages.TOO_SLOW, "6 messages behind")
+    assert not link.closings
+    assert link.got(NextHappened) == [NextHappened(7)], "five of before, and two"
+    assert [msgpack.unpackb(happened.payload) for happened in link.got(Happened)] == list(range(2, 7))
+    assert link.sent.index(NextHappened(7)) < link.sent.index(link.got(Happened)[0])
+    assert table.game.counters.events_dropped == 2
+
+
+def test_what_is_said_to_who_is_away_goes_after_the_return_and_what_was_on_its_way_is_counted() -> None:
+    table = Table(rules=Rules(), resume_s=9.0)
+    link = table.join()
+    link.say(Inputs(0, table.tick_number, b""))
+    game = table.game.stage
+    game.send("lost on its way")
+    table.tick()
+    table.lose(link)
+    table.tick(2)
+    game.send("away")
+    game.send("to another", to=[])
+    table.tick(2)
+    again = table.connect(HELLO._replace(resume=link.got(Welcome)[-1].resume))
+    table.tick(3)
+    game.send("back")
+    table.tick(2)
+    assert again.got(NextHappened) == [NextHappened(1)]
+    assert [happened.name for happened in again.got(Happened)] == ["away", "back"]
+    assert again.sent.index(NextHappened(1)) < again.sent.index(again.got(Happened)[0])
+
+
+def test_nothing_is_kept_for_a_player_inside_the_server() -> None:
+    table = Table(rules=Rules())
+    link = table.join()
+    player = link.session.player
+    assert player is not None
+    player.inputs.wheel = NEUTRAL
+    table.game.stage.send("n")
+    table.tick()
+    assert len(player.outbox) == 0
+    assert not link.got(Happened)
 
 
 def test_shared_values_reach_all_also_who_comes_later(table: Table) -> None:

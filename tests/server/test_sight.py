@@ -55,6 +55,34 @@ def take(sight: Sight, log: Log, tick: int, room: int) -> list[Cell]:
     return taken
 
 
+def test_known_is_the_tick_up_to_which_all_that_was_in_sight_has_been_sent() -> None:
+    sight, log = looking(), Log(dict.fromkeys(ROW, 10))
+    assert sight.known == -2
+    assert take(sight, log, 5, 20) == [OWN, NEAR]
+    assert sight.known == -2, "of one segment nothing is known"
+    assert take(sight, log, 6, 100) == [FAR, OWN, NEAR] or sight.complete
+    assert sight.known == 6
+    log.sizes[FAR] = 1000
+    assert FAR not in take(sight, log, 7, 20)
+    assert sight.known == 6
+    assert FAR in take(sight, log, 9, 2000)
+    assert sight.known == 9
+
+
+def test_what_comes_into_sight_later_was_not_in_sight_before() -> None:
+    sight, log = Sight(), Log(dict.fromkeys(ROW, 10))
+    sight.move((OWN,), 2, 4)
+    take(sight, log, 5, 100)
+    assert sight.known == 5
+    sight.move(tuple(ROW), 2, 8)
+    assert FAR not in take(sight, log, 8, 20)
+    assert sight.known == 7
+    assert FAR in take(sight, log, 9, 2000)
+    assert sight.known == 9
+    sight.forget()
+    assert sight.known == -2
+
+
 def test_everything_goes_where_it_fits_first_whole_and_then_its_changes() -> None:
     sight, log = looking(), Log(dict.fromkeys(ROW, 10))
     assert sorted(take(sight, log, 5, 100)) == ROW

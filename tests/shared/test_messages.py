@@ -26,6 +26,7 @@ from shared.messages import (
     Hello,
     Inputs,
     Message,
+    NextHappened,
     Ping,
     Pong,
     ProtocolError,
@@ -65,6 +66,7 @@ FROM_SERVER: list[Message] = [
     Pong(1.5, 17.25),
     Happened(TICK_MAX, "n" * 32, bytes(1024)),
     Shared({"score": [1, None, "two", {"three": 3.0}]}),
+    NextHappened(TICK_MAX),
 ]
 
 
@@ -131,6 +133,7 @@ OUT_OF_BOUNDS: list[tuple[Message, str, list[Any]]] = [
     (Happened(0, "", b""), "tick", [-2, TICK_MAX + 1]),
     (Happened(0, "", b""), "name", ["n" * 33, None]),
     (Happened(0, "", b""), "payload", [bytes(1025), "text"]),
+    (NextHappened(0), "number", [-1, TICK_MAX + 1, 1.0, None]),
     (Shared({}), "values", [[], None, {b"name": 1}, {str(i): 0 for i in range(65)}]),
     (BLANK, "tick", [-2, TICK_MAX + 1, None]),
     (BLANK, "newest", [-2, TICK_MAX + 1]),

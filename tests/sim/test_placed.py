@@ -1,4 +1,4 @@
-"""What the rules place, remove, change and spawn is drawn only where it was, and a shot at what is drawn hits."""
+"""Entities that the rules place, remove, change or spawn are drawn only where they were, and a shot at them hits."""
 
 import dataclasses
 import random
@@ -29,11 +29,11 @@ def playing(match: Match, *players: Player) -> None:
 
 
 class Acts(Rules):
-    """Things that stand in the air, and what the rules can do to them."""
+    """The rules place, change, remove and spawn things that stand in the air."""
 
     scene = "flat"
     far = 1.75
-    """How far one of them is placed away."""
+    """The distance by which one of them is placed to and fro, in blocks."""
 
     def prepare(self, scene: Scene) -> Scene:
         stands: dict[str, Any] = {"walk_speed": 0, "jump_speed": 0, "solid": False}
@@ -201,7 +201,7 @@ def test_an_entity_that_is_placed_where_all_is_sent_anew_is_never_drawn_elsewher
 
 
 class Moved(Rules):
-    """Each player is placed to and fro, from time to time twice in a row, and once below the floor."""
+    """The rules place all players to and fro, from time to time twice in a row."""
 
     scene = "flat"
     places: tuple[Vec, Vec] = ((64, 66, 8), (74, 66, 8))

@@ -1,0 +1,89 @@
+"""A player's events: when they go, in what order, and that each is sent or counted."""
+
+import random
+
+import pytest
+
+from server.outbox import Outbox
+from shared.messages import Happened, NextHappened, decode_from_server, encode
+
+ALL = 1 << 20
+
+
+def happened(number: int, length: int = 0) -> bytes:
+    return encode(Happened(number, "n", bytes(length)))
+
+
+def taken(outbox: Outbox, known: int, room: int = ALL) -> list[int | str]:
+    """The ticks of the events, and the numbers told as texts."""
+    messages = map(decode_from_server, outbox.take(known, room))
+    told: list[int | str] = []
+    for message in messages:
+        if isinstance(message, NextHappened):
+            told.append(f"{message.number}")
+        else:
+            assert isinstance(message, Happened)
+            told.append(message.tick)
+    return told
+
+
+def filled(*ticks: int, most: int = 100) -> Outbox:
+    outbox = Outbox()
+    for tick in ticks:
+        outbox.add(tick, happened(tick), most)
+    return outbox
+
+
+def test_an_event_goes_when_its_tick_is_known_and_none_overtakes_it() -> None:
+    outbox = filled(5, 5, 7, 9)
+    assert taken(outbox, 4) == []
+    assert taken(outbox, 6) == [5, 5]
+    assert taken(outbox, 6) == []
+    assert taken(outbox, 9) == [7, 9]
+    assert not outbox.due
+
+
+def test_only_so_many_bytes_go_but_always_one_event() -> None:
+    outbox = filled(*range(10))
+    size = len(happened(0))
+    assert taken(outbox, 99, 2 * size) == [0, 1]
+    assert taken(outbox, 99, 0) == [2]
+    assert taken(outbox, 99, -5) == [3]
+    assert taken(outbox, 99, 3 * size - 1) == [4, 5, 6]
+
+
+def test_the_oldest_of_too_many_are_dropped_and_the_next_ones_number_is_told() -> None:
+    outbox = filled(*range(10), most=4)
+    assert len(outbox) == 4
+    assert taken(outbox, 0) == ["6"], "at once, though none may go yet"
+    assert taken(outbox, 99) == [6, 7, 8, 9]
+    assert outbox.add(10, happened(10), 4) is False
+
+
+def test_after_a_return_the_next_ones_number_is_told_once() -> None:
+    outbox = filled(1, 2, 3)
+    assert taken(outbox, 2) == [1, 2]
+    outbox.reconnect()
+    assert outbox.due
+    assert taken(outbox, 2) == ["2"]
+    assert taken(outbox, 3) == [3]
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_each_event_is_sent_once_or_counted_once(seed: int) -> None:
+    rng, outbox = random.Random(seed), Outbox()
+    expected = missed = sent = 0
+    for tick in range(1000):
+        for _ in range(rng.randrange(4)):
+            outbox.add(tick, happened(tick), 8)
+            sent += 1
+        if rng.random() < 0.3 or tick == 999:
+            known, room = tick - rng.randrange(5), rng.choice((0, 20, ALL))
+            for message in map(decode_from_server, outbox.take(*((known, room) if tick < 999 else (tick, ALL)))):
+                if isinstance(message, NextHappened):
+                    missed += message.number - expected
+                    expected = message.number
+                else:
+                    expected += 1
+    assert missed > 100
+    assert expected == sent
