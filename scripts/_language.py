@@ -25,6 +25,8 @@ COMPLIANT = (
     "docs/client.md",
     "docs/games.md",
     "docs/glossary.md",
+    "docs/kernels.md",
+    "docs/measurements.md",
     "docs/protocol.md",
     "docs/server.md",
     "hatch_build.py",
