@@ -102,9 +102,9 @@ def run(settings: Settings) -> int:
     if settings.kernel == kernels.AUTO and kernels.trouble():
         logger.warning("the physics is slower, or has to be compiled", kernel=kernels.describe())
     with kernels.compiling(lambda: announce_compiling(sys.stderr)):
-        warm_up(scene)
+        world = warm_up(scene)
     with asyncio.Runner(loop_factory=loop_factory()) as runner, contextlib.ExitStack() as stack:
-        store = world = None
+        store = None
         if settings.data is not None:
             store = stack.enter_context(saved(scene, settings))
             world = store.world

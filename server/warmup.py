@@ -1,11 +1,12 @@
 """A game in miniature before the real one: what takes longer the first time has happened before anybody can see it.
 
-The kernel is compiled function by function, by the first call of each (seconds; from its cache on disk, some 50 ms),
-and Python itself is quicker the second time. So a scratch client does everything that a client can make a server do.
+Python itself is quicker the second time, and a kernel without a prebuilt library is compiled here. So scratch clients do
+everything that a client can make a server do.
 """
 
 from server.game import Game
 from server.limits import Limits
+from server.recorder import RecordedWorld
 from shared import edits, messages
 from shared.checks import SceneError
 from shared.messages import Bye, Command, Hello, Inputs, Message, Ping, Resync, encode
@@ -27,13 +28,19 @@ class _Void:
     def close(self, code: int, reason: str) -> None: ...
 
 
-def warm_up(scene: Scene) -> None:
+def warm_up(scene: Scene) -> RecordedWorld:
     """Joins, walks, jumps, builds, digs, falls out, shoots into the past and leaves, in a world of its own.
+
+    Returns:
+        A new world of the scene, untouched: generating its terrain is half of the work.
 
     Raises:
         SceneError: nobody could ever join.
     """
-    game, now = Game(scene, limits=Limits(edits_per_s=10_000)), 0.0
+    fresh, scratch = RecordedWorld(scene), RecordedWorld(scene)
+    fresh.load_terrain()
+    scratch.restore(fresh)
+    game, now = Game(scene, limits=Limits(edits_per_s=10_000), world=scratch), 0.0
 
     def tick() -> None:
         nonlocal now
@@ -72,3 +79,4 @@ def warm_up(scene: Scene) -> None:
     game.stats()
     say(Bye(messages.GOING_AWAY, "", -1.0))
     tick()
+    return fresh

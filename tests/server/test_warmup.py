@@ -8,6 +8,7 @@ from server.warmup import warm_up
 from shared import kernels
 from shared.checks import SceneError
 from shared.scene import load_scene
+from shared.world import World
 
 
 def test_that_something_is_compiled_is_told_once_and_only_then(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -28,6 +29,9 @@ def test_that_something_is_compiled_is_told_once_and_only_then(monkeypatch: pyte
 def test_a_scene_with_room_for_one_is_enough_and_one_without_is_refused_by_name() -> None:
     pit = replace(load_scene("flat"), size=(1, 1, 1), spawns=((16.5, 16.5, 4.0),))
     full, hole = [0, 0, 0, 32, 32, 32, 1], [16, 16, 4, 17, 17, 6, 0]
-    warm_up(replace(pit, terrain={"generator": "boxes", "fill": [full, hole]}))
+    narrow = replace(pit, terrain={"generator": "boxes", "fill": [full, hole]})
+    untouched = World(narrow, compiled=False)
+    untouched.load_terrain()
+    assert warm_up(narrow).state_hash() == untouched.state_hash()
     with pytest.raises(SceneError, match=r"^spawns = .*no room for a 'player'"):
         warm_up(replace(pit, terrain={"generator": "boxes", "fill": [full]}))
