@@ -1,6 +1,6 @@
 """A game in miniature before the real one: what takes longer the first time has happened before anybody can see it.
 
-Python itself is quicker the second time, and a kernel without a prebuilt library is compiled here. So scratch clients do
+Python itself is quicker the second time, and where no kernel is prebuilt, one is compiled here. So scratch clients do
 everything that a client can make a server do.
 """
 

@@ -182,7 +182,7 @@ _kernels: dict[str, Kernel] = {}
 
 def _loaded(form: str) -> Kernel:
     if form not in _kernels:
-        _kernels[form] = {PREBUILT: _prebuilt, NUMBA: _numba, PLAIN: _plain}[form]()
+        _kernels[form] = {PREBUILT: lambda: kernel_of(_library()), NUMBA: _numba, PLAIN: _plain}[form]()
     return _kernels[form]
 
 
@@ -196,10 +196,10 @@ def _plain() -> Kernel:
     return Kernel(form=PLAIN, compiled=False, lent=_view, bound=lambda arrays: arrays, **functions)
 
 
-def _prebuilt() -> Kernel:
-    library = _library()
+def kernel_of(library: ModuleType, form: str = PREBUILT) -> Kernel:
+    """The kernel in a Python module that `scripts/kernels` can build."""
     functions = {name: getattr(library, name) for name in exports.functions()}
-    return Kernel(form=PREBUILT, compiled=True, lent=_view, bound=_table, **functions)
+    return Kernel(form=form, compiled=True, lent=_view, bound=_table, **functions)
 
 
 def _table(arrays: Any) -> memoryview:

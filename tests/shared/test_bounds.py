@@ -25,6 +25,15 @@ WORK = (
     "tests/server/test_replication.py",
     "tests/server/test_rewind.py",
 )
+CHECKED = ("-p", "tests.kernels.checking")
+"""Has the tests run the kernel that `scripts/kernels` builds, with checks."""
+CONTROL_CHECKED = """
+import numpy as np
+from tests.kernels import checking
+from shared import kernels
+few, many = np.zeros(12, np.int64), np.zeros(24, np.int64)
+kernels.get(True).alike(few, 2, many, 2, 1, 1, few)
+"""
 CONTROL = """
 import numpy as np
 from shared import bulk, kernels
@@ -35,6 +44,19 @@ pytestmark = [
     pytest.mark.slow,
     pytest.mark.skipif(not kernels.numba_installed(), reason="Numba is not installed"),
 ]
+
+
+def test_no_index_of_the_prebuilt_kernel_is_out_of_bounds() -> None:
+    environment = os.environ | {"NUMBA_OPT": "0", "NUMBA_CPU_NAME": "generic"}
+
+    def run(*arguments: str) -> subprocess.CompletedProcess[str]:
+        return subprocess.run(
+            (sys.executable, *arguments), cwd=ROOT, env=environment, capture_output=True, text=True, check=False
+        )
+
+    assert "SystemError" in run("-c", CONTROL_CHECKED).stderr
+    done = run("-m", "pytest", "-q", "-p", "no:cacheprovider", *CHECKED, "-m", "not slow", "-k", "not plain", *WORK)
+    assert done.returncode == 0, done.stdout
 
 
 def test_no_index_is_out_of_bounds(tmp_path: Path) -> None:

@@ -1,16 +1,22 @@
 """Two worlds that are told the same are the same, at every tick: in two processes, compiled and not, across copies."""
 
-import hashlib
+import os
 import random
 import subprocess
 import sys
 from collections.abc import Iterator
+from pathlib import Path
 
+import pytest
+
+from shared import kernels
 from shared.inputs import Input
 from shared.scene import load_scene
 from shared.world import World
+from tests.kernels import chains
 
-TICKS = 20_000
+ROOT = Path(__file__).parent.parent.parent
+TICKS = chains.TICKS
 PLAYERS = 6
 
 
@@ -34,19 +40,27 @@ def inputs(seed: int) -> Iterator[dict[int, Input]]:
         }
 
 
-def chain(compiled: bool, ticks: int) -> str:
-    """The hash of the hashes of every tick."""
-    world, total = start(compiled), hashlib.sha256()
-    for _, wishes in zip(range(ticks), inputs(7), strict=False):
-        world.step(wishes)
-        total.update(world.state_hash())
-    return total.hexdigest()
+@pytest.mark.parametrize(
+    "scene", [chains.SCENES[0], *(pytest.param(s, marks=pytest.mark.slow) for s in chains.SCENES[1:])]
+)
+def test_two_processes_compiled_and_plain_agree_at_every_tick(scene: str) -> None:
+    other = other_chain(scene, kernels.PLAIN)
+    assert f"{kernels.PLAIN} {chains.chain(scene, TICKS, compiled=True)}" == other
 
 
-def test_two_processes_compiled_and_plain_agree_at_every_tick() -> None:
-    script = f"from tests.sim.test_two_worlds import chain; print(chain(False, {TICKS}))"
-    other = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
-    assert chain(True, TICKS) == other.stdout.strip()
+@pytest.mark.slow
+@pytest.mark.skipif(not kernels.numba_installed(), reason="Numba is not installed")
+@pytest.mark.parametrize("scene", chains.SCENES)
+def test_two_processes_of_which_numba_compiles_one_agree_at_every_tick(scene: str) -> None:
+    other = other_chain(scene, kernels.NUMBA)
+    assert f"{kernels.NUMBA} {chains.chain(scene, TICKS, compiled=True)}" == other
+
+
+def other_chain(scene: str, form: str) -> str:
+    """The form, and what another process makes of a scene with it."""
+    command = (sys.executable, "-m", "tests.kernels.chains", scene, str(TICKS))
+    environment = os.environ | {kernels.VARIABLE: form}
+    return subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, check=True).stdout.strip()
 
 
 def test_a_copy_and_a_restored_world_go_on_alike() -> None:

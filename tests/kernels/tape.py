@@ -1,0 +1,103 @@
+"""Records every call of a kernel, so that another machine can make them again: `replay.mjs` does, in WebAssembly.
+
+A tape holds, for each call, what has changed in the arrays since the last one, the arguments, the result, and what the
+call has changed. So a replay compares every word of every array after every call, bookkeeping included.
+
+    R                                             all arrays are forgotten
+    A  u32 array  u32 bytes  u8 unit              a new array, all zero
+    W  changes                                    written from outside, ahead of the next call
+    C  u8 function  arguments  i32 result  u16 arrays  changes ...   a call, and what it has changed
+
+    arguments     i64 of a number; u32 array  u32 length of an array; that of each array of a world
+    changes       u32 array  u32 n  n * u32 index  n * unit bytes
+
+All numbers are little-endian; an index counts units. The order of the functions is that of `exports.functions`.
+"""
+
+import struct
+from typing import Any, BinaryIO
+
+import numpy as np
+
+from shared import exports
+from shared.kernels import Kernel
+
+BYTES_MAX = 256 << 20
+"""All arrays are forgotten when they take more than that."""
+
+
+class Tape:
+    """Written to a file, call by call.
+
+    Args:
+        kernel: makes the calls.
+        file: gets the tape.
+    """
+
+    def __init__(self, kernel: Kernel, file: BinaryIO) -> None:
+        self._kernel, self._file = kernel, file
+        self._known: dict[tuple[int, int], tuple[int, np.ndarray[Any, Any]]] = {}
+        self._held = 0
+        self.calls: dict[str, int] = dict.fromkeys(exports.functions(), 0)
+
+    def kernel(self) -> Kernel:
+        """The kernel, recorded."""
+        functions = {
+            name: self._recorded(i, name, kinds) for i, (name, kinds) in enumerate(exports.functions().items())
+        }
+        return Kernel(**(vars(self._kernel) | {"bound": lambda arrays: arrays} | functions))
+
+    def _recorded(self, number: int, name: str, kinds: str) -> Any:
+        function = getattr(self._kernel, name)
+
+        def call(*arguments: Any) -> Any:
+            if self._held > BYTES_MAX:
+                self._file.write(b"R")
+                self._known.clear()
+                self._held = 0
+            touched: list[tuple[int, np.ndarray[Any, Any], np.ndarray[Any, Any]]] = []
+            words = bytearray(struct.pack("<cB", b"C", number))
+            for kind, argument in zip(kinds, arguments, strict=True):
+                if kind in (exports.NUMBER, exports.TRUTH):
+                    words += struct.pack("<q", argument)
+                    continue
+                for each in argument if kind == exports.WORLD else (argument,):
+                    array, now, shadow = self._array(each)
+                    touched.append((array, now, shadow))
+                    words += struct.pack("<II", array, len(each))
+            for array, now, shadow in touched:
+                if changes := _changes(array, now, shadow):
+                    self._file.write(b"W" + changes)
+            given = [
+                self._kernel.bound(argument) if kind == exports.WORLD else argument
+                for kind, argument in zip(kinds, arguments, strict=True)
+            ]
+            result = function(*given)
+            made = [changes for array, now, shadow in touched if (changes := _changes(array, now, shadow))]
+            self._file.write(bytes(words) + struct.pack("<iH", int(result or 0), len(made)) + b"".join(made))
+            self.calls[name] += 1
+            return result
+
+        return call
+
+    def _array(self, given: Any) -> tuple[int, np.ndarray[Any, Any], np.ndarray[Any, Any]]:
+        """The number of an array, its units as they are, and as they were after the latest call."""
+        raw = np.frombuffer(given, np.uint8) if len(given) else np.zeros(0, np.uint8)
+        unit = next(size for size in (8, 4, 1) if len(raw) % size == 0)
+        now = raw.view(f"<u{unit}")
+        key = (raw.ctypes.data if len(raw) else 0, len(raw))
+        if key not in self._known:
+            self._known[key] = len(self._known), np.zeros_like(now)
+            self._held += len(raw)
+            self._file.write(struct.pack("<cIIB", b"A", self._known[key][0], len(raw), unit))
+        number, shadow = self._known[key]
+        return number, now, shadow
+
+
+def _changes(array: int, now: np.ndarray[Any, Any], shadow: np.ndarray[Any, Any]) -> bytes:
+    """What is not as it was; from then on it is."""
+    at = np.flatnonzero(now != shadow)
+    if not len(at):
+        return b""
+    shadow[at] = now[at]
+    return struct.pack("<II", array, len(at)) + at.astype("<u4").tobytes() + now[at].tobytes()
