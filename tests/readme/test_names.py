@@ -86,3 +86,10 @@ def test_a_name_without_a_link_exists_too(text: str) -> None:
     plain = re.findall(r"`([^`]+)`", LINK.sub("", FENCE.sub("", text)))
     names = [name for name in plain if NAME.fullmatch(name.removesuffix("()")) and not (ROOT / name).exists()]
     assert [name for name in names if name.removesuffix("()") not in known] == []
+
+
+@pytest.mark.parametrize("folder", ["client_sdk", "server", "shared"])
+def test_the_architecture_has_each_module(folder: str) -> None:
+    page = ROOT / "ARCHITECTURE.md"
+    linked = {(page.parent / target).resolve() for _, target in LINK.findall(page.read_text("utf-8"))}
+    assert [path.name for path in (ROOT / folder).rglob("*.py") if path.stem[0] != "_" and path not in linked] == []
