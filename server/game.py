@@ -210,7 +210,7 @@ class Game:
             credit = paused_s * self.scene.tick_rate * self.limits.messages_per_tick
             for session in self.sessions:
                 session.opened = session.heard = session.sent_at = now
-                session.allowance = min(session.allowance + credit, 0.0)
+                session.allowance += credit
             self.roster.excuse(paused_s, now)
 
     def _join(self) -> None:
@@ -258,9 +258,12 @@ class Game:
         self.orders.answer()
         self.stage.tell(self.limits.outbox_max)
         for session in tuple(self.sessions):
-            if session.allowance < 0:  # what exceeds the burst has been found excusable
+            if session.allowance:
                 most = self.limits.messages_per_tick
-                session.allowance = min(max(session.allowance, -self._burst) + most, 0.0)
+                if session.allowance < 0:  # what exceeds the burst has been found excusable
+                    session.allowance = min(max(session.allowance, -self._burst) + most, 0.0)
+                else:  # for messages that waited while the server had no turn
+                    session.allowance = max(session.allowance - most, 0.0)
             if session.entity and not session.closed:
                 try:
                     self.stage.show(session)

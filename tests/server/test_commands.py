@@ -55,7 +55,7 @@ def test_each_edit_that_cannot_be_done_says_why(table: Table) -> None:
         order(3, 0, 16, 16, -3, 5),
         Command(4, 0, 0.0, edits.NAME, b"\xff"),
         Command(5, 0, 0.0, "fly", b""),
-        order(6, table.tick_number + 100, 18, 16, 1, 5),
+        order(6, table.tick_number + 200, 18, 16, 1, 5),
     )
     table.tick(2)
     told = verdicts(link)

@@ -199,8 +199,8 @@ def test_a_flood_of_messages_is_closed_and_a_burst_is_not() -> None:
     table = Table(Limits(messages_per_tick=4))
     link = table.join()
     for _ in range(3):
-        link.say(*[Ping(0.0)] * 128)
+        link.say(*[Ping(0.0)] * 256)
         assert link.closings == []
-        table.tick(32)  # the allowance is back
-    link.say(*[Ping(0.0)] * 129)
+        table.tick(64)  # the allowance is back: a second's worth, at 64 ticks/s
+    link.say(*[Ping(0.0)] * 257)
     assert link.refusal() == (messages.MALFORMED, "too many messages")

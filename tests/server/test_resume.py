@@ -41,7 +41,7 @@ def test_who_comes_back_in_time_goes_on_as_before(table: Table) -> None:
     heard(table, link)
     link.say(Inputs(table.tick_number + 2, table.tick_number, bytes((127, 0, 0)) * 3))
     table.lose(link)
-    table.tick(20)
+    table.tick(40)
     place = table.game.world.position(me)
     assert place[0] > 16.5, "the inputs that had come were carried out"
     again = back(table, token(link))
