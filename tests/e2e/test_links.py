@@ -89,9 +89,12 @@ class Seen:
     before: Stats = field(default_factory=Stats)
     after: Stats = field(default_factory=Stats)
     events: list[Event] = field(default_factory=list)
+    rtt_s: float = 0.0
+    """The least round trip of the last pings: the path without its queues, and without a busy machine."""
 
     def __call__(self, core: Core) -> None:
         self.bot(core)
+        self.rtt_s = core.clock.rtt_s
         if core.prediction is None or core.entity not in core.prediction.confirmed:
             return
         now, confirmed = self.now(), core.prediction.confirmed
@@ -117,7 +120,7 @@ class Figures:
         self.substituted = self._total("inputs_substituted")
         self.skipped = self._total("snapshots_skipped")
         self.lead_ticks = sum(each.after.lead_ticks for each in seen) / len(seen)
-        self.rtt_ms = 1e3 * min(each.after.rtt_s for each in seen)
+        self.rtt_ms = 1e3 * min(each.rtt_s for each in seen)
         self.corrections = sum((Counter(each.after.corrections_by_cause) for each in seen), Counter[str]())
 
     def age_ms(self, q: float, start: float = SETTLED_S, end: float = 1e9) -> float:
