@@ -175,7 +175,9 @@ class Play:
                 self._lead.observe(tick, margin / one, phase, now)
         if self._settling is not None or self._settled:  # the server may have used inputs that are withdrawn
             self._late, self._settled = True, False
-        if fates.count(USED) == len(fates):
+        used = fates.count(USED)
+        stats.inputs_used += used
+        if used == len(fates):
             return
         neutralised = fates.count(NEUTRALISED)
         missing = fates.count(REPEATED) + neutralised

@@ -46,6 +46,8 @@ class Stats:
     bytes_up: int = 0
     bytes_down: int = 0
     inputs_sent: int = 0
+    inputs_used: int = 0
+    """Ticks for which the server used the input that was sent for them."""
     inputs_late: int = 0
     """Came after their tick."""
     inputs_refused: int = 0

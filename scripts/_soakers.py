@@ -14,6 +14,7 @@ import msgpack
 import numpy as np
 
 from _generator import REQUEST, frame
+from _progress import Progress
 from client_sdk.confirmed import Confirmed
 from client_sdk.replica import check_scene
 from shared import edits, messages
@@ -136,6 +137,9 @@ class Honest:
         self.got = self.due = 0
         """Snapshots that came, and that the server made, between the first and the last of each connection."""
         self.playing = False
+        self.progress = Progress(walks=False)
+        self.used = 0
+        """Inputs that the server has used."""
         self._waiting: dict[int, tuple[Cell, int, Command]] = {}
         self._copy: Confirmed | None = None
         """What it knows of the world, but for the terrain."""
@@ -211,6 +215,7 @@ class Honest:
             self.counts["joined"] += 1
             self._waiting = {}
         self.entity, self.resume, self._sent = welcome.entity, welcome.resume, -1
+        self.progress.away()
         self._copy = Confirmed(check_scene(welcome.scene), welcome.entity)
         self.playing = True
 
@@ -220,6 +225,8 @@ class Honest:
             self.got += 1
             self.due += tick - self._tick
         self._tick = tick
+        self.used += snapshot.fates.count(messages.USED)
+        self.progress.see(asyncio.get_running_loop().time(), self.used)
         if self._copy is not None and (wrong := self._copy.apply(snapshot)):
             self.unexplained.append(wrong)
         for number, verdict in np.frombuffer(snapshot.verdicts, VERDICT).tolist():

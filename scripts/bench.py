@@ -25,6 +25,7 @@ clients join.
 import argparse
 import itertools
 import json
+import signal
 import statistics
 import sys
 from pathlib import Path
@@ -243,11 +244,16 @@ def main(argv: list[str] | None = None) -> int:
     command.add_argument("--quick", action="store_true", help="one round of 3 s each, within a minute")
     command.set_defaults(run=jitter.run)
     args = parser.parse_args(argv)
+    for number in (signal.SIGINT, signal.SIGTERM):  # the processes of the benchmark end as well
+        signal.signal(number, signal.default_int_handler)
     try:
         report, status = args.run(args, Console())
     except RigError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
+    except KeyboardInterrupt:
+        print("stopped", file=sys.stderr)
+        return 130
     if args.json and report:
         args.json.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
     return int(status)

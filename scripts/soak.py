@@ -4,10 +4,13 @@
     python scripts/soak.py [--minutes 30] [--clients 100] [--seed 1] [--json OUT]
 
 One server process saves its world; a third of the honest players lose their connections every few seconds, the others
-stay for up to 90 s, then leave or are cut off; all come back by themselves. Meanwhile the server is killed (SIGKILL)
+stay for up to 90 s, then leave or are cut off; all come back by themselves. Players of the SDK, one for each ten of
+them, walk all the time. Meanwhile the server is killed (SIGKILL)
 and started again, suspended for some seconds (SIGSTOP), and attacked (`_hostile.py`). In the last 40 % of the time it
 is not killed any more, so that its memory can be watched. Every edit that a player was told is done must be in the
-world that is read from the directory in the end. Exits with 1 if one is lost, or an error is unexplained.
+world that is read from the directory in the end. Exits with 1 if one is lost, or an error is unexplained. That a
+player's inputs are not used, or that a player of the SDK does not move, more than 2 s after a stall or a return, is an
+error: snapshots would go on coming.
 """
 
 import argparse
@@ -30,10 +33,12 @@ from rich.console import Console
 from rich.progress import Progress
 
 from _soakers import Cells, Honest
+from _walkers import Walker
 from server.store import Store
 from shared.scene import load_scene
 from shared.world import World
 from sovereign_netcode.loadtest.processes import CannotStartError, stats
+from sovereign_netcode.stderr import Stderr
 
 ROOT = Path(__file__).resolve().parent.parent
 SCENE = "hills"
@@ -53,6 +58,12 @@ ABUSE = {
     "flood": 1,
 }
 CONNECTS_PER_S = 200
+STALL_S = 1.0, 5.0
+"""The shortest and the longest time, in seconds, for which the server is suspended."""
+PER_WALKER = 10
+"""Honest players for each one of the SDK; there are two of these at least."""
+STUCK_S_MAX = 1.0
+"""A player who could do nothing for longer, in seconds beyond the time that is allowed, is an error."""
 EXPLAINED = re.compile("stalled|suspended|goes on")
 """What the watchdog says of a process that was suspended, and of a machine that others keep busy."""
 
@@ -154,11 +165,16 @@ class Course:
 async def abuse(port: int, seed: int, seconds: float, made: Counter[str], errors: list[str]) -> None:
     """An attack that is over after a while."""
     order = {"port": port, "seed": seed, "peers": ABUSE, "connects_per_s": CONNECTS_PER_S}
-    process = await asyncio.create_subprocess_exec(
-        *(sys.executable, str(ROOT / "scripts" / "_hostile.py"), json.dumps(order)),
-        stdin=asyncio.subprocess.PIPE,
-        stdout=asyncio.subprocess.PIPE,
-    )
+    complaints = Stderr()
+    try:
+        process = await asyncio.create_subprocess_exec(
+            *(sys.executable, str(ROOT / "scripts" / "_hostile.py"), json.dumps(order)),
+            stdin=asyncio.subprocess.PIPE,
+            stdout=asyncio.subprocess.PIPE,
+            stderr=complaints.pipe,
+        )
+    finally:
+        complaints.started()
     assert process.stdin is not None
     assert process.stdout is not None
     try:
@@ -166,8 +182,8 @@ async def abuse(port: int, seed: int, seconds: float, made: Counter[str], errors
         process.stdin.close()
         told = json.loads(await asyncio.wait_for(process.stdout.read(), END_S) or b"{}")
         made.update(told.get("made", {}))
-        errors += [f"hostile: {error}" for error in told.get("failed", ["it died"])]
-        await asyncio.wait_for(process.wait(), END_S)
+        code = await asyncio.wait_for(process.wait(), END_S)
+        errors += [f"hostile: {error}" for error in told.get("failed", [f"it died: {complaints.cause(code)}"])]
     finally:
         if process.returncode is None:
             process.kill()
@@ -188,7 +204,7 @@ async def disturb(life: Life, course: Course, counts: Counter[str], errors: list
                 await life.start()
             elif what == "stall":
                 life.process.send_signal(signal.SIGSTOP)
-                await asyncio.sleep(course.rng.uniform(1.0, 3.0))
+                await asyncio.sleep(course.rng.uniform(*STALL_S))
                 life.process.send_signal(signal.SIGCONT)
             else:
                 group.create_task(abuse(life.port, counts[what], length_s, counts, errors))
@@ -218,7 +234,9 @@ async def soak(minutes: float, clients: int, seed: int, directory: Path, console
     life = Life(directory, errors)
     await life.start()
     players = [Honest(i, life.port, seed, cells, lossy=i % 3 == 0) for i in range(clients)]
-    tasks = [asyncio.create_task(player.play()) for player in players]
+    walkers = [Walker(i, life.port) for i in range(max(2, clients // PER_WALKER))]
+    everybody: list[Honest | Walker] = [*players, *walkers]
+    tasks = [asyncio.create_task(player.play()) for player in everybody]
     watching = [asyncio.create_task(life.watch())]
     playing: list[int] = []
     try:
@@ -248,7 +266,8 @@ async def soak(minutes: float, clients: int, seed: int, directory: Path, console
             life.process.kill()
             await life.process.wait()
     bad, explained = logged(directory)
-    errors += bad + [f"player {player.number}: {what}" for player in players for what in player.unexplained]
+    errors += bad + [f"player {player.number}: {what}" for player in players for what in wrongs(player)]
+    errors += [f"walker {walker.number}: {what}" for walker in walkers for what in wrongs(walker)]
     for player in players:
         counts.update(player.counts)
     lost = lost_edits(directory / "data", cells)
@@ -266,6 +285,11 @@ async def soak(minutes: float, clients: int, seed: int, directory: Path, console
             "snapshots_due": due,
             "worst_player_share": round(shares[0], 5) if shares else 0.0,
             "players_playing_median": statistics.median(playing) if playing else 0,
+            "inputs_used": sum(player.used for player in everybody),
+            "stuck_s_max": round(max(player.progress.stuck_s for player in everybody), 2),
+            "walkers": len(walkers),
+            "blocks_walked_least": round(min(walker.walked for walker in walkers), 1),
+            "walkers_events": dict(sum((walker.counts for walker in walkers), Counter[str]())),
             "edits_done": cells.verdicts[0],
             "edits_by_verdict": dict(sorted(cells.verdicts.items())),
             "blocks_checked": len(cells.settled),
@@ -277,6 +301,12 @@ async def soak(minutes: float, clients: int, seed: int, directory: Path, console
             "lost": lost[:50],
         },
     }
+
+
+def wrongs(player: Honest | Walker) -> list[str]:
+    """What went wrong for a player."""
+    stuck_s = player.progress.stuck_s
+    return player.unexplained + ([f"stuck for {stuck_s:.1f} s"] if stuck_s > STUCK_S_MAX else [])
 
 
 def lost_edits(data: Path, cells: Cells) -> list[str]:
@@ -299,12 +329,17 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--json", type=Path, metavar="OUT", help="write the figures to this file")
     args = parser.parse_args(argv)
     console = Console()
+    for number in (signal.SIGINT, signal.SIGTERM):  # the server ends as well
+        signal.signal(number, signal.default_int_handler)
     with tempfile.TemporaryDirectory() as directory:
         try:
             found = asyncio.run(soak(args.minutes, args.clients, args.seed, Path(directory), console))
         except CannotStartError as error:
             console.print(f"error: {error}", style="red", highlight=False, markup=False)
             return 2
+        except KeyboardInterrupt:
+            print("stopped", file=sys.stderr)
+            return 130
     if args.json is not None:
         args.json.write_text(json.dumps(found, indent=2) + "\n", "utf-8")
     console.print_json(json.dumps(found))

@@ -1,6 +1,7 @@
 """A real server process under test: its streams, its pages, its end."""
 
 import json
+import math
 import os
 import queue
 import re
@@ -15,12 +16,19 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from client_sdk.client import Client
+from client_sdk.events import Event
 from server.process import COMPILING
+from shared.checks import Vec
 
 ROOT = Path(__file__).resolve().parents[2]
 START_S = 90.0
 """Compiling the kernel for the first time takes its time."""
 END_S = 10.0
+RECOVERY_S = 2.0
+"""A player moves again within this time after a stall or a return."""
+MOVING_BLOCKS = 1.0
+"""The way that a player who walks covers at least in two seconds, also on a busy machine; it is 6 blocks otherwise."""
 UPGRADE = (
     b"GET / HTTP/1.1\r\nHost: x\r\nConnection: Upgrade\r\nUpgrade: websocket\r\n"
     b"Sec-WebSocket-Version: 13\r\nSec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\n\r\n"
@@ -138,3 +146,32 @@ def page(address: tuple[str, int], path: str) -> str:
 def stats(address: tuple[str, int]) -> dict[str, Any]:
     found: dict[str, Any] = json.loads(page(address, "/stats"))
     return found
+
+
+class Strider:
+    """Plays a client in a game's loop: it walks in circles and jumps, all the time."""
+
+    def __init__(self, client: Client) -> None:
+        self.client = client
+        self.events: list[Event] = []
+        self._place: Vec | None = None
+
+    def plays(self, seconds: float = 0.0, until: Callable[[], bool] = lambda: True) -> float:
+        """Plays for so long, and until something is true.
+
+        Returns:
+            The blocks that the player has walked meanwhile, as the server tells it.
+        """
+        walked, began = 0.0, time.monotonic()
+        while (now := time.monotonic()) < began + seconds or not until():
+            assert now < began + seconds + START_S, self.events
+            self.events += self.client.poll()
+            self.client.set_input(math.cos(2 * now), math.sin(2 * now), jump=True)
+            self.client.update()
+            prediction, entity = self.client.core.prediction, self.client.entity
+            if prediction is not None and entity in prediction.confirmed:
+                place = prediction.confirmed.position(entity)
+                walked += 0.0 if self._place is None else math.dist(place, self._place)
+                self._place = place
+            time.sleep(0.005)
+        return walked

@@ -2,9 +2,9 @@
 
 import asyncio
 import contextlib
+import math
 import subprocess
 import sys
-import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -14,6 +14,10 @@ from client_sdk.client import Client
 from client_sdk.events import Disconnected, Event, Joined, Left, Resumed
 from client_sdk.transports.aio import AsyncClient
 from tests.client_sdk.servers import ROOT
+from tests.e2e.processes import MOVING_BLOCKS, RECOVERY_S, Strider
+
+sys.path.insert(0, str(ROOT / "scripts"))
+from _walkers import walk
 
 pytestmark = pytest.mark.e2e
 COMMAND = (sys.executable, "-m", "server", "--host", "127.0.0.1", "--scene", "flat", "--log-level", "warning")
@@ -37,54 +41,47 @@ def port_of(url: str) -> int:
     return int(url.rpartition(":")[2])
 
 
-def poll(client: Client, events: list[Event], wanted: type[Event]) -> None:
-    """Plays until something has happened."""
-    until = time.monotonic() + 30
-    while not any(isinstance(event, wanted) for event in events):
-        assert time.monotonic() < until, events
-        events += client.poll()
-        client.set_input(1, 0)
-        client.update()
-        time.sleep(0.005)
+def happened(player: Strider, wanted: type[Event]) -> bool:
+    return any(isinstance(event, wanted) for event in player.events)
 
 
 def test_a_client_in_a_games_loop_survives_its_server(tmp_path: Path) -> None:
-    events: list[Event] = []
     with server(tmp_path) as (process, url):
         client = Client.connect(url, name="Ann")
-        poll(client, events, Joined)
+        player = Strider(client)
+        player.plays(until=lambda: happened(player, Joined))
         me = client.entity
-        until = time.monotonic() + 2  # on disk by then
-        while time.monotonic() < until:
-            events += client.poll()
-            client.update()
-            time.sleep(0.005)
+        assert player.plays(seconds=2) > MOVING_BLOCKS  # on disk by then
         process.kill()
-        poll(client, events, Disconnected)
+        player.plays(until=lambda: happened(player, Disconnected))
         assert client.away
         assert client.view().me is not None, "there is something to draw all the time"
     with server(tmp_path, port_of(url)):
-        poll(client, events, Resumed)
+        player.plays(until=lambda: happened(player, Resumed))
         assert (client.entity, client.playing) == (me, True)
-        assert not any(isinstance(event, Left) for event in events)
+        player.plays(seconds=RECOVERY_S)
+        used = client.stats.inputs_used
+        assert player.plays(seconds=2) > MOVING_BLOCKS
+        assert client.stats.inputs_used > used
+        assert not happened(player, Left)
         client.close()
 
 
 def test_a_client_gives_up_after_its_patience(tmp_path: Path) -> None:
-    events: list[Event] = []
     with server(tmp_path) as (_, url):
         client = Client.connect(url, patience_s=1.0)
-        poll(client, events, Joined)
-    poll(client, events, Left)
+        player = Strider(client)
+        player.plays(until=lambda: happened(player, Joined))
+    player.plays(until=lambda: happened(player, Left))
     assert client.closed
-    assert any(isinstance(event, Disconnected) for event in events)
+    assert happened(player, Disconnected)
 
 
 async def test_a_client_in_an_event_loop_survives_its_server(tmp_path: Path) -> None:
     loop = asyncio.get_running_loop()
     with contextlib.ExitStack() as first:
         process, url = await loop.run_in_executor(None, first.enter_context, server(tmp_path))
-        client = await AsyncClient.connect(url, name="Ann")
+        client = await AsyncClient.connect(url, name="Ann", before_update=walk)
         seen: list[Event] = []
 
         async def until(wanted: type[Event]) -> None:
@@ -103,5 +100,15 @@ async def test_a_client_in_an_event_loop_survives_its_server(tmp_path: Path) -> 
         await loop.run_in_executor(None, second.enter_context, server(tmp_path, port_of(url)))
         await until(Resumed)
         assert client.entity == me
+        await asyncio.sleep(RECOVERY_S)
+        used, way, place = client.stats.inputs_used, 0.0, client.view().me
+        for _ in range(20):
+            await asyncio.sleep(0.1)
+            before, place = place, client.view().me
+            assert before is not None
+            assert place is not None
+            way += math.dist(before.position, place.position)
+        assert client.stats.inputs_used > used
+        assert way > MOVING_BLOCKS
         await client.close()
         assert not any(isinstance(event, Left) for event in seen)

@@ -71,6 +71,9 @@ class Editor:
         self.own: list[Cell] = []
         self.waiting: dict[int, tuple[Cell, int]] = {}
         self.told: list[int] = []
+        self.used = 0
+        """Inputs that the server has used, over all lives."""
+        self.places: set[int] = set()
 
     async def play(self, address: tuple[str, int]) -> None:
         """Until the connection ends."""
@@ -95,6 +98,8 @@ class Editor:
         self.own, self.waiting = [], {}
 
     def hear(self, snapshot: Snapshot) -> None:
+        self.used += snapshot.fates.count(messages.USED)
+        self.places |= {state[X] for state in self.states(snapshot) if state[ID] == self.entity}
         if not self.own:
             (state,) = [state for state in self.states(snapshot) if state[ID] == self.entity]
             x, y, z = (part // BLOCK for part in state[X : X + 3])
@@ -175,6 +180,9 @@ def test_nothing_that_a_client_was_told_is_lost_in_fifty_kills(tmp_path: Path) -
     assert early == KILLS // 5
     assert sum(editor.returns for editor in editors) > BOTS * KILLS // 2
     assert cells.done > 10 * KILLS, (cells.done, cells.refused)
+    for editor in editors:  # they walk to and fro, in every life that they see
+        assert editor.used > KILLS
+        assert len(editor.places) > KILLS // 5, "a place is told where it turns"
 
 
 async def one_life(

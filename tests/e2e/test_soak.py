@@ -14,6 +14,7 @@ from tests.worlds import build, floor
 
 sys.path.insert(0, str(ROOT / "scripts"))
 import _soakers
+import _walkers
 import soak
 
 MINUTES = 0.25
@@ -37,6 +38,9 @@ def test_everything_at_once_loses_no_edit_and_leaves_no_error_unexplained(tmp_pa
     assert details["counts"]["kill"] == details["counts"]["stall"] == details["counts"]["abuse"] == 1
     assert details["counts"]["came back"] > 0
     assert details["blocks_checked"] > 0
+    assert details["inputs_used"] > 0.5 * details["snapshots_due"]
+    assert details["stuck_s_max"] <= soak.STUCK_S_MAX
+    assert details["blocks_walked_least"] > 5
 
 
 def test_an_edit_that_was_told_and_is_not_there_is_found() -> None:
@@ -64,6 +68,14 @@ def test_what_a_log_holds_is_explained_or_not(tmp_path: Path) -> None:
     bad, explained = soak.logged(tmp_path)
     assert [line.partition(": ")[2] for line in bad] == [lines[2], "Traceback (most recent call last):"]
     assert explained == {"the event loop has stalled": 1}
+
+
+def test_a_player_who_was_stuck_is_an_error() -> None:
+    walker = _walkers.Walker(0, 0)
+    assert soak.wrongs(walker) == []
+    walker.progress.stuck_s = soak.STUCK_S_MAX + 0.5
+    walker.unexplained.append("left")
+    assert soak.wrongs(walker) == ["left", "stuck for 1.5 s"]
 
 
 def test_a_course_has_one_of_each_at_least_and_a_quiet_end() -> None:
