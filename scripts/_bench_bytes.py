@@ -1,7 +1,7 @@
-"""What one client is sent while so many entities move in its view, at 20 Hz; `bench.py bytes` runs it.
+"""`bench.py bytes`: the bytes that the server sends to one client while N entities move in its view, at 20 Hz.
 
-A whole game core and a whole client core in one process and in simulated time, joined by a wire that loses nothing and
-takes no time. The client's copy of what it sees is compared with the server's world after every tick, bit by bit.
+A game core and a client core run in one process and in simulated time, joined by a perfect link without latency. After
+every tick, the client's copy of the entities in its view is compared with the server's world, bit by bit.
 """
 
 import random
@@ -23,13 +23,13 @@ from shared.world import OverlapError, World
 
 RATE = 20
 SETTLE_TICKS = 120
-"""Nothing is counted before: the client joins, terrain comes in, walkers fall to the ground."""
+"""Ticks before the count starts: the client joins and receives terrain, and the walkers fall to the ground."""
 REACH = 36.0
-"""Walkers turn back when they are so many blocks from the player, along an axis: all stay in view."""
+"""Distance from the player, in blocks along an axis, at which walkers turn back. They all stay in view."""
 
 
 class Wire:
-    """The server's link to the client: what is sent lies here, and what it is as WebSocket frames is counted."""
+    """The server's link to the client: keeps the messages, and counts their bytes as WebSocket frames."""
 
     def __init__(self) -> None:
         self.messages: list[bytes] = []
@@ -47,7 +47,7 @@ class Wire:
 
 
 class Restless:
-    """The worst case: another direction in every tick, and jumps."""
+    """The worst case of a policy: a new direction in every tick, and jumps."""
 
     def __init__(self, rng: random.Random) -> None:
         self._random = rng
@@ -65,7 +65,7 @@ MOTIONS: dict[str, Callable[[random.Random], Policy]] = {
 
 
 class Scenery:
-    """A player in the middle of so many entities, which the server moves; they join when the player has."""
+    """A player amid `entities` that the server moves. They appear once the player has joined."""
 
     def __init__(self, motion: str, entities: int, seed: int, *, compiled: bool | None = None) -> None:
         self.entities, self.motion, self.rng = entities, MOTIONS[motion], random.Random(seed)
@@ -77,7 +77,7 @@ class Scenery:
         self.centre = (0.0, 0.0, 0.0)
         self.moved: dict[int, Policy] = {}
         self.server_s = self.client_s = 0.0
-        """CPU time of all ticks."""
+        """CPU time of the server's and of the client's share of all ticks."""
 
     def tick(self) -> None:
         game, now = self.game, self.game.world.tick / RATE
@@ -98,7 +98,7 @@ class Scenery:
             game.receive(self.session, message, now + 0.5 / RATE)
 
     def seen(self, rows: Int64s) -> Int64s:
-        """Those that lie in the segments which the client sees."""
+        """Returns the rows that lie in the segments which the client sees."""
         sees: set[Cell] = self.session.sight.sees
         cells = (rows[:, X : X + 3] >> TO_SEGMENT).tolist()
         seen: Int64s = rows[np.array([tuple(cell) in sees for cell in cells], bool)]
@@ -116,7 +116,7 @@ class Scenery:
                 continue
 
     def _homewards(self, entity: int, wish: Input) -> Input:
-        """The wish, turned around where it leads out of the view."""
+        """Returns the input, with each axis reversed along which it leads out of the view."""
         x, y = (
             -part if abs(at - middle) > REACH and (at - middle) * part > 0 else part
             for part, at, middle in zip(wish[:2], self.game.world.position(entity), self.centre, strict=False)
@@ -125,7 +125,7 @@ class Scenery:
 
 
 def run(motion: str, entities: int, ticks: int, seed: int, *, compiled: bool | None = None) -> dict[str, Any]:
-    """One client for so many ticks among so many entities; `differing`: ticks in which its copy was not exact."""
+    """Returns the figures of one client. `differing` is the number of ticks in which its copy was not exact."""
     scenery = Scenery(motion, entities, seed, compiled=compiled)
     for _ in range(SETTLE_TICKS):
         scenery.tick()

@@ -1,4 +1,4 @@
-"""`bench.py server`: the searches of `_bench_server.py`, one after the other, and their table."""
+"""`bench.py server`: runs the searches of `_bench_server.py` one after the other, and prints their table."""
 
 import argparse
 import os
@@ -22,7 +22,7 @@ def run(args: argparse.Namespace, console: Console) -> tuple[dict[str, Any], int
 
     without_picows = lacking("picows")
     if without_picows:
-        console.print(f"the rows of picows are left out: {without_picows}", highlight=False, soft_wrap=True)
+        console.print(f"no rows for picows: {without_picows}", highlight=False, soft_wrap=True)
 
     def report(stage: dict[str, Any]) -> None:
         console.print(
@@ -51,7 +51,7 @@ def run(args: argparse.Namespace, console: Console) -> tuple[dict[str, Any], int
             first = most if args.quick else 1000  # more than the game holds
             echoed = server.search(running, first, seconds, resolution, 1 if args.quick else steps, report)
         if not without_picows:
-            console.print("  the same on picows, which no game is played over: what another library could gain")
+            console.print("  the same on picows, without a game: the bound of another library")
             with server.rig(server.ECHO_PICOWS, str(size), seed=number + 1) as running:
                 first = most // 4 if args.quick else 1000
                 picows = server.search(running, first, seconds, resolution, 1 if args.quick else steps, report)
@@ -77,12 +77,12 @@ def run(args: argparse.Namespace, console: Console) -> tuple[dict[str, Any], int
         )
     console.print(capacity_table(runs, bounds))
     if max(run["load_before"] for run in runs) > cores / 2:
-        console.print("other processes were at work: the numbers of clients are too low, go by the CPU time")
+        console.print("other processes were busy: the numbers of clients are too low, use the CPU time instead")
     return {"quick": args.quick, "rate": server.RATE, "cores": cores, "runs": runs + bounds}, 0
 
 
 def bound(stages: list[dict[str, Any]]) -> dict[str, Any]:
-    """What a server that only echoes comes to."""
+    """Returns the figures of a server that only echoes, which are the bound for a game."""
     most = server.most(stages)
     cpu_us = statistics.median(stage["cpu_us_per_client_tick"] for stage in stages)
     return {
@@ -93,7 +93,7 @@ def bound(stages: list[dict[str, Any]]) -> dict[str, Any]:
 
 
 def run_crowd(args: argparse.Namespace, console: Console, seconds: float) -> tuple[dict[str, Any], int]:
-    """So many players in one segment, each seeing all."""
+    """Measures `--crowd` players in one segment, each of whom sees all others."""
     with server.rig("game", capacity=args.crowd, per_segment=args.crowd) as running:
         stage = server.packed(running.hold(args.crowd, seconds))
     made = Table("figure", title=f"server: {args.crowd} players in one segment, 30 Hz")
@@ -115,7 +115,7 @@ def run_crowd(args: argparse.Namespace, console: Console, seconds: float) -> tup
 
 
 def capacity_table(runs: list[dict[str, Any]], bounds: list[dict[str, Any]]) -> Table:
-    made = Table("figure", title="server: 30 Hz, one process; each search apart")
+    made = Table("figure", title="server: 30 Hz, one process; a column per search")
     for number in range(len(runs)):
         made.add_column(f"search {number + 1}", justify="right")
     for name, form in (

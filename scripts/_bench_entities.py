@@ -1,7 +1,7 @@
-"""A large world: 100,000 entities, a tenth of them walking, and clients that join it; `bench.py entities` runs it.
+"""`bench.py entities`: a large world of 100,000 entities, a tenth of which walk, and clients that join it.
 
-In process and without sockets, so the time is that of the cores alone: CPU time per tick, which others on the machine
-hardly touch. Walkers hold a heading for about a second, as the wandering bots do.
+It runs in one process and without sockets, so it measures only the cores. The figures are CPU time per tick, on which
+other processes have little influence. Walkers keep a direction for about a second, as the wandering bots do.
 """
 
 import gc
@@ -25,11 +25,11 @@ RATE = 30
 SIDE = 48
 """Segments along one side of the world."""
 WALKS = 10
-"""One entity in so many walks."""
+"""Number of entities per entity that walks."""
 
 
 def wide(clients: int) -> Scene:
-    """Hills, 1,536 blocks along each side, with a spawn for each client."""
+    """Returns a scene of hills, 1,536 blocks along each side, with a spawn point for each client."""
     rng = random.Random(1)
     spawns = [[rng.randrange(8, SIDE * SEGMENT - 8), rng.randrange(8, SIDE * SEGMENT - 8), 28] for _ in range(clients)]
     table: dict[str, Any] = load_scene("hills").to_table()
@@ -37,7 +37,7 @@ def wide(clients: int) -> Scene:
 
 
 class Large:
-    """The game, its walkers and its clients."""
+    """The game with its walkers and clients."""
 
     def __init__(self, entities: int, clients: int, seed: int) -> None:
         self.rng = random.Random(seed)
@@ -67,7 +67,7 @@ class Large:
             self.sessions.append(session)
 
     def ticks(self, n: int) -> list[float]:
-        """The CPU time of each, in seconds."""
+        """Runs `n` ticks. Returns the CPU time of each, in seconds."""
         times: list[float] = []
         for _ in range(n):
             self.now += 1 / RATE
@@ -83,10 +83,10 @@ class Large:
 
 
 def run(entities: int, clients: int, seed: int) -> dict[str, Any]:
-    """CPU time per tick in ms, before, while and after the clients join."""
+    """Returns the CPU time per tick in ms, before, while and after the clients join."""
     large = Large(entities, clients, seed)
     gc.collect()
-    gc.freeze()  # as the server does when it has started
+    gc.freeze()  # as the server does after its start
     before = large.ticks(2 * RATE)
     large.join(clients)
     joining = large.ticks(clients // large.game.limits.joins_per_tick + 8)

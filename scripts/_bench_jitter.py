@@ -1,10 +1,10 @@
-"""`bench.py jitter`: how late ticks begin and how long they take, with garbage collection and event loop as in the
-product, and otherwise.
+"""`bench.py jitter`: how late ticks begin and how long they take, for variants of garbage collection and event loop.
 
-A server process under steady load from lean clients; one for each variant in turn, and the turns repeated, so that what
-others do on the machine meets all of them. In the product what is there after the start is frozen: no collection looks
-at it again. Lateness is by the clock: it includes what others did. All other times are
-CPU time of the server's thread. Quantiles are of the samples of all rounds put together.
+Each round starts a server process per variant, in turn, under steady load from simple clients. The rounds are repeated,
+so that other work on the machine affects all variants alike. The product freezes all objects that exist after the
+start, so that no collection visits them again. Lateness is measured by the clock and includes the effect of other
+processes. All other times are CPU time of the server's thread. Quantiles are taken over the samples of all rounds
+together.
 """
 
 import argparse
@@ -37,23 +37,23 @@ FIGURES = {
     "cpu_us_per_client_tick": ("us/client and tick", 1.0, "{:.1f}"),
     "rss_mb": ("memory in MB", 1.0, "{:.0f}"),
 }
-"""Title, factor and form."""
+"""Title, factor and format of each figure."""
 Figures = dict[str, Any]
 
 
 def measure(kind: str, clients: int, seconds: float, seed: int) -> Figures:
-    """One round of one variant."""
+    """Runs one round of one variant. Returns its figures."""
     with server.rig(kind, seed=seed, capacity=clients) as running:
         held = running.hold(clients, seconds)
         return held | {
-            "full_collection_ms": running.collect() * 1e3,  # so rare that no round of some seconds has one
+            "full_collection_ms": running.collect() * 1e3,  # too rare to occur within a round of a few seconds
             "collections_cpu_share": held["collections_cpu_s"] / held["seconds"],
             "collections_per_s": held["collections"] / held["seconds"],
         }
 
 
 def summary(rounds: list[Figures]) -> Figures:
-    """What a variant comes to: quantiles over all rounds, with the least and the most of those of each."""
+    """Returns a variant's figures: quantiles over the samples of all rounds, and those of each round."""
     found: Figures = {}
     for name in TIMES:
         counts: Counter[int] = Counter()
@@ -72,7 +72,7 @@ def run(args: argparse.Namespace, console: Console) -> tuple[dict[str, Any], int
     rounds, seconds = (1, 3.0) if args.quick else (args.rounds, 10.0)
     stages: dict[str, list[Figures]] = {kind: [] for kind in VARIANTS}
     for number in range(rounds):
-        turn = number % len(VARIANTS)  # nobody is always the first, when the machine may be cooler
+        turn = number % len(VARIANTS)  # another variant is the first in each round, when the machine may be cooler
         for kind in [*VARIANTS][turn:] + [*VARIANTS][:turn]:
             stages[kind].append(measure(kind, args.clients, seconds, number + 1))
             console.print(f"round {number + 1} of {rounds}: {VARIANTS[kind]}", highlight=False)

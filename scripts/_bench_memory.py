@@ -1,6 +1,7 @@
-"""What a connection, an entity and a loaded segment take in the server, and that nothing stays behind of what is gone.
+"""Memory of a connection, an entity and a loaded segment in the server, and a check that it is freed afterwards.
 
-Counted by tracemalloc (Python's objects and numpy's arrays, not the allocator's slack), in process: without sockets.
+Counted by tracemalloc, which sees Python's objects and numpy's arrays but not the allocator's slack. It runs in one
+process, without sockets.
 """
 
 import gc
@@ -25,14 +26,14 @@ CLIENTS = 200
 
 
 def wide() -> Scene:
-    """Hills, 384 blocks along each side."""
+    """Returns a scene of hills, 384 blocks along each side."""
     table: dict[str, Any] = load_scene("hills").to_table()
     middle = SIDE * SEGMENT / 2
     return Scene.from_table(table | {"size": [SIDE, SIDE, 1], "spawns": [[middle, middle, 28.0]], "tick_rate": 30})
 
 
 class Sink:
-    """A link that takes everything."""
+    """A link that discards all messages."""
 
     def send(self, message: bytes) -> None:
         pass
@@ -45,7 +46,7 @@ class Sink:
 
 
 class Played:
-    """A game that ticks, its clients and its time."""
+    """A game with its clients and its time."""
 
     def __init__(self) -> None:
         self.game = Game(wide(), limits=Limits(resume_s=0.0, joins_per_tick=1000))
@@ -75,7 +76,7 @@ class Played:
         self.clients.clear()
 
     def churn(self) -> None:
-        """Clients come and go, entities live and die, segments are unloaded and loaded again."""
+        """Runs a cycle: clients join and leave, entities appear and are removed, a segment is unloaded and loaded."""
         game, side = self.game, SIDE * SEGMENT
         self.join(20)
         made = [game.world.spawn("player", (4 + 3 * i % (side - 8), 9.5, 28.0)) for i in range(100)]
@@ -89,24 +90,24 @@ class Played:
         game.world.unload_segment(corner)
         self.tick(5)
         game.world.load_segment(corner, generate(game.scene.terrain, corner))
-        self.tick(100)  # as many as are remembered, and more
+        self.tick(100)  # more ticks than the server keeps in any history
 
 
 def held() -> int:
-    """Bytes in use."""
+    """Returns the bytes in use."""
     gc.collect()
     return tracemalloc.get_traced_memory()[0]
 
 
 def cost(n: int, act: Callable[[], Any]) -> float:
-    """Bytes that stay in use for each of the `n` things that `act` makes."""
+    """Returns the bytes that stay in use for each of the `n` things that `act` makes."""
     before = held()
     act()
     return (held() - before) / n
 
 
 def costs() -> dict[str, float]:
-    """Bytes per segment, per entity that has moved and rests, and per connection with its entity, which walks."""
+    """Returns the bytes per segment, per entity that has moved and rests, and per connection with a walking entity."""
     played = Played()
     world = played.game.world
     side = SIDE * SEGMENT - 8
@@ -133,7 +134,7 @@ def costs() -> dict[str, float]:
 
 
 def churn(cycles: int) -> list[int]:
-    """Bytes in use after each cycle."""
+    """Returns the bytes in use after each cycle."""
     played, after = Played(), []
     for _ in range(cycles):
         played.churn()
@@ -142,7 +143,7 @@ def churn(cycles: int) -> list[int]:
 
 
 def run(cycles: int) -> dict[str, Any]:
-    """All of it."""
+    """Returns all figures of the benchmark."""
     tracemalloc.start()
     try:
         return {**costs(), "bytes_after_each_cycle": churn(cycles)}
@@ -151,5 +152,5 @@ def run(cycles: int) -> dict[str, Any]:
 
 
 def above() -> list[Cell]:
-    """Segments above those of the scene."""
+    """Returns the segments above those of the scene."""
     return [(x, y, 1) for x in range(SIDE) for y in range(SIDE)]

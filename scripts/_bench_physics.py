@@ -1,4 +1,4 @@
-"""What `bench.py physics` measures. Every function returns samples in seconds per unit, taken in turn."""
+"""The measurements of `bench.py physics`. Every function returns samples in seconds per unit, taken in turn."""
 
 import time
 from collections.abc import Callable
@@ -16,14 +16,14 @@ from shared.world import World
 
 WALKERS = 10_000
 TICKS = 2
-"""One sample is the mean of so many ticks: short ones, so that most are not interrupted."""
+"""Ticks per sample. A sample is short, so that most are not interrupted by other processes."""
 ROUNDS_PER_WISH = 5
 
 Found = tuple[Samples, dict[str, Any]]
 
 
 def _run(world: World, ticks: int = TICKS) -> float:
-    """Entity-steps done; an awake entity is one, a sleeper is none."""
+    """Steps a world. Returns the number of entity-steps: one per tick and awake entity, none for a sleeping one."""
     turns = 0
     for _ in range(ticks):
         turns += world.awake_count
@@ -38,7 +38,7 @@ def _run_in_c(world: World, ticks: int = TICKS) -> float:
 
 
 def walk(rounds: int, *, pairs: bool) -> Found:
-    """10,000 walkers on hills, all awake: the product beside the same step in C, and their hashes."""
+    """Measures 10,000 walkers on hills, all awake: the product and the same step in C. Compares their hashes."""
     ours = crowd(hills(pairs=pairs), WALKERS, compiled=True)
     worlds, work = [ours], {"ours": lambda: _run(ours)}
     if _step_c.available():
@@ -57,7 +57,7 @@ def walk(rounds: int, *, pairs: bool) -> Found:
 
 
 def rest(rounds: int) -> Samples:
-    """10,000 sleepers: the whole tick, shared among them."""
+    """Measures 10,000 sleeping entities: the time of a whole tick, divided by their number."""
     world = crowd(hills(), WALKERS, compiled=True)
 
     def tick() -> float:
@@ -69,7 +69,7 @@ def rest(rounds: int) -> Samples:
 
 
 def million(rounds: int, count: int = 1_000_000) -> Found:
-    """A million solid entities on a hill-side of 2 x 2 km, one per cent of them walking: seconds per tick."""
+    """Measures a million solid entities on 2 x 2 km of hills, one per cent of which walk, in seconds per tick."""
     start = time.perf_counter()
     world = crowd(hills(64), count, compiled=True)
     seconds = time.perf_counter() - start
@@ -88,7 +88,7 @@ def million(rounds: int, count: int = 1_000_000) -> Found:
 
 
 def scenes(rounds: int) -> Samples:
-    """The same walkers on one plain, and what each thing that a scene leaves out saves."""
+    """Measures 10,000 walkers on a plain, and how much each ability that a scene leaves out saves."""
     full = Scene("plain", size=(16, 16, 1))
     alone = replace(full, entity_collision=False)
     weightless = replace(alone, gravity=0.0)
@@ -110,7 +110,7 @@ def _task(world: World) -> Callable[[], float]:
 
 
 def edits(rounds: int) -> Samples:
-    """A block set and removed, in the air and under a sleeper, and a cube of 8 x 8 x 8 filled and cleared."""
+    """Measures setting a block in the air and below a sleeping entity, and filling a cube of 8 x 8 x 8 blocks."""
     world = crowd(hills(), WALKERS, compiled=True)
     x, y, z = (int(part // 1) for part in world.position(1))
 
@@ -133,7 +133,7 @@ def edits(rounds: int) -> Samples:
 
 
 def obstacles(rounds: int) -> Found:
-    """Is anything solid in this box? Dense cells beside greedily merged xy slabs, and one edit of each."""
+    """Measures look-ups of solid blocks in a box, and edits: dense cells against greedily merged xy slabs."""
     world = crowd(hills(4), 4, compiled=True)
     slabs = Slabs.of(world.blocks)
     boxes = boxes_on(world, 20_000)
@@ -163,7 +163,7 @@ def obstacles(rounds: int) -> Found:
 
 
 def calls(rounds: int) -> Samples:
-    """What a client pays per call, with 50 players around it in 27 segments; and a turn without Numba."""
+    """Measures a client's calls, with 50 players around it in 27 segments, and an entity-step without Numba."""
     scene = Scene("plain", size=(3, 3, 3), templates=(Template("player", walk_speed=3.0, jump_speed=8.0),))
     nine = replace(scene, size=(3, 3, 1))
     world, plain = crowd(nine, 50, compiled=True), crowd(nine, 50, compiled=False)

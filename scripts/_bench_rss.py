@@ -1,7 +1,7 @@
-"""`bench.py memory`, with sockets: what a server process has in RAM, by connections and under churn.
+"""`bench.py memory` over sockets: the memory (RSS) of a server process, per connection and under churn.
 
-RSS counts all of it: the sockets' buffers in Python, the event loop, what the allocator keeps. It does not count what
-the kernel holds for a socket.
+RSS includes the sockets' buffers in Python, the event loop and the allocator's reserves. It does not include the
+kernel's memory for a socket.
 """
 
 import statistics
@@ -16,9 +16,10 @@ HOLD_S = 3.0
 CHURN_CLIENTS = 100
 LEAVING_PER_S = 10.0
 MARGIN = 6
-"""Segments between the players and the one that is unloaded and loaded."""
+"""Segments between the players and the segment that is unloaded and loaded."""
 SETTLE_S = 30.0
-"""Of churn, until as many come back to nobody as are given up by the server: half of those who leave say nothing."""
+"""Seconds of churn until the number of entities is steady: half of the clients leave without a message, and the server
+keeps their entities for a while."""
 SAMPLE_S = 5.0
 COUNTS = ("joined", "left", "spawned", "removed", "segments_loaded")
 LEVELS = ("clients", "players", "entities", "segments")
@@ -26,7 +27,7 @@ Figures = dict[str, Any]
 
 
 def connections(rounds: int) -> list[float]:
-    """Bytes of RSS per client with its entity: the slope between few and many clients, on a new server each time."""
+    """Returns the bytes of RSS per client with its entity, once per round: the slope from `FEW` to `MANY` clients."""
     found = []
     for seed in range(1, rounds + 1):
         with server.rig("game", seed=seed, capacity=MANY) as running:
@@ -36,10 +37,11 @@ def connections(rounds: int) -> list[float]:
 
 
 def churn(minutes: float, told: Callable[[Figures], None]) -> Figures:
-    """A server in which everything comes and goes.
+    """Measures a server in which clients, entities and segments come and go.
 
     Args:
-        told: called with the figures of each minute, and of the end.
+        minutes: length of the measurement.
+        told: called with the figures of each minute, and with those at the end.
     """
     with server.rig("churn", capacity=CHURN_CLIENTS, margin=MARGIN) as running:
         running.hold(CHURN_CLIENTS, 1.0)
@@ -70,12 +72,12 @@ def churn(minutes: float, told: Callable[[Figures], None]) -> Figures:
 
 
 def sample(first: Figures, now: Figures, minute: float) -> Figures:
-    """What there is, and what has come and gone since the first."""
+    """Returns the current numbers, and how many entities, clients and segments have come and gone since `first`."""
     levels = {name: now[name] for name in ("rss_mb", *LEVELS)}
     return {"minute": round(minute, 2)} | levels | {name: now[name] - first[name] for name in COUNTS}
 
 
 def slope(samples: list[tuple[float, float]]) -> float:
-    """In KB per minute, by least squares."""
+    """Returns the slope of (minute, MB) samples in KB per minute, by least squares."""
     minutes, mb = zip(*samples, strict=True)
     return statistics.linear_regression(minutes, mb).slope * 1e3

@@ -1,8 +1,9 @@
-"""What `bench.py server` measures: how many clients one server process holds, and what a client costs it.
+"""The measurements of `bench.py server`: how many clients one server process holds, and the cost of a client.
 
-A client counts as held if the server's ticks are on time (99 % start less than a tick late) and every single client
-gets at least 95 % of its snapshots. Players fill the hills from a corner on, at a constant density, so one server can
-be asked about many numbers of clients in turn. All times are of one run on one machine, the echo server's too.
+A number of clients is held if the server's ticks are on time (99 % start less than a tick late) and each client gets at
+least 95 % of its snapshots. Players fill the hills from a corner on, at a constant density, so one server can be
+measured with several numbers of clients in turn. All times come from one run on one machine, including those of the
+echo server.
 """
 
 import contextlib
@@ -28,28 +29,30 @@ from sovereign_netcode.stderr import Stderr
 ROOT = Path(__file__).resolve().parent.parent
 RATE = 30
 PER_SEGMENT = 5
-"""Players per segment of 32 x 32 blocks: a client, who sees nine segments or more, sees about 50."""
+"""Players per segment of 32 x 32 blocks. A client sees nine segments or more, so it sees about 50 players."""
 CAPACITY = 2000
 SHARE_MIN = 0.95
 JOINS_PER_S = 200.0
 SETTLE_S = 1.5
-"""After the last join: terrain is delivered, caches are warm."""
+"""Seconds after the last join, in which terrain is delivered and caches warm up."""
 JOIN_S = 5.0
-"""What all the joins may take beyond their pace."""
+"""Seconds that the joins may take beyond `clients / JOINS_PER_S`."""
 PATIENCE_S = 30.0
 START_S = 120.0
 
 ECHO_PICOWS = "echo_picows"
-"""The kind of server that shows what another library's sockets would gain."""
+"""Kind of server that shows what another library's sockets would gain."""
 
 Figures = dict[str, Any]
 
 
 def scene_toml(capacity: int, per_segment: int = PER_SEGMENT, margin: int = 0) -> str:
-    """`hills`, as large as that many players need, with a spawn for each, segment by segment.
+    """Returns the scene `hills` as TOML, large enough for `capacity` players, with a spawn point for each.
+
+    The spawn points fill one segment after the other.
 
     Args:
-        margin: more segments on two sides, where nobody appears.
+        margin: number of further segments on two sides, without spawn points.
     """
     hills = (ROOT / "shared" / "scenes" / "hills.toml").read_text("utf-8")
     rest = "\n".join(line for line in hills.splitlines() if not line.startswith(("#", "size", "spawns")))
@@ -64,11 +67,11 @@ def scene_toml(capacity: int, per_segment: int = PER_SEGMENT, margin: int = 0) -
 
 
 class RigError(Exception):
-    """A process of the benchmark does not do its part; the text says why."""
+    """A process of the benchmark has failed. The message says why."""
 
 
 class Rig:
-    """A server and a generator of load, both processes of their own."""
+    """A server process and a process that generates load."""
 
     def __init__(self, kind: str, scene: Path, *more: str, seed: int = 1) -> None:
         script = ("_echo_picows.py",) if kind == ECHO_PICOWS else ("_busy_server.py", kind)
@@ -85,7 +88,7 @@ class Rig:
         threading.Thread(target=self._listen, daemon=True).start()
 
     def hold(self, clients: int, seconds: float) -> Figures:
-        """So many clients, once they play, for so long: what both sides have counted."""
+        """Waits until `clients` play, then measures for `seconds`. Returns the counts of both sides."""
         self._tell(f"clients {clients}")
         deadline = time.monotonic() + clients / JOINS_PER_S + JOIN_S
         while time.monotonic() < deadline:
@@ -140,16 +143,16 @@ class Rig:
         )}  # fmt: skip
 
     def leaving(self, per_s: float) -> None:
-        """From now on the oldest clients leave at that rate, and others come instead."""
+        """Makes the oldest clients leave from now on, `per_s` per second, each replaced by a new one."""
         self._tell(f"leaving {per_s}")
 
     def collect(self) -> float:
-        """Has the server collect all its garbage; the CPU time of that, in seconds. Not every kind of server can."""
+        """Makes the server collect all its garbage, which not every kind can. Returns the CPU time in seconds."""
         self._server.send_signal(signal.SIGUSR1)
         deadline = time.monotonic() + PATIENCE_S
         while (taken := self.stats()["full_collection_s"]) is None:
             if time.monotonic() > deadline:
-                raise RigError("the server has not collected its garbage")
+                raise RigError(f"the server has not collected its garbage within {PATIENCE_S:g} s")
             time.sleep(0.05)
         return float(taken)
 
@@ -167,7 +170,7 @@ class Rig:
 
     @staticmethod
     def _end(process: subprocess.Popen[str]) -> None:
-        """Waits for a process that ends, and not for long."""
+        """Waits at most `PATIENCE_S` for a process to end, then kills it."""
         try:
             process.wait(PATIENCE_S)
         except subprocess.TimeoutExpired:
@@ -236,7 +239,7 @@ def rig(
 def search(
     running: Rig, first: int, seconds: float, resolution: float, steps: int, report: Callable[[Figures], None]
 ) -> list[Figures]:
-    """What every number of clients gave that was tried on the way to the largest that is held."""
+    """Searches for the largest number of clients that is held. Returns the figures of each number that was tried."""
     stages: list[Figures] = []
     good, bad, n = 0, CAPACITY + 1, first
     while len(stages) < steps and n > 10:
@@ -258,7 +261,7 @@ def search(
 
 
 def packed(stage: Figures) -> Figures:
-    """A crowd's stage by the names of the report; `fairness` is the least served over the best served."""
+    """Adds a crowd's figures under the names of the report. `fairness` is the least served over the best served."""
     return stage | {
         "bytes_per_client_per_s": stage["bytes_down_per_client_per_s"],
         "fairness": stage["snapshots_share_worst"] / max(stage["snapshots_share_best"], 1e-9),
@@ -266,15 +269,15 @@ def packed(stage: Figures) -> Figures:
 
 
 def most(stages: list[Figures]) -> Figures | None:
-    """The stage with the most clients that were held."""
+    """Returns the figures of the largest number of clients that was held; None if none was."""
     return max((stage for stage in stages if stage["held"]), key=lambda stage: stage["clients"], default=None)
 
 
 def profile(clients: int, seconds: float) -> dict[str, float]:
-    """The share of each part in the server's CPU time, by samples of its stack (SIGPROF) in a run apart.
+    """Returns the share of each part in the server's CPU time, by samples of its stack (SIGPROF) in a separate run.
 
-    A signal that comes while sockets are written or read is seen in the next Python code, mostly `receive`: that has
-    the share of the kernel too.
+    A signal that arrives while a socket is written or read is handled in the next Python code, mostly in `receive`. So
+    the share of `receive` includes the kernel's.
     """
     with rig("profile") as running:
         samples: dict[str, float] = running.hold(clients, seconds)["samples"]

@@ -1,14 +1,14 @@
-"""Servers to be measured, as processes of their own; `bench.py server` starts them.
+"""The servers that the benchmarks measure. `bench.py server` and others start them as processes.
 
 _busy_server.py game SCENE         the product
 _busy_server.py profile SCENE      the product, its stack sampled by CPU time; /stats shows the seconds of each part
 _busy_server.py product SCENE      the product; /stats shows the CPU time of its ticks and of garbage collections
-_busy_server.py default SCENE      the same, but what is there after the start is not frozen
-_busy_server.py off SCENE          the same without a collector
-_busy_server.py asyncio SCENE      the same on asyncio's own event loop
-_busy_server.py churn SCENE        the product, in which entities come and go, and segments are unloaded and loaded
-_busy_server.py echo SCENE BYTES   the product's gateway and ticker without a game: the bound. What comes is taken in
-                                   unread; every tick each client is sent a message of so many bytes
+_busy_server.py default SCENE      like "product", but objects are not frozen after the start
+_busy_server.py off SCENE          like "product", without garbage collection
+_busy_server.py asyncio SCENE      like "product", on asyncio's own event loop
+_busy_server.py churn SCENE        the product with rules that add and remove entities and segments all the time
+_busy_server.py echo SCENE BYTES   the product's gateway and ticker without a game: the bound. It ignores inputs, and
+                                   sends each client a message of BYTES bytes in every tick
 """
 
 import asyncio
@@ -49,7 +49,7 @@ from shared.world import World
 
 
 class Echo:
-    """To the gateway and the server it looks like a `Game`."""
+    """A substitute for `Game` in the gateway and the server. It sends messages of a fixed size."""
 
     def __init__(self, scene: str, size: int) -> None:
         self.scene = load_scene(scene)
@@ -112,12 +112,12 @@ DOORS: list[tuple[FunctionType, str]] = [
         (Game.tick, "rest of the tick"),
     )
 ]
-"""The functions by which a part is entered."""
+"""Functions that enter a part of the server, with the name of the part."""
 SAMPLE_S = 0.002
 
 
 class Profile:
-    """How much of this process's CPU time is spent in which part, by samples of the stack."""
+    """A profile of this process: the CPU time spent in each part, by samples of the stack."""
 
     def __init__(self) -> None:
         self.samples = dict.fromkeys([*(part for _, part in DOORS), "event loop"], 0.0)
@@ -132,23 +132,23 @@ class Profile:
             part = self._parts.get(frame.f_code)
             frame = frame.f_back
         now = time.process_time()
-        self.samples[part or "event loop"] += now - self._latest  # in the event loop's C code signals wait and are one
+        self.samples[part or "event loop"] += now - self._latest  # signals during its C code wait and merge
         self._latest = now
 
 
 class Churn(Rules):
-    """In every tick something appears among the players; it lives for `LIFE_S`.
+    """Rules that add an entity among the players in every tick and remove it after `LIFE_S`.
 
-    Every second a segment at the far end of the world is unloaded, and loaded anew half a second later.
+    Every second they unload a segment at the far end of the world, and load it again half a second later.
     """
 
     LIFE_S = 5.0
     AREA = 160
-    """The players' side of the world, in blocks."""
+    """Side of the area with players, in blocks."""
 
     def __init__(self) -> None:
         self.alive: collections.deque[tuple[int, int]] = collections.deque()
-        """Until which tick, and who."""
+        """Entities that these rules have added, each with the tick at which to remove it."""
         self.counts = dict.fromkeys(("spawned", "removed", "segments_loaded"), 0)
 
     def on_tick(self) -> None:
@@ -167,11 +167,11 @@ class Churn(Rules):
             self.counts["segments_loaded"] += 1
 
     world: World
-    """The game's; rules have no business with segments."""
+    """The game's world. Other rules do not load and unload segments, so the game API does not offer it."""
 
 
 class Stopwatch:
-    """CPU time of a game's ticks, of what in them comes before the step, and of each garbage collection."""
+    """Measures the CPU time of a game's ticks, of their part before the step, and of each garbage collection."""
 
     def __init__(self, game: Game) -> None:
         self.ticks, self.before_step, self.collections = Histogram(), Histogram(), Histogram()
@@ -179,7 +179,7 @@ class Stopwatch:
         cast("Any", app).Ticker = lambda rate, tick, *more: Ticker(rate, self._tick, *more)
         self._tick_began = self._collection_began = 0.0
         self.full_collection_s: float | None = None
-        """Of the one that SIGUSR1 has asked for."""
+        """CPU time of the collection that SIGUSR1 requested, in seconds; None until it is done."""
         cast("Any", game.world).step = self._step
         gc.callbacks.append(self._collect)
         signal.signal(signal.SIGUSR1, lambda number, frame: self._collect_all())
@@ -223,11 +223,11 @@ VARIANTS: dict[str, tuple[ModuleType, str, Callable[[], Any]]] = {
     "off": (app, "freeze", gc.disable),
     "asyncio": (process, "loop_factory", lambda: asyncio.new_event_loop),
 }
-"""What the product does otherwise, and what does it instead."""
+"""Function of the product that a variant replaces (module and name), and the replacement."""
 
 
 def in_view(game: Game) -> float:
-    """Entities in the segments that a client sees, on average."""
+    """Returns the average number of entities in the segments that a client sees."""
     cells = game.world.states()[:, X : X + 3] >> TO_SEGMENT
     inhabitants = collections.Counter(map(tuple, cells.tolist()))
     views = [sum(inhabitants[segment] for segment in session.sight.sees) for session in game.sessions]
@@ -235,7 +235,7 @@ def in_view(game: Game) -> float:
 
 
 class Measured(app.Server):
-    """The product's server, with more figures."""
+    """The product's server with more figures in /stats."""
 
     def __init__(self, settings: Settings, game: Game, more: Sequence[Callable[[], dict[str, Any]]]) -> None:
         self._more = more
@@ -246,7 +246,7 @@ class Measured(app.Server):
 
 
 def serve(served: Game, *more: Callable[[], dict[str, Any]]) -> None:
-    """As `python -m server` does, on a port that the system picks, with more figures."""
+    """Runs the server as `python -m server` does, on a free port, with more figures in /stats."""
     settings = Settings(port=0, page=False, log_level="warning")
     log.set_up(settings.log_level, settings.log_format, sys.stderr)
     with asyncio.Runner(loop_factory=process.loop_factory()) as runner:

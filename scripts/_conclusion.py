@@ -1,33 +1,34 @@
-"""The last paragraph of the accuracy report, from the numbers of its run."""
+"""The conclusion of the accuracy report, in words, from the numbers of its run."""
 
 from typing import Any
 
 Row = dict[str, Any]
 
 TEXT = """\
-The product keeps whole steps of 2^-24 block, moves by the mean of two velocities, clamps axis by axis and looks dense \
-cells up: {ns:.0f} ns per step, {record}.
+The product stores positions in whole steps of 2^-24 block, moves by the mean of two velocities, clamps axis by axis \
+and looks blocks up in dense cells: {ns:.0f} ns per step, {record}.
 
-Numbers: the grid's rounding takes {grid_time:.2f} times the time of plain float64, which is inside a block in \
+Numbers: the grid's rounding takes {grid_time:.2f} times the time of plain float64. Plain float64 is inside a block in \
 {double_share:.1%} of the samples, up to {double_depth:.2g} deep, and differs between two compilers \
-{double_corrections:.3g} times per player and minute; float32 ends {single_far:.2g} blocks off at 10^7. The price is \
-that speeds are rounded to 2^-16: {minute:.1e} block after a minute of walking. A grid of 2^-16 takes \
+{double_corrections:.3g} times per player and minute. float32 ends {single_far:.2g} blocks off at 10^7. The price of \
+the grid is that speeds are rounded to 2^-16: {minute:.1e} block after a minute of walking. A grid of 2^-16 takes \
 {coarse_time:.2f} times as long as one of 2^-24, and at 128 Hz a minute ends {coarse_minute:.1e} off \
 ({middle_minute:.1e} with 2^-20, {fast_minute:.1e} with 2^-24).
 
-Integrator: the mean's apex is {apex:.2g} from the closed form, the seed's semi-implicit one {semi_apex:.2g}, for one \
-addition. At 60 Hz, where a tick is no binary fraction, the mean's is {sixty_apex:.1e} off.
+Integrator: the apex of a jump is {apex:.2g} from the closed form with the mean, and {semi_apex:.2g} with the seed's \
+semi-implicit integrator. The mean costs one more addition. At 60 Hz, where a tick is no binary fraction, the mean's \
+apex is {sixty_apex:.1e} off.
 
 Mover: going back along the velocity loses {back_lost:.0%} of the motion along a wall, the clamp {lost:.0%}. A sweep \
-by time of impact loses {impact_lost:.0%}, is inside a block in {impact_share:.1%} of the samples as the clamp is in \
-{share:.1%}, and takes {impact_time:.1f} times as long.
+by time of impact loses {impact_lost:.0%} and takes {impact_time:.1f} times as long; it is inside a block in \
+{impact_share:.1%} of the samples, the clamp in {share:.1%}.
 
 Obstacles: merged slabs take {slab_time:.1f} times as long as cells. Without Numba the product takes {plain_us:.1f} us \
-per step and differs {plain_corrections:g} times."""
+per step, and two machines differ {plain_corrections:g} times per player and minute."""
 
 
 def conclusion(rows: list[Row]) -> str:
-    """Which choice the product makes, and what it costs."""
+    """Returns the text: the choices that the product makes, and their costs."""
 
     def find(group: str, **wanted: object) -> Row:
         return next(row for row in rows if row["group"] == group and all(row[key] == wanted[key] for key in wanted))

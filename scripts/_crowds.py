@@ -1,4 +1,4 @@
-"""Worlds full of walkers for the benchmarks, and a clock that takes turns."""
+"""Worlds with many walkers for the benchmarks, and a timer that measures pieces of work in turn."""
 
 import dataclasses
 import gc
@@ -16,12 +16,12 @@ Samples = dict[str, list[float]]
 
 
 def hills(segments: int = 16, *, pairs: bool = True) -> Scene:
-    """Rolling ground of so many segments squared."""
+    """Returns a scene of hills with `segments` segments along each side."""
     return dataclasses.replace(load_scene("hills"), size=(segments, segments, 1), entity_collision=pairs)
 
 
 def crowd(scene: Scene, count: int, *, compiled: bool | None = None) -> World:
-    """A world with `count` players on a square grid on its ground, all at rest."""
+    """Returns a world with `count` players on a square grid on its ground, all at rest."""
     world = World(scene, compiled=compiled)
     world.load_terrain()
     side = int(np.ceil(np.sqrt(count)))
@@ -37,7 +37,7 @@ def crowd(scene: Scene, count: int, *, compiled: bool | None = None) -> World:
 
 
 def wishes(world: World, seed: int, share: float = 1.0) -> dict[int, Input]:
-    """A random direction for each of the first entities; what they wish for is kept until the next ones."""
+    """Returns random inputs for the first `share` of the entities. A world keeps an input until the next one."""
     ids = sorted(world.states()[:, 0].tolist())
     moves = np.random.default_rng(seed).uniform(-1, 1, (round(share * len(ids)), 2)).tolist()
     return {entity: make_input(x, y) for entity, (x, y) in zip(ids, moves, strict=False)}
@@ -46,9 +46,13 @@ def wishes(world: World, seed: int, share: float = 1.0) -> dict[int, Input]:
 def take_turns(
     work: Mapping[str, Callable[[], float]], rounds: int, between: Callable[[int], None] | None = None
 ) -> Samples:
-    """Times each piece of work once a round, in turn: seconds per unit, of which each says how many it did.
+    """Times each piece of work once per round, in turn. Returns samples in seconds per unit.
 
-    What disturbs the machine for a while disturbs all alike, so that ratios hold.
+    A disturbance of the machine affects all pieces alike, so ratios hold.
+
+    Args:
+        work: functions by name, each of which returns the number of units that it did.
+        between: called with the number of the round before each round.
     """
     samples: Samples = {name: [] for name in work}
     gc.collect()
@@ -58,7 +62,7 @@ def take_turns(
             if between is not None:
                 between(number)
             for name, task in work.items():
-                task()  # warms the caches: the others have used them since
+                task()  # warms the caches, which the other pieces have used meanwhile
                 start = time.perf_counter()
                 units = task()
                 samples[name].append((time.perf_counter() - start) / units)
@@ -68,7 +72,7 @@ def take_turns(
 
 
 def _heights(world: World) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:
-    """The z of the ground in every column of a world one segment high, [y, x]."""
+    """Returns the z of the ground in every column of a world that is one segment high, [y, x]."""
     nx, ny, _ = world.scene.size
     heights = np.zeros((ny * SEGMENT, nx * SEGMENT))
     for i, j, k in world.blocks:

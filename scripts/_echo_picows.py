@@ -1,9 +1,9 @@
-"""What `_busy_server.py echo` is, on picows instead of the product's gateway: the bound of another library's sockets.
+"""The server of `_busy_server.py echo` on picows instead of the product's gateway: the bound of another library.
 
 _echo_picows.py SCENE BYTES
 
-picows parses, answers and writes in C, with a direct `send` where nothing waits; there is no `outstanding`, no door and
-no limit here, so this is the most that a gateway built on it could gain.
+picows parses, answers and writes in C, with a direct `send` while no data waits. This server has no flow control, no
+admission and no limits, so it shows the most that a gateway built on picows could gain.
 """
 
 import asyncio
@@ -33,7 +33,7 @@ BINARY = WSMsgType.BINARY
 
 
 class Listener(WSListener):
-    """One connection, and the link that `Echo` sends over."""
+    """A connection, which is also the link on which `Echo` sends."""
 
     def __init__(self, echo: Echo) -> None:
         super().__init__()
@@ -61,7 +61,7 @@ class Listener(WSListener):
 
 
 async def serve(echo: Echo) -> None:
-    """Until it is killed."""
+    """Serves until the process is killed."""
     loop, started = asyncio.get_running_loop(), time.monotonic()
     ticker = Ticker(echo.scene.tick_rate, echo.tick, loop.stop, lambda ring: best_alarm(loop, ring))
 

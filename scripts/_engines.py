@@ -1,4 +1,4 @@
-"""The rows of the accuracy report as things that step: the product's world, and the variants, behind one face."""
+"""The engines of the accuracy report: the product's world and the variants behind one interface."""
 
 import importlib.util
 import sys
@@ -36,7 +36,7 @@ OBSTACLES = {"cells": _variants.CELLS, "slabs": _variants.SLABS}
 
 @dataclass(frozen=True)
 class Choice:
-    """One row: what is chosen. The defaults are the product's."""
+    """The choices of one row. The defaults are those of the product."""
 
     format: str = "grid 2^-24"
     integrator: str = "mean"
@@ -48,28 +48,28 @@ class Choice:
 
 
 class Engine(Protocol):
-    """Some players, each alone among the blocks."""
+    """Some players, each of whom meets only blocks, and no other player."""
 
     def wish(self, moves: Moves, jumps: npt.NDArray[np.bool_]) -> None:
-        """What all wish from now on: [n, 2] intents of -127..127, and [n] whether to jump."""
+        """Sets the inputs from now on: [n, 2] directions of -127..127, and [n] whether to jump."""
 
     def step(self) -> None: ...
 
     def places(self) -> Floats:
-        """[n, 3] in blocks from the corner of the map."""
+        """Returns the positions [n, 3], in blocks from the corner of the map."""
 
     def boxes(self) -> tuple[Floats, Floats]:
-        """Low and high corners as the engine itself sees them, [n, 3] in blocks."""
+        """Returns the low and high corners of the boxes as the engine itself computes them, [n, 3] in blocks."""
 
     def state(self) -> npt.NDArray[Any]:
-        """[n, m]: what another machine would have to agree about, bit for bit."""
+        """Returns the state [n, m] that must be equal on another machine, bit for bit."""
 
     def correct(self, rows: npt.NDArray[np.bool_], other: "Engine") -> None:
-        """Takes over these rows of another engine of the same kind."""
+        """Copies the state of these rows from another engine of the same kind."""
 
 
 class Variant:
-    """An engine from `_variants`; `fast` is the other machine."""
+    """An engine of `_variants`. `fast` selects the build that stands for another machine."""
 
     def __init__(self, choice: Choice, kinds: Kinds, spots: Floats, shift: int = 0, *, fast: bool = False) -> None:
         self._module = _fast() if fast else _variants
@@ -126,10 +126,10 @@ class Variant:
 
 
 class Product:
-    """The real world of the product."""
+    """The product's own world. `fast` selects the other executor, which stands for another machine."""
 
     def __init__(self, choice: Choice, kinds: Kinds, spots: Floats, shift: int = 0, *, fast: bool = False) -> None:
-        compiled = (choice.executor == "compiled") != fast  # the other machine has the other executor
+        compiled = (choice.executor == "compiled") != fast
         nz, ny, nx = (side // SEGMENT for side in kinds.shape)
         at = shift // SEGMENT
         scene = Scene(
@@ -172,7 +172,7 @@ class Product:
 
     def state(self) -> npt.NDArray[Any]:
         states = self.world.states()
-        states[:, MOVE_X:] = 0  # inputs are told, not computed
+        states[:, MOVE_X:] = 0  # inputs are sent, not computed
         return states[:, FLAGS : VX + 3]
 
     def correct(self, rows: npt.NDArray[np.bool_], other: Engine) -> None:
@@ -186,12 +186,12 @@ def engine(choice: Choice, kinds: Kinds, spots: Floats, shift: int = 0, *, fast:
 
 
 def slabs_of(kinds: Kinds) -> tuple[Moves, Moves]:
-    """The map [z, y, x] merged layer by layer: [n, 4] in cells, and where each layer of each segment begins."""
+    """Merges a map [z, y, x]. Returns the slabs [n, 4] in cells, and where each layer of each segment starts."""
     return Slabs.merged(kinds != 0)
 
 
 def _on(value: float, scale: float) -> float:
-    """`value` in whole steps of 1 / scale; itself for 0."""
+    """Returns `value` rounded to whole steps of 1 / scale; unchanged if `scale` is 0."""
     return rounded(value * scale) / scale if scale else value
 
 

@@ -1,6 +1,6 @@
-"""The repository's own `.venv`, made from hashed pins; standard library only.
+"""The repository's own `.venv`, made from hashed pins. This file needs only the standard library.
 
-Interpreters older than the project supports must be able to run this file: they look for a newer one.
+Interpreters older than the supported ones must be able to run this file, because it looks for a newer one.
 """
 
 from __future__ import annotations
@@ -31,10 +31,10 @@ class Step(NamedTuple):
 
 
 def ensure(requirements: str) -> Path:
-    """Return the Python of an environment that holds at least the pins of `requirements`.
+    """Returns the Python of an environment that has at least the pins of `requirements`. Sets it up if necessary.
 
-    The stamp is absent while a set-up is under way, so an interrupted one is started afresh,
-    whereas changed pins are installed over the old ones.
+    The stamp file is absent while a set-up runs, so a set-up after an interrupted one starts from scratch. Changed pins
+    are installed over the old ones.
     """
     place, installed, digest = _read_stamp()
     usable = place == str(ROOT) and PYTHON.exists()
@@ -45,7 +45,7 @@ def ensure(requirements: str) -> Path:
         return PYTHON
 
     base = _base_python()
-    print(f"setting up {VENV} with what {requirements} pins, once: up to a minute ... ", end="", flush=True)
+    print(f"setting up {VENV} with the pins of {requirements}, once: up to a minute ... ", end="", flush=True)
     started = time.perf_counter()
     if usable:
         STAMP.unlink()
@@ -60,7 +60,7 @@ def ensure(requirements: str) -> Path:
 
 
 def run(title: str, *args: str) -> Step:
-    """Run the environment's Python with `args` in the repository root, its output going where ours goes."""
+    """Runs the environment's Python with `args` in the repository's root. Its output is not captured."""
     print(f"\n== {title}", flush=True)
     started = time.perf_counter()
     status = subprocess.run([str(PYTHON), *args], cwd=ROOT, check=False).returncode
@@ -68,10 +68,10 @@ def run(title: str, *args: str) -> Step:
 
 
 def lacking(module: str) -> str:
-    """What to do about a module that only the development pins hold; empty: it is installed."""
+    """Returns how to install a module that only the development pins have; empty if it is installed."""
     if importlib.util.find_spec(module) is not None:
         return ""
-    return f"{module} is not installed here; `python scripts/test --version` sets it up, with all else for development"
+    return f"{module} is not installed here; `python scripts/test --version` installs everything for development"
 
 
 def _read_stamp() -> tuple[str, str, str]:
@@ -90,12 +90,12 @@ def _digest(requirements: str) -> str:
 def _base_python() -> str:
     names = ("python3.11", "python3.12", "python3.13", "python3.14")
     for candidate in (sys.executable, *filter(None, map(shutil.which, names))):
-        # A version manager's shim may be on PATH without a Python behind it: ask, do not trust the name.
+        # A version manager's shim may be on PATH without a Python behind it, so run it to find out.
         probe = [candidate, "-c", "import sys; sys.exit(sys.version_info < (3, 11))"]
         if subprocess.run(probe, capture_output=True, check=False).returncode == 0:
             return candidate
     version = ".".join(map(str, sys.version_info[:2]))
-    raise _failure(f"Python 3.11 or newer is needed: this is {version}, and PATH has no newer one")
+    raise _failure(f"Python 3.11 or newer is needed; this is {version}, and PATH has no newer one")
 
 
 def _must(*command: str) -> None:

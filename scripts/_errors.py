@@ -1,4 +1,4 @@
-"""What the accuracy report measures of one engine. Nothing here is a constant of the table: all of it is run."""
+"""The measurements of the accuracy report for one engine. Every figure of the table is measured, none is a constant."""
 
 import statistics
 import time
@@ -17,25 +17,25 @@ Moves = npt.NDArray[np.int64]
 
 FLOOR = 8
 FAR = (1_000_000, 10_000_000)
-"""Whole segments away, so that the same map lies there."""
+"""Distances from the origin in blocks: whole segments, so that the same map lies there."""
 
 
 def plain(length: int = 256) -> Kinds:
-    """A floor at z = 8, 32 blocks wide."""
+    """Returns a map with a floor at z = 8, 32 blocks wide."""
     kinds = np.zeros((32, 32, length), np.uint8)
     kinds[:FLOOR] = 1
     return kinds
 
 
 def walled(apart: int = 4, length: int = 128) -> Kinds:
-    """The same with walls across it, one block thick."""
+    """Returns the map of `plain` with walls across it, one block thick."""
     kinds = plain(length)
     kinds[FLOOR : FLOOR + 4, :, ::apart] = 1
     return kinds
 
 
 def ground() -> Kinds:
-    """64 x 64 blocks of the hills, with a few pillars for corners."""
+    """Returns a map of 64 x 64 blocks of the hills, with a few pillars for their corners."""
     kinds = np.zeros((32, 64, 64), np.uint8)
     for j in (0, 1):
         for i in (0, 1):
@@ -50,7 +50,7 @@ def _nothing() -> None:
 
 
 def spots(kinds: Kinds, count: int) -> Floats:
-    """Places on the ground of a map, in the middle of columns, the same for everyone."""
+    """Returns positions on the ground of a map, in the middle of columns, the same for every engine."""
     rng = np.random.default_rng(5)
     x = rng.integers(1, kinds.shape[2] - 1, count)
     y = rng.integers(1, kinds.shape[1] - 1, count)
@@ -58,7 +58,12 @@ def spots(kinds: Kinds, count: int) -> Floats:
 
 
 def play(machines: list[Engine], count: int, ticks: int, each: Callable[[], None], *, jumps: bool = True) -> None:
-    """Everybody walks about, in a new direction every half second or so; all machines are told the same."""
+    """Steps all machines with the same inputs. Each player walks in a new direction about every half second.
+
+    Args:
+        each: called after every step.
+        jumps: whether players jump, too.
+    """
     rng = np.random.default_rng(11)
     moves, hops = np.zeros((count, 2), np.int64), np.zeros(count, np.bool_)
     for tick in range(ticks):
@@ -73,7 +78,7 @@ def play(machines: list[Engine], count: int, ticks: int, each: Callable[[], None
 
 
 def jump(choice: Choice) -> tuple[float, float]:
-    """Errors of the apex, in blocks, and of the time of landing, in ms, beside the closed form at the same ticks."""
+    """Returns a jump's errors against the closed form at the same ticks: the apex in blocks, the landing in ms."""
     it = engine(choice, plain(64), np.array([[32.5, 16.5, FLOOR]]))
     none = np.zeros((1, 2), np.int64)
     for _ in range(3):
@@ -91,7 +96,7 @@ def jump(choice: Choice) -> tuple[float, float]:
 
 
 def minute(choice: Choice) -> float:
-    """The worst error of position after a minute of walking and hopping on a plain, in blocks."""
+    """Returns the worst error of a position, in blocks, after a minute of walking and jumping on a plain."""
     moves = np.array([[127, 0], [101, 53], [-88, 12], [-127, 0], [60, 0], [-17, 1]])
     starts = np.array([[8.5 if x > 0 else 247.5, 2.5, FLOOR] for x, _ in moves.tolist()])
     moves[:, 1] = 0  # along the plain, however wide it is
@@ -106,7 +111,7 @@ def minute(choice: Choice) -> float:
 
 
 def inside(choice: Choice, count: int, ticks: int) -> tuple[float, float]:
-    """The share of samples inside a block, and the worst depth in blocks."""
+    """Returns the share of samples inside a block, and the greatest depth in blocks."""
     kinds = ground()
     it = engine(choice, kinds, spots(kinds, count))
     rectangles, starts = slabs_of(kinds)
@@ -125,7 +130,7 @@ def inside(choice: Choice, count: int, ticks: int) -> tuple[float, float]:
 
 
 def along_walls(choice: Choice) -> float:
-    """The share of the motion along a wall that is lost by pressing into it at 45 degrees: many walls, both sides."""
+    """Returns the share of the motion along a wall that is lost by pressing into it at 45 degrees, over many walls."""
     kinds = walled()
     faces = np.arange(4, 124, 4)
     east = faces - LOW[0] - SIDES[0] - 0.25
@@ -144,7 +149,7 @@ def along_walls(choice: Choice) -> float:
 
 
 def far(choice: Choice, count: int, ticks: int) -> list[float]:
-    """How far from its twin at the origin a player ends up when the whole world lies 10^6 or 10^7 blocks east."""
+    """Returns the greatest change of a final position, in blocks, if the world is 10^6 or 10^7 blocks further east."""
     kinds = ground()
     here = spots(kinds, count)
     machines = [engine(choice, kinds, here, shift) for shift in (0, *FAR)]
@@ -154,7 +159,7 @@ def far(choice: Choice, count: int, ticks: int) -> list[float]:
 
 
 def corrections(choice: Choice, count: int, ticks: int) -> float:
-    """How often, per player and minute, two machines differ in any bit and one must be corrected."""
+    """Returns the number of corrections per player and minute: two machines differ in a bit, and one is corrected."""
     kinds = ground()
     here = spots(kinds, count)
     machines = [engine(choice, kinds, here), engine(choice, kinds, here, fast=True)]
@@ -173,7 +178,7 @@ def corrections(choice: Choice, count: int, ticks: int) -> float:
 
 
 def ns(choices: list[Choice], count: int, rounds: int, ticks: int = 2) -> list[list[float]]:
-    """Nanoseconds per entity-step of every choice, in turns; samples are short, so that most are not interrupted."""
+    """Returns samples of each choice in ns per entity-step, taken in turn; short ones, so that few are interrupted."""
     kinds = ground()
     here = spots(kinds, count)
     machines = [
@@ -196,7 +201,7 @@ def ns(choices: list[Choice], count: int, rounds: int, ticks: int = 2) -> list[l
 
 
 def measure(choice: Choice, *, quick: bool) -> dict[str, float]:
-    """All columns of one row but the time."""
+    """Returns all columns of a row except for the time."""
     count, seconds = (48, 4) if quick else (400, 30)
     ticks = seconds * choice.tick_rate
     if choice.executor == "plain":

@@ -1,16 +1,17 @@
-"""A thousand players in one process, on the wire alone: no prediction, no world, one epoll. For `bench.py server`.
+"""A generator of load for `bench.py server`: a thousand players in one process, without prediction and world.
 
 argument  {"port", "seed", "rate", "joins_per_s"}, as JSON
-stdin     "clients N": have so many; "leaving N": the oldest leaves N times a second, and another one comes; "begin":
-          the window begins; "end": it ends, tell; the end of the pipe: stop
-stdout    a JSON object per line: {"playing", "gone"} at the reports, and the window's figures after "end"
+stdin     a command per line: "clients N": connect or disconnect until there are N; "leaving N": the oldest client
+          leaves N times per second and is replaced; "begin": the window begins; "end": the window ends, report its
+          figures. The end of the pipe: stop
+stdout    a JSON object per line: {"playing", "gone", "clients"} every `REPORT_S`, and the window's figures after "end"
 
-Every client says hello, pings once a second, acknowledges, and sends the input of each tick at a moment of its own
-within the tick, whether or not snapshots come: `LEAD_TICKS` ahead of the server's time. It wanders: a new direction
-about once a second, a jump now and then. Of what comes, heads are read.
+Every client sends a hello, pings once a second, acknowledges, and sends the input of each tick `LEAD_TICKS` ahead of
+the server's time, at its own moment within the tick, whether or not snapshots arrive. It wanders: a new direction about
+once a second, and an occasional jump. It reads only the first bytes of most messages.
 
-Between the slots it sleeps, and does not wait for its sockets: to wake another process up takes the server's time, a
-tenth of it in a virtual machine, and is nothing that clients elsewhere would cost.
+Between the slots the process sleeps instead of waiting for its sockets. Waking another process takes the server's time,
+a tenth of it in a virtual machine. Clients on other machines would not cost that.
 """
 
 import contextlib
@@ -32,12 +33,13 @@ from shared import messages
 from shared.messages import Bye, Hello, Inputs, Ping, decode_from_server, encode
 
 LEAD_TICKS = 2
-"""An input goes out at most so long before the deadline of its tick, and up to a tick later."""
+"""Ticks from sending an input to the deadline of its tick, at most. An input is sent up to a tick later than that."""
 REPORT_S = 0.2
 PING_S = 1.0
 SLOT_S = 0.001
-"""The clock of what is sent: late by more than this is told."""
+"""Length of a slot in seconds. Each client sends in one slot of every tick."""
 CATCH_UP_SLOTS = 16
+"""Most slots that are due and run without reading messages in between."""
 MASK = b"\x5a\x13\xc7\x2e"
 REQUEST = (
     b"GET / HTTP/1.1\r\nHost: localhost\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
@@ -48,14 +50,14 @@ SNAPSHOT, TERRAIN, WELCOME, PONG = 18, 19, 17, 20
 
 
 def frame(message: bytes) -> bytes:
-    """One masked binary frame."""
+    """Returns a message as a masked binary frame."""
     n = len(message)
     head = bytes((0x82, 0x80 | n)) if n < 126 else b"\x82\xfe" + n.to_bytes(2, "big")
     return head + MASK + bytes(apply_mask(message, MASK))
 
 
 class Player:
-    """One connection."""
+    """A player with its connection."""
 
     __slots__ = ("acked", "buffer", "move", "number", "open", "phase", "pinged", "rng", "sent", "snapshots", "sock")
 
@@ -76,7 +78,7 @@ class Player:
 
 
 class Swarm:
-    """All of them, and what has been counted since the window began."""
+    """All players, and the counts since the start of the window."""
 
     def __init__(self, order: dict[str, Any]) -> None:
         self.order = order
@@ -88,7 +90,7 @@ class Swarm:
         self.made = self.gone = self.wanted = 0
         self.leaving_per_s = 0.0
         self.server_tick_0 = self.best = self.asked = -math.inf
-        """The server's time in ticks at time 0 of the clock, by the quickest pong of the last second."""
+        """Server time, in ticks, at time 0 of the local clock, by the quickest pong of the last second."""
         self.reset()
 
     def reset(self) -> None:
@@ -99,7 +101,7 @@ class Swarm:
         for player in self.players.values():
             player.snapshots = 0
 
-    # -- what comes ----------------------------------------------------------------------------------------
+    # -- receiving -----------------------------------------------------------------------------------------
 
     def receive(self, player: Player, now: float) -> None:
         try:
@@ -135,7 +137,7 @@ class Swarm:
                 length, start = int.from_bytes(data[at + 2 : at + 10], "big"), at + 10
             if start + length > size:
                 break
-            if data[at] != 0x82:  # the server closes
+            if data[at] != 0x82:  # not a binary frame: the server closes the connection
                 self.drop(player)
                 self.gone += 1
                 return
@@ -144,7 +146,7 @@ class Swarm:
         player.buffer = data[at:]
 
     def take(self, player: Player, data: bytes, start: int, end: int, now: float) -> None:
-        """One message."""
+        """Handles one message."""
         if data[start] == ARRAY16:
             form = data[start + 4]
             if form == UINT32:
@@ -161,18 +163,19 @@ class Swarm:
         elif data[start + 1] == PONG:
             pong = decode_from_server(data[start:end])
             assert isinstance(pong, messages.Pong)
-            # The later an answer comes, the lower this is; and a server that gives up ticks falls behind.
+            # A later pong gives a lower value, so the highest of a second is taken. A server that drops ticks falls
+            # behind, so each second is measured anew.
             if now - self.asked >= PING_S:
                 self.asked, self.server_tick_0, self.best = now, max(self.best, pong.tick - now * self.rate), -math.inf
             self.best = max(self.best, pong.tick - now * self.rate)
         elif data[start + 1] == WELCOME:
             self.by_slot[int(player.phase * self.slots)].append(player)
-        # Terrain is for those who have a world.
+        # Terrain is ignored, because these clients have no world.
 
-    # -- what goes -----------------------------------------------------------------------------------------
+    # -- sending -------------------------------------------------------------------------------------------
 
     def send(self, player: Player, now: float) -> None:
-        """The inputs up to the tick whose turn it is."""
+        """Sends the inputs up to the tick that is due."""
         if now - player.pinged >= PING_S:
             player.pinged = now
             self.out(player, frame(encode(Ping(time.monotonic()))))
@@ -199,9 +202,9 @@ class Swarm:
         except BlockingIOError:
             sent = 0
         except OSError:
-            return  # the next read tells
+            return  # the next read reports the error
         self.bytes_up += sent
-        if sent < len(data):  # the server has not read for so long that it cannot matter any more
+        if sent < len(data):  # the server has not read for a long time: give up
             self.stuck += 1
             self.drop(player)
             self.gone += 1
@@ -217,7 +220,7 @@ class Swarm:
         while True:
             now = time.monotonic()
             due = begun + slot / (self.slots * self.rate)
-            for _ in range(CATCH_UP_SLOTS):  # then what has come is read, however far behind it is
+            for _ in range(CATCH_UP_SLOTS):  # then messages are read, even if more slots are due
                 if due > now:
                     break
                 players = self.by_slot[slot % self.slots]
@@ -274,7 +277,7 @@ class Swarm:
         self.poll.register(player.sock.fileno(), select.EPOLLIN)
 
     def leave(self, player: Player) -> None:
-        """Every other one says goodbye; the server waits for the return of those that do not."""
+        """Disconnects a player. Every other one sends a `Bye`; the server keeps the entities of the rest for a time."""
         if player.number % 2:
             self.out(player, frame(encode(Bye(messages.GOING_AWAY, "", -1.0))))
         self.drop(player)
@@ -289,7 +292,7 @@ class Swarm:
                 slot.remove(player)
 
     def figures(self) -> dict[str, Any]:
-        """Of the window."""
+        """Returns the figures of the window."""
         seconds, n = time.monotonic() - self.began, max(1, len(self.players))
         counts = sorted(player.snapshots for player in self.players.values()) or [0]
         return {
@@ -310,7 +313,7 @@ class Swarm:
 
 
 def quantiles(counts: list[int]) -> dict[str, float]:
-    """p50, p99 and max of values counted by whole milliseconds, rounded up."""
+    """Returns p50, p99 and max of values that were counted by whole milliseconds, rounded up."""
     return between([], [(1000 * (ms + 1), n) for ms, n in enumerate(counts)])
 
 

@@ -1,10 +1,10 @@
-"""Peers that mean harm, in one process: for `soak.py` and the torture tests. On this machine's own server only.
+"""Hostile peers in one process, for `soak.py` and the torture tests. They attack only a server on this machine.
 
-argument  {"port", "seed", "peers": {attack: how many at a time}, "connects_per_s"}, as JSON
+argument  {"port", "seed", "peers": {attack: number at a time}, "connects_per_s"}, as JSON
 stdin     its end: stop
-stdout    one JSON object in the end: how often each attack was made
+stdout    one JSON object at the end: how often each attack was made
 
-Each peer does its attack, again and again, whatever the server makes of it.
+Each peer repeats its attack, however the server reacts.
 """
 
 import asyncio
@@ -24,9 +24,9 @@ from shared import messages
 from shared.messages import CLIENT_MESSAGE_MAX, Command, Hello, Inputs, Ping, encode
 
 PATIENCE_S = 8.0
-"""A peer whose connection the server does not end goes by itself after so long."""
+"""Seconds after which a peer disconnects if the server has not ended its connection."""
 AT_ONCE = struct.pack("ii", 1, 0)
-"""SO_LINGER: closing resets the connection."""
+"""Value of SO_LINGER with which closing a socket resets the connection."""
 HELLO = frame(encode(Hello(messages.VERSION, {}, "rogue")))
 
 Streams = tuple[asyncio.StreamReader, asyncio.StreamWriter]
@@ -34,18 +34,18 @@ Attack = Callable[[Streams, random.Random], Awaitable[None]]
 
 
 async def nothing(streams: Streams, rng: random.Random) -> None:
-    """Half open: a connection, and not a byte."""
+    """Connects and sends nothing."""
     await streams[0].read(1 << 16)
 
 
 async def half_a_request(streams: Streams, rng: random.Random) -> None:
-    """The request never ends."""
+    """Sends a part of the request, and never the rest."""
     streams[1].write(REQUEST[: rng.randrange(1, len(REQUEST))])
     await streams[0].read(1 << 16)
 
 
 async def slow_loris(streams: Streams, rng: random.Random) -> None:
-    """A byte of the request now and then."""
+    """Sends the request slowly, byte by byte."""
     for at in range(len(REQUEST)):
         streams[1].write(REQUEST[at : at + 1])
         await asyncio.sleep(0.2)
@@ -64,7 +64,7 @@ async def never_reads(streams: Streams, rng: random.Random) -> None:
 
 
 async def one_byte_a_second(streams: Streams, rng: random.Random) -> None:
-    """Reads, but so slowly that nothing gets through."""
+    """Reads one byte per second, so that the server's messages pile up."""
     streams[1].write(REQUEST + HELLO)
     transport = streams[0]._transport  # type: ignore[attr-defined]
     transport.pause_reading()
@@ -79,14 +79,14 @@ async def one_byte_a_second(streams: Streams, rng: random.Random) -> None:
 
 
 async def mid_frame(streams: Streams, rng: random.Random) -> None:
-    """Goes in the middle of a message."""
+    """Disconnects in the middle of a message."""
     message = frame(encode(Command(1, 5, 4.5, "edit", bytes(200))))
     streams[1].write(REQUEST + HELLO + message[: rng.randrange(1, len(message))])
     await asyncio.sleep(rng.uniform(0.0, 0.3))
 
 
 async def rubbish(streams: Streams, rng: random.Random) -> None:
-    """Well-formed frames of nonsense, and nonsense instead of frames."""
+    """Sends random bytes, in well-formed frames or instead of frames."""
     data = rng.randbytes(rng.randrange(CLIENT_MESSAGE_MAX))
     streams[1].write(REQUEST + HELLO + (data if rng.random() < 0.5 else frame(data)))
     await streams[0].read(1 << 16)
@@ -94,7 +94,7 @@ async def rubbish(streams: Streams, rng: random.Random) -> None:
 
 
 async def flood(streams: Streams, rng: random.Random) -> None:
-    """As many messages as will go out."""
+    """Sends 2000 messages at once."""
     streams[1].write(REQUEST + HELLO + frame(encode(Ping(1.0))) * 2000)
     await streams[0].read(1 << 16)
     await asyncio.sleep(rng.uniform(0.2, 0.5))
@@ -116,7 +116,7 @@ ATTACKS: dict[str, Attack] = {
 
 
 async def peer(attack: Attack, port: int, rng: random.Random, made: Counter[str]) -> None:
-    """One attack after the other."""
+    """Makes an attack again and again, each on a new connection."""
     while True:
         await asyncio.sleep(rng.uniform(0.0, 0.3))
         with contextlib.suppress(OSError, TimeoutError):
@@ -130,11 +130,11 @@ async def peer(attack: Attack, port: int, rng: random.Random, made: Counter[str]
 
 
 async def connects(port: int, per_s: float, made: Counter[str]) -> None:
-    """Connections that are reset as soon as they are there, at a steady rate."""
+    """Makes connections at a steady rate and resets each at once."""
     loop = asyncio.get_running_loop()
     begun, n = loop.time(), 0
     while True:
-        n = max(n, int((loop.time() - begun - 0.5) * per_s))  # what could not be made in time is given up
+        n = max(n, int((loop.time() - begun - 0.5) * per_s))  # connections that could not be made in time are skipped
         while n < (loop.time() - begun) * per_s:
             n += 1
             with contextlib.suppress(OSError), socket.socket() as sock:
@@ -148,7 +148,7 @@ async def connects(port: int, per_s: float, made: Counter[str]) -> None:
 
 
 async def main(order: dict[str, object]) -> None:
-    """Until the input ends."""
+    """Runs all peers until stdin ends, then prints the counts."""
     port, seed, peers, made = order["port"], order["seed"], order["peers"], Counter[str]()
     assert isinstance(port, int)
     assert isinstance(peers, dict)
@@ -169,5 +169,5 @@ async def main(order: dict[str, object]) -> None:
 
 
 if __name__ == "__main__":
-    logging.getLogger("asyncio").setLevel(logging.ERROR)  # that a connection is gone is what they are here for
+    logging.getLogger("asyncio").setLevel(logging.ERROR)  # lost connections are intended here
     asyncio.run(main(json.loads(sys.argv[1])))

@@ -1,4 +1,4 @@
-"""A game that is fuzzed: players at work, of whom each input is one's next message; all queues must stay bounded."""
+"""The fuzzing of a game: each fuzzed input is a player's next message. All queues of the game must stay bounded."""
 
 import random
 from typing import Any
@@ -29,7 +29,7 @@ WELCOME = 17
 
 
 class _Shooting(Rules):
-    """Looks into the past for every command."""
+    """Rules that query the past (lag compensation) for every command."""
 
     def on_command(self, player: Player, name: str, payload: Any) -> bool | None:
         self.game.rewound(player).ray(self.game.position(player.entity), (1.0, 0.5, -0.25), 16.0)
@@ -39,7 +39,7 @@ class _Shooting(Rules):
 
 
 class _Deaf:
-    """A link; now and then it takes nothing, and it may call back while it is being closed."""
+    """A link that is sometimes congested, and that may report the loss of the connection while it is being closed."""
 
     def __init__(self, house: "House", number: int) -> None:
         self.house, self.number, self.waiting = house, number, 0
@@ -60,11 +60,11 @@ class _Deaf:
 
 
 class House:
-    """A game with players at work; each input is one client's next message."""
+    """A target of the fuzzer: a game with players, each input of which is one client's next message."""
 
     PLAYERS = 6
     LIFE = 4000
-    """After so many messages there is a new game, so that each can be had again soon."""
+    """Number of messages after which a new game starts, so that few messages reproduce a failure."""
 
     def __init__(self) -> None:
         self.made = 0
@@ -110,12 +110,12 @@ class House:
             self.lose(number)
             self._open(number)
             if rng.random() < 0.95:
-                hello = Hello(messages.VERSION, {}, "Ann", resume=rng.choice(self.tokens[-8:]))  # anybody's
+                hello = Hello(messages.VERSION, {}, "Ann", resume=rng.choice(self.tokens[-8:]))  # of any player
                 game.receive(self.sessions[number], encode(hello), self.now)
         session = self.sessions[number]
         before = game.counters.kicked
         if not _is_message(data) and rng.random() < 0.98:
-            data = self._plausible()  # what is no message ends the session: of that there is enough
+            data = self._plausible()  # malformed messages end the session, so most are replaced
         if not session.entity and rng.random() < 0.9:
             data = encode(Ping(0.0))
         game.receive(session, data, self.now)
@@ -131,7 +131,7 @@ class House:
         return told
 
     def _plausible(self) -> bytes:
-        """A message as a client might send it now, more or less."""
+        """Returns a message that a client might send now, approximately."""
         rng, tick = self.rng, self.game.world.tick
         x, y, z = (rng.randint(-8, 8) for _ in range(3))
         return encode(

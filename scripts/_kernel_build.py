@@ -1,7 +1,8 @@
-"""Builds the kernel for every target: `_kernel_build.py OUT [--objects-only]`; `scripts/kernels` is its door.
+"""Builds the kernel for every target: `_kernel_build.py OUT [--objects-only]`. `scripts/kernels` runs it.
 
-LLVM makes an object file for each target from one IR (`_kernel_ir`), and LLD a library from that; both are pinned. The
-same sources give the same bytes with the same versions, which the manifest names. The linker is that of `ziglang`.
+LLVM makes an object file for each target from one IR (`_kernel_ir`). LLD, from the package `ziglang`, links it to a
+library. Both are pinned. The bytes of the result depend only on the sources and on the versions that the manifest
+names.
 """
 
 from __future__ import annotations
@@ -21,10 +22,10 @@ from typing import Any
 
 ROOT = Path(__file__).resolve().parent.parent
 LINKER = ROOT / "build" / "linker"
-"""Where `scripts/kernels` puts the linker."""
+"""Folder in which `scripts/kernels` installs the linker."""
 OBJECT, STUBS, DEFINITION = "kernel.o", "python3.lib", "python3.def"
 BUILDING = {"NUMBA_OPT": "0", "NUMBA_CPU_NAME": "generic", "NUMBA_CPU_FEATURES": "", "PYTHONHASHSEED": "0"}
-"""The environment of a build."""
+"""Environment variables of a build, which make its result reproducible."""
 WASM_FEATURES = "+bulk-memory,+sign-ext,+mutable-globals,+nontrapping-fptoint"
 WASM_STACK_BYTES = 64 * 1024
 
@@ -34,10 +35,10 @@ class Target:
     """A library to build.
 
     Attributes:
-        triple, cpu, features: see `_kernel_ir.Machine`.
-        link: command lines of the linker's tools, one after the other; {exports} stands for an `--export=NAME` for each
-            function, {init} for the export of the Python module.
-        python: whether it is a Python module, else its functions are exported themselves.
+        triple, cpu, features: the machine (`_kernel_ir.Machine`).
+        link: command lines of the linker's tools, in order; {exports} stands for an `--export=NAME` for each function,
+            {init} for the export of the Python module.
+        python: whether the library is a Python module; otherwise it exports the functions themselves.
     """
 
     triple: str
@@ -87,10 +88,11 @@ TARGETS = {
 
 
 def build(out: Path, *, link: bool = True) -> dict[str, Any]:
-    """Builds all targets into a folder, with a manifest; returns the manifest.
+    """Builds all targets into a folder, with a manifest. Returns the manifest.
 
     Args:
-        link: else there are only the manifest's checksums of the object files.
+        out: the folder.
+        link: whether to link libraries; otherwise only the manifest is written, with the object files' checksums.
     """
     import llvmlite.binding as llvm
 
@@ -129,13 +131,13 @@ def build(out: Path, *, link: bool = True) -> dict[str, Any]:
 
 
 def made_with() -> dict[str, str]:
-    """The versions that decide which bytes come out."""
+    """Returns the versions on which the bytes of the result depend."""
     python = ".".join(platform.python_version_tuple()[:2])
     return {"python": python, "numba": version("numba"), "llvmlite": version("llvmlite")}
 
 
 def _linked(name: str, code: bytes, functions: list[str]) -> bytes:
-    """The library for an object file."""
+    """Returns the library that is linked from an object file."""
     from _kernel_python import INIT, PYTHON
 
     shown = " ".join(f"--export={each}" for each in (*functions, "built_from"))
@@ -150,7 +152,7 @@ def _linked(name: str, code: bytes, functions: list[str]) -> bytes:
 
 
 def _zig(folder: str, *arguments: str) -> None:
-    """Runs a tool of the linker's package in a folder."""
+    """Runs a tool of the package `ziglang` in a folder."""
     environment = os.environ | {
         "PYTHONPATH": str(LINKER),
         "ZIG_GLOBAL_CACHE_DIR": folder,
@@ -168,8 +170,8 @@ def _sha256(data: bytes) -> str:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("out", type=Path, help="an existing folder")
-    parser.add_argument("--objects-only", action="store_true", help="no linker: only the manifest")
+    parser.add_argument("out", type=Path, help="an existing folder for the results")
+    parser.add_argument("--objects-only", action="store_true", help="do not link; write only the manifest")
     args = parser.parse_args()
     build(args.out, link=not args.objects_only)
 

@@ -1,10 +1,10 @@
-"""LLVM IR of the kernel sources, made by Numba: one module for a target, in which each function of `shared.exports` is
+"""LLVM IR of the kernel sources, made by Numba: one module per target, in which each function of `shared.exports` is
 
     i32 NAME(i64* words)
 
-All arguments stand in one block of int64 words: a number or a truth value is one word, an array is its address and its
-length, a world is the address of the table of its arrays (`exports.table`). Nothing else is left in the module that
-another one could see, and it needs nothing that is not in it.
+All arguments are in one block of int64 words. A number or a truth value takes one word. An array takes two: its address
+and its length. A world is the address of the table of its arrays (`exports.table`). The module exports nothing else,
+and needs nothing from outside.
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ import llvmlite.binding as llvm
 from shared import kernels
 
 FAILED = -(1 << 31)
-"""The result of a function that met an index out of bounds, where indices are checked."""
+"""Result of a function that found an index out of bounds, in a build that checks indices."""
 SPEED_LEVEL = 3
 
 
 @dataclass(frozen=True)
 class Machine:
-    """What LLVM makes code for: see `llvm::TargetMachine`."""
+    """The machine that LLVM makes code for; the fields are those of `llvm::TargetMachine`."""
 
     triple: str
     cpu: str
@@ -36,7 +36,7 @@ class Machine:
     reloc: str = "pic"
 
     def target_machine(self) -> Any:
-        """A new target machine of LLVM."""
+        """Returns a new target machine of LLVM."""
         target = llvm.Target.from_triple(self.triple)
         return target.create_target_machine(
             cpu=self.cpu, features=self.features, opt=SPEED_LEVEL, reloc=self.reloc, codemodel="small"
@@ -45,7 +45,7 @@ class Machine:
 
 @dataclass(frozen=True)
 class Source:
-    """What Numba has made of an exported function: an LLVM module, and the function's name in it."""
+    """Numba's result for an exported function: the text of an LLVM module, and the function's name in it."""
 
     name: str
     symbol: str
@@ -53,12 +53,12 @@ class Source:
 
 
 def numba_sources(root: Path, *, bounds: bool = False) -> list[Source]:
-    """Compiles every exported function of the sources in `root`/shared, without optimising any.
+    """Compiles every exported function of the sources in `root`/shared, without optimisation.
 
-    Call it once in a process, with NUMBA_OPT=0 and NUMBA_CPU_NAME=generic in the environment.
+    Call it only once in a process, with NUMBA_OPT=0 and NUMBA_CPU_NAME=generic in the environment.
 
     Args:
-        bounds: indices are checked, and a function that meets one out of bounds returns `FAILED`.
+        bounds: whether to check indices; a function that finds one out of bounds returns `FAILED`.
     """
     import numba
     from numba import types
@@ -85,7 +85,7 @@ def numba_sources(root: Path, *, bounds: bool = False) -> list[Source]:
 
 
 def _wrapper(name: str, kinds: str, returns: bool) -> str:
-    """Python source of a function that takes its arguments from a block of words and gives an int32."""
+    """Returns the Python source of a function that takes its arguments from a block of words and returns an int32."""
     from shared import exports
 
     arguments: list[str] = []
@@ -109,7 +109,7 @@ def _wrapper(name: str, kinds: str, returns: bool) -> str:
 
 
 def _intrinsics() -> tuple[Any, Any]:
-    """For compiled functions: the pointer in a word; and for a type of elements, the array in two words."""
+    """Returns two intrinsics for compiled functions: the pointer in a word, and the array of a type in two words."""
     from numba import types
     from numba.extending import intrinsic
     from numba.np import arrayobj
@@ -155,7 +155,7 @@ def _intrinsics() -> tuple[Any, Any]:
 
 
 def _words_type() -> Any:
-    """The type of a pointer to int64 words."""
+    """Returns the type of a pointer to int64 words."""
     from numba import types
 
     pointer: Any = types.CPointer
@@ -198,12 +198,14 @@ define i32 @built_from(ptr %words) {{
 def linked(
     sources: list[Source], code_crc: int, machine: Machine, more: str = "", visible: tuple[str, ...] = ()
 ) -> tuple[Any, Any]:
-    """One optimised module for a machine, and the target machine.
+    """Returns one optimised module for a machine, and the target machine.
 
     Args:
+        sources: the compiled functions.
         code_crc: the checksum of the sources (`shared.freshness`).
-        more: IR that is linked with it, such as what binds it to Python.
-        visible: the functions that others may see; none: all exports.
+        machine: the machine to make code for.
+        more: IR to link with it, such as the binding to Python.
+        visible: names of the functions to export; empty: all of them.
     """
     target_machine = machine.target_machine()
     ours = "".join(EXPORT.format(name=each.name, symbol=each.symbol, failed=FAILED) for each in sources)

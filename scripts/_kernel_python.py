@@ -1,9 +1,10 @@
-"""LLVM IR of the module through which CPython calls a kernel: a call costs some 60 ns, against 1 us with ctypes.
+"""LLVM IR of the module through which CPython calls a kernel. A call costs about 60 ns, against 1 us with ctypes.
 
-It uses nothing but functions of the stable ABI of CPython 3.11, and no data of it, which would need import tables on
-Windows; so one library serves every version from that on. Arrays come as objects with a buffer. The buffer protocol
-refuses one that is not contiguous, or read-only where it is written to; a wrong element size is refused here. Results
-are whole numbers, 0 where there is none. The GIL is held: no call takes as long as a thread's turn (5 ms).
+The module uses only functions of the stable ABI of CPython 3.11, so one library serves that version and all later ones.
+It uses no data of the ABI, because that would need import tables on Windows. Arrays are passed as objects with a
+buffer. The buffer protocol rejects a buffer that is not contiguous, and a read-only one where the kernel writes. This
+module rejects a wrong element size. Results are whole numbers; functions without a result return 0. The GIL is held,
+because no call takes as long as a thread's turn (5 ms).
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ MODULE = "sovereign_kernel"
 INIT = f"PyInit_{MODULE}"
 FASTCALL = 0x80
 WRITABLE = 1
-"""`PyBUF_WRITABLE`; without it a buffer may be read-only."""
+"""The flag `PyBUF_WRITABLE`; without it a buffer may be read-only."""
 BUFFER_BYTES = 80
 """`sizeof(Py_buffer)`: buf, obj, len, itemsize, readonly, ndim, format, shape, strides, suboffsets, internal."""
 
@@ -23,7 +24,7 @@ PYTHON = (
     "PyBuffer_Release", "PyErr_BadArgument", "PyErr_BadInternalCall", "PyErr_Occurred", "PyLong_AsLongLong",
     "PyLong_FromLongLong", "PyModuleDef_Init", "PyObject_GetBuffer",
 )  # fmt: skip
-"""All that is used of Python."""
+"""All functions of Python that the module uses."""
 
 COMMON = """
 declare void @PyBuffer_Release(ptr)
@@ -35,7 +36,7 @@ declare ptr @PyLong_FromLongLong(i64)
 declare ptr @PyModuleDef_Init(ptr)
 declare i32 @PyObject_GetBuffer(ptr, ptr, i32)
 
-; Writes the address and the length of an array to two words; false: an exception is set, and nothing is held.
+; Writes the address and the length of an array to two words. False: an exception is set, and no buffer is held.
 define internal i1 @take_array(ptr %object, ptr %buffer, ptr %words, i32 %flags, i64 %size) alwaysinline {
   %got = call i32 @PyObject_GetBuffer(ptr %object, ptr %buffer, i32 %flags)
   %failed = icmp ne i32 %got, 0
@@ -62,7 +63,7 @@ no:
   ret i1 false
 }
 
-; Writes the address of a world's table of arrays to a word; false: as above.
+; Writes the address of a world's table of arrays to a word. False: an exception is set, and no buffer is held.
 define internal i1 @take_world(ptr %object, ptr %buffer, ptr %words) alwaysinline {
   %pair = alloca [2 x i64]
   %got = call i1 @take_array(ptr %object, ptr %buffer, ptr %pair, i32 0, i64 8)
@@ -84,7 +85,7 @@ no:
   ret i1 false
 }
 
-; Writes a whole number or a truth value to a word; false: an exception is set.
+; Writes a whole number or a truth value to a word. False: an exception is set.
 define internal i1 @take_number(ptr %object, ptr %words) alwaysinline {
   %value = call i64 @PyLong_AsLongLong(ptr %object)
   store i64 %value, ptr %words
@@ -111,7 +112,11 @@ DEFINITION = """
 
 
 def module(names: dict[str, str]) -> str:
-    """The IR of a Python module with these functions (of `shared.exports`: their names and kinds of arguments)."""
+    """Returns the IR of a Python module.
+
+    Args:
+        names: the functions: their names and the kinds of their arguments (as in `shared.exports`).
+    """
     methods = [f"{{ ptr @name_{n}, ptr @python_{n}, i32 {FASTCALL}, ptr null }}" for n in names]
     entries = ", ".join(f"%method {each}" for each in (*methods, "zeroinitializer"))
     return "\n".join(
@@ -130,7 +135,7 @@ def module(names: dict[str, str]) -> str:
 
 
 def _function(name: str, kinds: str) -> str:
-    """A function as Python calls it: `PyObject *NAME(PyObject *self, PyObject *const *arguments, Py_ssize_t n)`."""
+    """Returns the IR of `PyObject *NAME(PyObject *self, PyObject *const *arguments, Py_ssize_t n)` for Python."""
     lines = [
         f"define internal ptr @python_{name}(ptr %self, ptr %arguments, i64 %n) {{",
         f"  %words = alloca [{exports.words_of(kinds)} x i64], align 16",
@@ -171,7 +176,7 @@ def _function(name: str, kinds: str) -> str:
 
 
 def _held(kind: str) -> bool:
-    """Whether an argument of a kind is a buffer, which has to be released."""
+    """Returns whether an argument of a kind is a buffer, which must be released."""
     return kind not in (exports.NUMBER, exports.TRUTH)
 
 

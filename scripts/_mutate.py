@@ -1,4 +1,4 @@
-"""Changes bytes into other bytes that are nearly right: that is where decoders go wrong."""
+"""Mutations of messages into bytes that are nearly valid, where decoders are most likely to fail."""
 
 import random
 from collections.abc import Sequence
@@ -8,7 +8,7 @@ import msgpack
 
 HEADS = bytes((0x80, 0x8F, 0x90, 0x94, 0x9F, 0xA0, 0xBF, 0xC0, 0xC1, 0xC2, 0xC4, 0xC6, 0xC7, 0xC9, 0xCA, 0xCB, 0xCD))
 HEADS += bytes((0xCE, 0xCF, 0xD0, 0xD1, 0xD3, 0xD4, 0xD9, 0xDB, 0xDC, 0xDD, 0xDE, 0xDF, 0xE0, 0xFF, 0x00, 0x7F))
-"""Those with which MessagePack begins a value."""
+"""First bytes of values in MessagePack."""
 ODD: tuple[Any, ...] = (
     *(None, True, False, 0, -1, 1, 127, 128, 255, 256, 1 << 31, (1 << 32) - 1, 1 << 53, (1 << 63) - 1, (1 << 64) - 1),
     *(-(1 << 63), 0.0, -0.0, 1e300, -1e300, 5e-324, float("inf"), float("nan"), "", "\0", "é" * 40, b"", bytes(3)),
@@ -19,7 +19,7 @@ LONGEST = 12_000
 
 
 def mutated(data: bytes, corpus: Sequence[bytes], rng: random.Random) -> bytes:
-    """A changed copy, at most `LONGEST` bytes; now and then its values are changed, not its bytes."""
+    """Returns a changed copy of at most `LONGEST` bytes. In a quarter of the cases, a value changes as well."""
     if rng.random() < 0.25:
         data = _value_changed(data, rng)
     below = rng.random
@@ -48,7 +48,7 @@ def mutated(data: bytes, corpus: Sequence[bytes], rng: random.Random) -> bytes:
 
 
 def _value_changed(data: bytes, rng: random.Random) -> bytes:
-    """One field of a message, or something in it, is an odd value."""
+    """Replaces one field of a message, or a value within it, by an unusual value."""
     try:
         value = msgpack.unpackb(data, strict_map_key=False)
         if type(value) is not list or not value:
@@ -66,5 +66,5 @@ def _value_changed(data: bytes, rng: random.Random) -> bytes:
             near = type(old) is int and rng.random() < 0.5
             holder[at] = old + rng.choice((-1, 1, -256, 1 << 16)) if near else rng.choice(ODD)
         return msgpack.packb(value)  # type: ignore[no-any-return]
-    except Exception:  # what is no message cannot be changed as one
+    except Exception:  # these bytes are not a message, so they have no values to change
         return data

@@ -1,4 +1,4 @@
-"""Compiles modules of the folder it is started in, in place, for `native.py`: `_native_build.py 3 shared/ring.py`."""
+"""Compiles modules of the current folder in place, for `native.py`: `_native_build.py LEVEL shared/ring.py ...`."""
 
 import sys
 

@@ -1,4 +1,4 @@
-"""The picture of the accuracy report."""
+"""Draws the picture of the accuracy report."""
 
 from pathlib import Path
 
@@ -38,7 +38,7 @@ def _title(axes: Axes, text: str) -> None:
 
 
 def worst(row: Row) -> float:
-    """The largest error of a row in blocks."""
+    """Returns the largest error of a row, in blocks."""
     names = ("apex_error", "minute_error", "inside_depth", "error_1e6", "error_1e7")
     return max(abs(float(row[name])) for name in names)
 

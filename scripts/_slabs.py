@@ -1,6 +1,6 @@
-"""The obstacles that the product does not use: blocks merged greedily into xy slabs, one list per layer.
+"""A representation of obstacles that the product does not use: blocks merged greedily into xy slabs, a list per layer.
 
-It is what the seed of this project proposed; here it is kept as a measure, so that the choice can be checked.
+The seed of this project proposed it. It is kept so that the product's choice can be measured against it.
 """
 
 from typing import Any
@@ -21,9 +21,10 @@ Flags = npt.NDArray[np.bool_]
 
 @njit(cache=True)
 def _merge(layer: Any, slabs: Any) -> int:
-    """Fills `slabs` ([n, 4]: x0, y0, x1, y1) with rectangles that cover the solid blocks of a layer [y, x]; how many.
+    """Fills `slabs` ([n, 4]: x0, y0, x1, y1) with rectangles that cover the solid blocks of a layer [y, x].
 
-    Greedy: grow east as far as it goes, then north as long as the whole row is solid.
+    It is greedy: each rectangle grows east as far as possible, then north as long as the whole row is solid. Returns
+    the number of rectangles.
     """
     left = layer.copy()
     n = 0
@@ -75,7 +76,7 @@ def _dense(blocks_in: Any, arrays: Any, boxes: Any, out: Any) -> None:
 
 
 class Slabs:
-    """All layers of a box of segments, merged; [n, 4] in blocks, layer after layer."""
+    """The slabs of a box of segments: [n, 4] in blocks, layer after layer."""
 
     def __init__(self, slabs: Boxes, starts: Boxes, origin: Boxes, sizes: Boxes) -> None:
         self._slabs, self._starts, self._origin, self._sizes = slabs, starts, origin, sizes
@@ -93,7 +94,7 @@ class Slabs:
 
     @staticmethod
     def merged(solid: Flags) -> tuple[Boxes, Boxes]:
-        """A map [z, y, x] layer by layer: [n, 4] in cells, and where each layer of each segment column begins."""
+        """Merges a map [z, y, x]. Returns the slabs [n, 4] in cells, and the start of each layer of each column."""
         height, depth, width = solid.shape
         scratch = np.zeros((SEGMENT * SEGMENT, 4), np.int64)
         parts, starts = [], [0]
@@ -109,18 +110,18 @@ class Slabs:
         return len(self._slabs)
 
     def hits(self, boxes: Boxes) -> Flags:
-        """Whether a block overlaps each box, [n]."""
+        """Returns for each box whether a block overlaps it, [n]."""
         out = np.zeros(len(boxes), np.bool_)
         _hits(self._slabs, self._starts, self._origin, self._sizes, boxes, BLOCK, out)
         return out
 
     def merge_layer(self, layer: Flags) -> int:
-        """What an edit costs at least: its layer merged anew (and the rest of the list moved, not counted)."""
+        """Merges a layer again, which is the least work of an edit. Moving the rest of the list would come on top."""
         return int(_merge(layer, np.zeros((SEGMENT * SEGMENT, 4), np.int64)))
 
 
 def boxes_on(world: World, count: int) -> Boxes:
-    """Boxes of players at random places near the ground, [n, 6] in grid steps."""
+    """Returns boxes of players at random positions near the ground, [n, 6] in grid steps."""
     rng = np.random.default_rng(3)
     sides = np.array([0.6, 0.6, 1.8])
     high = np.array([world.scene.size[0] * SEGMENT, world.scene.size[1] * SEGMENT, 24.0]) - sides
@@ -130,7 +131,7 @@ def boxes_on(world: World, count: int) -> Boxes:
 
 
 def dense_hits(world: World, boxes: Boxes) -> Flags:
-    """The same by the product's own look-up."""
+    """Returns for each box whether a block overlaps it, [n], by the product's own look-up."""
     out = np.zeros(len(boxes), np.bool_)
     arrays = Arrays(*map(np.asarray, world.arrays))
     _dense(kernels.jitted(kernel).blocks_in, arrays, boxes, out)

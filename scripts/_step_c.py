@@ -1,4 +1,4 @@
-"""The step in C: built with gcc when it is asked for, and called on the very arrays of a `World`."""
+"""The step in C: built with gcc at the first use, and called on the arrays of a `World`."""
 
 import ctypes
 import functools
@@ -16,7 +16,7 @@ FLAGS = ("-O2", "-ffp-contract=off", "-shared", "-fPIC")
 
 
 def available() -> bool:
-    """Whether there is a gcc to build it with."""
+    """Returns whether gcc is installed."""
     return shutil.which("gcc") is not None
 
 
@@ -29,7 +29,7 @@ def library() -> ctypes.CDLL:
 
 
 def run(world: World, ticks: int) -> None:
-    """Steps a compiled world in C, without inputs. A benchmark may reach into a world; nobody else may."""
+    """Steps a compiled world in C, without inputs. Only a benchmark may use a world's private arrays."""
     step, arrays = library().step, world._arrays
     addresses = [np.asarray(array).ctypes.data for array in arrays]
     struct = (ctypes.c_int64 * (len(addresses) + 1))(*addresses, len(arrays.table))

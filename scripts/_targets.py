@@ -1,6 +1,6 @@
-"""What is fuzzed: each target takes bytes, holds what is promised of them, and tells in a word what came of it.
+"""The targets of the fuzzer. A target takes bytes, checks what the product promises about them, and names the outcome.
 
-A promise that is broken is an `AssertionError`; any other exception is one that should not have come out.
+A broken promise raises `AssertionError`. Any other exception is one that the product should not have raised.
 """
 
 import atexit
@@ -76,12 +76,12 @@ FROM_SERVER: tuple[Message, ...] = (
 
 
 def said(error: Exception) -> str:
-    """How the text of an error begins, without what is a peer's own in it."""
-    return WORDS.match(str(error))[0][:24]  # type: ignore[index]  # it matches nothing at least
+    """Returns the first words of an error, which contain nothing that the peer sent."""
+    return WORDS.match(str(error))[0][:24]  # type: ignore[index]  # the pattern also matches an empty text
 
 
 def client(data: bytes) -> str:
-    """What a server receives. The quick way is held against the judge."""
+    """Decodes as a server does. The fast decoder must agree with the general one."""
     try:
         message: Message | None = decode_from_client(data)
         told = type(message).__name__
@@ -98,7 +98,7 @@ def client(data: bytes) -> str:
 
 
 def server(data: bytes) -> str:
-    """What a client receives, and the parts of snapshots."""
+    """Decodes as a client does, with the parts of snapshots."""
     try:
         message = decode_from_server(data)
         if not isinstance(message, Snapshot):
@@ -117,7 +117,7 @@ def server(data: bytes) -> str:
 
 
 def value(data: bytes) -> str:
-    """The payload of a command, or of what rules tell."""
+    """Decodes the payload of a command or of a game event."""
     try:
         return type(unpack_value(data)).__name__
     except ProtocolError as error:
@@ -125,7 +125,7 @@ def value(data: bytes) -> str:
 
 
 def edit(data: bytes) -> str:
-    """The payload of the command that places and removes blocks."""
+    """Decodes the payload of the command that places and removes blocks."""
     found = edits.unpack(data)
     if found is not None:
         assert all(type(part) is int and abs(part) < 1 << 28 for part in found[:3])
@@ -134,7 +134,7 @@ def edit(data: bytes) -> str:
 
 
 class Desk:
-    """The settings: bytes are a file, an environment (after a 0 byte) and flags (after another)."""
+    """A target for the settings. Its bytes are a file, an environment and flags, separated by 0 bytes."""
 
     def __init__(self) -> None:
         folder = tempfile.mkdtemp()
@@ -190,4 +190,4 @@ TARGETS: dict[str, tuple[Callable[[], Target], tuple[bytes, ...], int]] = {
     "session": (House, tuple(map(encode, FROM_CLIENT)), 38),
     "settings": (Desk, SETTINGS, 2),
 }
-"""By name: what makes it, the inputs to begin with, and its share of all inputs in thousandths."""
+"""Targets by name: a function that makes the target, its first inputs, and its share of all inputs in thousandths."""

@@ -1,9 +1,9 @@
-"""The step as it could have been: other number formats, integrators, movers and obstacles, in one switched source.
+"""Variants of the step: other number formats, integrators, movers and obstacles, selected by switches.
 
-Nothing here is the product; it exists so that the product's choices can be measured against their neighbours.
-One entity at a time among blocks, in floats of either width; a grid is floats that hold whole steps only. Loaded
-a second time as `_variants_fast` it is compiled with fastmath, like a machine whose compiler contracts and
-reorders: the two differ in nothing else.
+The product uses none of this. It exists so that the product's choices can be measured against their alternatives. Each
+entity meets only blocks. Numbers are floats of either width; a grid is floats that hold only whole steps. Loaded a
+second time as `_variants_fast`, this source is compiled with fastmath, and stands for a machine whose compiler
+contracts and reorders operations. The two builds differ in nothing else.
 """
 
 import math
@@ -12,13 +12,13 @@ from typing import Any
 from numba import njit
 
 FAST = __name__.endswith("_fast")
-# Without reference counts on the arrays, as in the product's kernel.
+# `_nrt` is off: no reference counts on the arrays, as in the product's kernel.
 _options: dict[str, Any] = {"cache": True, "error_model": "numpy", "fastmath": FAST, "_nrt": False}
 _njit = njit(**_options)
 
 
 def jit(function: Any) -> Any:
-    """Numba's cache knows a function by its name and file only: the two instances must not share it."""
+    """Compiles a function under a name that depends on the build: Numba's cache knows only the name and the file."""
     function.__qualname__ += "_fast" if FAST else ""
     return _njit(function)
 
@@ -27,7 +27,7 @@ SEMI, EXPLICIT, MEAN = range(3)
 CLAMP, REWIND, IMPACT = range(3)
 CELLS, SLABS = range(2)
 
-# Columns of the numbers (all of the format's width) and of the switches.
+# Indices of the numbers (all of the format's width) and of the switches.
 GRAVITY, TERMINAL, JUMP, STEP, HALF, SCALE, LO, SIZE = 0, 1, 2, 3, 4, 5, 6, 9
 NUMBERS = 12
 INTEGRATOR, MOVER, OBSTACLES = range(3)
@@ -35,7 +35,7 @@ INTEGRATOR, MOVER, OBSTACLES = range(3)
 
 @jit
 def on_grid(d: Any, f: Any) -> Any:
-    """A displacement in whole steps of the grid, halves away from zero; itself if there is no grid."""
+    """Returns a displacement rounded to whole steps of the grid, halves away from zero; unchanged without a grid."""
     if f[SCALE] == 0:
         return d
     steps = math.floor(abs(d) * f[SCALE] + f[HALF])
@@ -44,7 +44,7 @@ def on_grid(d: Any, f: Any) -> Any:
 
 @jit
 def solid_in(t: Any, slabs: bool, x0: int, y0: int, z0: int, x1: int, y1: int, z1: int) -> bool:
-    """Whether a block from one cell to the other, which is included, is solid; all outside of the map is."""
+    """Returns whether a block from one cell to the other (inclusive) is solid. Everything outside the map is solid."""
     kinds, rectangles, starts, origin = t
     nz, ny, nx = kinds.shape
     x0, x1, y0, y1, z0, z1 = (
@@ -76,7 +76,7 @@ def solid_in(t: Any, slabs: bool, x0: int, y0: int, z0: int, x1: int, y1: int, z
 
 @jit
 def across(t: Any, slabs: bool, k: int, layer: int, lo: Any, hi: Any) -> bool:
-    """Whether a layer of cells across axis k is solid within the cross-section of a box."""
+    """Returns whether a layer of cells across axis `k` is solid within the cross-section of a box."""
     a = (k + 1) % 3
     b = (k + 2) % 3
     a0, a1 = math.floor(lo[a]), math.ceil(hi[a]) - 1
@@ -100,7 +100,7 @@ def corners(p: Any, f: Any, lo: Any, hi: Any) -> None:
 
 @jit
 def put_on(p: Any, f: Any, k: int, face: int, d: Any) -> None:
-    """Puts the leading side of a box on a face."""
+    """Moves a box along axis `k` until its leading side is on a face."""
     side = p.dtype.type(face)
     if d > 0:
         p[k] = side - f[SIZE + k] - f[LO + k]
@@ -110,7 +110,7 @@ def put_on(p: Any, f: Any, k: int, face: int, d: Any) -> None:
 
 @jit
 def clamp(t: Any, slabs: bool, p: Any, d: Any, f: Any, hit: Any, lo: Any, hi: Any) -> None:
-    """Axis by axis, z, x, y, each up to the first face: the product's mover."""
+    """The product's mover: moves along z, x and y in turn, each up to the first face."""
     for turn in range(3):
         k = (turn + 2) % 3
         if d[k] == 0:
@@ -133,7 +133,7 @@ def clamp(t: Any, slabs: bool, p: Any, d: Any, f: Any, hit: Any, lo: Any, hi: An
 
 @jit
 def rewind(t: Any, slabs: bool, p: Any, d: Any, f: Any, hit: Any, lo: Any, hi: Any) -> None:
-    """The seed's: move, and while a block is overlapped go back along the velocity until it is not."""
+    """The seed's mover: moves at once, then goes back along the velocity as long as the box overlaps a block."""
     for k in range(3):
         p[k] += d[k]
     for _ in range(4):
@@ -170,10 +170,11 @@ def rewind(t: Any, slabs: bool, p: Any, d: Any, f: Any, hit: Any, lo: Any, hi: A
 
 @jit
 def soonest(t: Any, slabs: bool, left: Any, f: Any, lo: Any, hi: Any, edges: bool, scratch: Any) -> Any:
-    """The first impact of a motion: its time (2: none), axis and face.
+    """Returns the first impact of a motion: its time (2: none), axis and face.
 
-    With `edges`, what a box reaches along the other axes in that very moment counts too: else it would slip into a
-    block whose edge it meets head-on. Without, it does not: else walls would catch what slides along them.
+    With `edges`, faces that the box reaches along the other axes at that very moment count, too; without it, they do
+    not. If they never counted, a box could slip into a block whose edge it meets head-on. If they always did, walls
+    would stop a box that slides along them.
     """
     low, high = scratch[0], scratch[1]
     best = f[SCALE] * 0 + 2
@@ -210,7 +211,7 @@ def soonest(t: Any, slabs: bool, left: Any, f: Any, lo: Any, hi: Any, edges: boo
 
 @jit
 def impact(t: Any, slabs: bool, p: Any, d: Any, f: Any, hit: Any, lo: Any, hi: Any, scratch: Any) -> None:
-    """A true sweep: to the first time of impact, then on with what is left along the other axes."""
+    """A sweeping mover: moves to the first impact, then continues with the rest of the motion along the other axes."""
     left = scratch[2]
     for k in range(3):
         left[k] = d[k]
@@ -251,7 +252,7 @@ def step(
     hit: Any,
     scratch: Any,
 ) -> None:
-    """One tick of all; `wishes` [n, 2] in blocks/s, `places` and `speeds` [n, 3], `hit` [3] and `scratch` [6, 3]."""
+    """Steps all entities. `wishes` is [n, 2] in blocks/s; `places`, `speeds` [n, 3]; `hit` [3]; `scratch` [6, 3]."""
     slabs = switches[OBSTACLES] == SLABS
     d, lo, hi = scratch[3], scratch[4], scratch[5]
     for i in range(len(places)):
@@ -299,7 +300,7 @@ def step(
 
 @jit
 def depths(t: Any, lows: Any, highs: Any, out: Any) -> None:
-    """How deep each box is inside a block, in blocks: 0 if it only touches."""
+    """Writes to `out` how deep each box is inside a block, in blocks: 0 if it only touches one."""
     for i in range(len(lows)):
         deepest = 0.0
         lo, hi = lows[i], highs[i]

@@ -1,8 +1,8 @@
-"""Speed against error: what each choice in the physics buys and costs, measured in one run.
+"""Measures the speed and the errors of the choices in the physics, in one run.
 
-Number formats, integrators, tick rates, movers, obstacles and executors, one changed at a time around the product's
-choice, and a few combinations that others use. Rows of the product run its real world; the others run variants of
-the step that exist only for this report. Lengths in blocks; an error of 0 is exactly 0.
+It varies number format, integrator, tick rate, mover, obstacles and executor, one at a time around the product's
+choice, and adds a few combinations that other engines use. Rows of the product run its own world. The others run
+variants of the step that exist only for this report. Lengths are in blocks. An error of 0 is exactly 0.
 """
 
 import argparse
@@ -44,7 +44,7 @@ GROUPS: dict[str, list[Choice]] = {
         Choice("float32", "semi", 60, "impact"),
     ],
 }
-"""The rows, by what is varied. The first of the last group is the seed's proposal, taken at its word."""
+"""Rows by what they vary. The first row of the last group is the seed's proposal, taken literally."""
 
 COLUMNS = {
     "ns": "ns per step",
@@ -79,7 +79,7 @@ def run(progress: Progress, *, quick: bool) -> list[Row]:
 
 
 def label(row: Row) -> str:
-    """What a row changes, in words."""
+    """Returns in words what a row changes."""
     usual = asdict(Choice())
     words = [row["format"]] if row["format"] != usual["format"] else []
     words += [row[key] for key in ("integrator", "mover", "obstacles", "executor") if row[key] != usual[key]]
@@ -88,7 +88,7 @@ def label(row: Row) -> str:
 
 
 def shown(column: str, value: float) -> str:
-    """A number as short as it can be read; tiny shares below what a double can tell are 0."""
+    """Returns a number as a short text. A wall loss below the precision of a double is shown as 0."""
     if value == 0 or (column == "tangential_lost" and abs(value) < 1e-4):
         return "0"
     if column in SHARES:
@@ -115,12 +115,12 @@ def table(rows: list[Row]) -> Table:
 def main(argv: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--json", type=Path, metavar="OUT", help="write all rows to this file")
-    parser.add_argument("--plot", type=Path, metavar="OUT.png", help="draw the picture of the README")
+    parser.add_argument("--plot", type=Path, metavar="OUT.png", help="draw the report's picture")
     parser.add_argument("--quick", action="store_true", help="fewer players, for less time")
     args = parser.parse_args(argv)
     console = Console()
     if not kernels.numba_installed():
-        console.print("error: Numba is not installed; the variants are compiled by it")
+        console.print("error: Numba is not installed; this report compiles its variants with it")
         return 2
     if args.plot and (why := lacking("matplotlib")):
         console.print(f"error: --plot: {why}", highlight=False, markup=False, soft_wrap=True)

@@ -1,24 +1,24 @@
-"""Benchmarks: figures with their scatter, and ratios taken in one run.
+"""Runs a benchmark and prints its figures with their scatter. Ratios compare measurements of one run.
 
-`physics` times the compiled step on crowds, beside the same step in C, which it builds and which must reach the
-same hash. A figure is the median of repeated runs, its range beside it. Two busy cores scatter by a third.
+`physics` times the compiled step on crowds, and the same step in C, which it builds and which must reach the same hash.
+A figure is the median of repeated runs, with its range. Two busy cores scatter by a third.
 
-`server` looks for the most clients that one server process holds at 30 Hz, all wandering over hills with some 50
-entities in view, beside what the same gateway holds without a game. It needs the machine for itself: while others
-work, ticks are late for their sake. The CPU time per client and tick is told as well, and what it comes to.
-`server --crowd` puts 300 players (or N) into one segment instead, each seeing all: the fairness is what the worst
-served of them gets of what the best served gets.
+`server` searches for the most clients that one server process holds at 30 Hz, all wandering over hills with about 50
+entities in view, and for the most that the same gateway holds without a game. It needs an idle machine, because other
+processes make ticks late. It also prints the CPU time per client and tick, and the number of clients that this allows.
+`server --crowd` puts 300 players (or N) into one segment instead, where each sees all others. Its fairness is the share
+of snapshots of the worst served player over that of the best served one.
 
-`jitter` tells how late the ticks of a server with 200 clients begin and how long they take, with garbage collection and
-event loop as the product has them and otherwise, in turns.
+`jitter` measures how late the ticks of a server with 200 clients begin and how long they take, in turns with the
+product's garbage collection and event loop and with others.
 
-`bytes` tells what one client is sent at 20 Hz while 100 entities (or N) move in its view, and that its copy of them is
-exact in every tick.
+`bytes` measures the bytes that the server sends to one client at 20 Hz while 100 entities (or N) move in its view, and
+checks that the client's copy of them is exact in every tick.
 
-`memory` tells the bytes per connection, entity and loaded segment, and what is in use after each cycle of churn; the
-same of a server process over sockets, by what it has in RAM: between 200 and 400 clients, and in --minutes of churn.
+`memory` measures the bytes per connection, entity and loaded segment, and the bytes in use after each cycle of churn.
+It also measures the RSS of a server process over sockets: between 200 and 400 clients, and in --minutes of churn.
 
-`entities` tells the CPU time of a tick with 100,000 entities, a tenth of them walking, before, while and after 200
+`entities` measures the CPU time of a tick with 100,000 entities, a tenth of which walk, before, while and after 200
 clients join.
 """
 
@@ -48,11 +48,11 @@ from _crowds import Samples
 from shared import kernels
 
 Report = dict[str, Any]
-"""What `--json` writes; empty: nothing. A command gives it, and the exit code."""
+"""Figures of a command, which `--json` writes; empty if the command could not run. A command also returns a status."""
 
 
 class Row(NamedTuple):
-    """A line of the table: the samples in `unit`, and the most that they should be in the middle."""
+    """A row of the table: the samples in `unit`, and the target for their median, which is an upper limit."""
 
     name: str
     unit: str
@@ -69,13 +69,13 @@ def in_unit(samples: list[float], unit: float) -> list[float]:
 
 
 def ratios(samples: Samples) -> list[float]:
-    """Ours over theirs, round by round."""
+    """Returns our time over that of the step in C, round by round."""
     return [ours / theirs for ours, theirs in zip(samples["ours"], samples["c"], strict=True)]
 
 
 def run_physics(args: argparse.Namespace, console: Console) -> tuple[Report, int]:
     if not kernels.available():
-        console.print("error: there is neither a prebuilt kernel nor Numba; the benchmark times the compiled step")
+        console.print("error: no prebuilt kernel and no Numba here; the benchmark times the compiled step")
         return {}, 2
     rounds = 10 if args.quick else 60
     rows: list[Row] = []
@@ -138,14 +138,14 @@ def run_physics(args: argparse.Namespace, console: Console) -> tuple[Report, int
     if _step_c.available():
         console.print(f"the same hash as the step in C: {'yes' if report['hash_equal_to_c'] else 'NO'}")
     else:
-        console.print("gcc is not installed: the rows of the step in C are left out")
+        console.print("gcc is not installed: no rows for the step in C")
     console.print(f"slabs and cells give the same answers: {'yes' if report['obstacles_agree'] else 'NO'}")
     console.print(f"a million entities were spawned in {report['million_spawn_s']:.1f} s, terrain of 2 x 2 km included")
     return report, 0 if report["hash_equal_to_c"] is not False and report["obstacles_agree"] else 1
 
 
 def run_bytes(args: argparse.Namespace, console: Console) -> tuple[Report, int]:
-    """What a client is sent, by how the others move; some of them pause, so there are more in view than move."""
+    """Runs `bytes`, for each kind of motion. More entities are in view than move, because some pause."""
     ticks, seeds = (200, 1) if args.quick else (600, 3)
     runs = [
         wire.run(motion, round(args.entities * more), ticks, seed)
@@ -164,17 +164,19 @@ def run_bytes(args: argparse.Namespace, console: Console) -> tuple[Report, int]:
 
 
 def run_memory(args: argparse.Namespace, console: Console) -> tuple[Report, int]:
-    """What things take, and whether anything stays of what is gone."""
+    """Runs `memory`: in one process, over sockets, and under churn over sockets if --minutes is given."""
     report = memory.run(args.cycles)
     for name in ("segment", "entity", "connection"):
         console.print(f"{report[f'bytes_per_{name}']:10,.0f} bytes per {name}")
     after = report["bytes_after_each_cycle"]
-    console.print(f"{after[0]:10,} bytes after a cycle of churn, and in the {len(after) - 1} after it more by")
+    console.print(
+        f"{after[0]:10,} bytes in use after a cycle of churn; further bytes in each of the {len(after) - 1} after it:"
+    )
     console.print("           " + " ".join(f"{b - a:,}" for a, b in itertools.pairwise(after)))
     if sys.platform == "linux":
         apart = report["rss_bytes_per_connection"] = rss.connections(args.rounds)
         console.print(f"{statistics.median(apart):10,.0f} bytes of RSS per connection over sockets,", end=" ")
-        console.print("on servers apart: " + " ".join(f"{value:,.0f}" for value in apart))
+        console.print("per server: " + " ".join(f"{value:,.0f}" for value in apart))
     if args.minutes:
         report["churn"] = churn = rss.churn(args.minutes, lambda minute: console.print(f"  {minute}", soft_wrap=True))
         console.print(f"{churn['slope_kb_per_minute']:+10,.1f} KB of RSS per minute of churn over sockets,", end=" ")
@@ -183,7 +185,7 @@ def run_memory(args: argparse.Namespace, console: Console) -> tuple[Report, int]
 
 
 def run_entities(args: argparse.Namespace, console: Console) -> tuple[Report, int]:
-    """A large world, once for each seed."""
+    """Runs `entities` once for each seed."""
     runs = [entities.run(args.entities, args.clients, seed) for seed in range(1, args.seeds + 1)]
     made = Table("figure", title=f"entities: one in {entities.WALKS} walks, {entities.RATE} Hz, CPU time per tick")
     for number in range(1, args.seeds + 1):
@@ -211,36 +213,51 @@ def main(argv: list[str] | None = None) -> int:
     commands = parser.add_subparsers(dest="command", required=True)
     each = argparse.ArgumentParser(add_help=False)
     each.add_argument("--json", type=Path, metavar="OUT", help="write all figures to this file")
-    command = commands.add_parser("physics", parents=[each], help="the step of the shared world")
+    command = commands.add_parser("physics", parents=[each], help="time of the step")
     command.add_argument("--quick", action="store_true", help="fewer rounds")
     command.set_defaults(run=run_physics)
     command = commands.add_parser("server", parents=[each], help="clients per server process (Linux)")
     command.add_argument("--quick", action="store_true", help="one coarse search, within 45 s")
     command.add_argument(
-        "--crowd", type=int, nargs="?", const=300, metavar="N", help="N players in one segment instead (300)"
+        "--crowd",
+        type=int,
+        nargs="?",
+        const=300,
+        metavar="N",
+        help="put N players into one segment instead (default: 300)",
     )
     command.set_defaults(run=capacity.run)
-    command = commands.add_parser("bytes", parents=[each], help="what a client is sent")
-    command.add_argument("--entities", type=int, default=100, metavar="N", help="how many of them move (100)")
-    command.add_argument("--quick", action="store_true", help="ten seconds of one seed each")
+    command = commands.add_parser("bytes", parents=[each], help="bytes that a client receives")
+    command.add_argument("--entities", type=int, default=100, metavar="N", help="entities that move (default: 100)")
+    command.add_argument("--quick", action="store_true", help="ten seconds of one seed per kind of motion")
     command.set_defaults(run=run_bytes)
     command = commands.add_parser(
         "memory", parents=[each], help="bytes per connection, entity and segment, and under churn"
     )
-    command.add_argument("--cycles", type=int, default=10, metavar="N", help="of churn in process, 2 s each (10)")
-    command.add_argument("--rounds", type=int, default=3, metavar="N", help="of connections over sockets (3; Linux)")
-    command.add_argument("--minutes", type=float, default=0.0, metavar="M", help="of churn over sockets (none; Linux)")
+    command.add_argument(
+        "--cycles", type=int, default=10, metavar="N", help="cycles of churn in one process, 2 s each (default: 10)"
+    )
+    command.add_argument(
+        "--rounds", type=int, default=3, metavar="N", help="rounds of connections over sockets (default: 3; Linux)"
+    )
+    command.add_argument(
+        "--minutes", type=float, default=0.0, metavar="M", help="minutes of churn over sockets (default: none; Linux)"
+    )
     command.set_defaults(run=run_memory)
-    command = commands.add_parser("entities", parents=[each], help="a tick of a large world")
-    command.add_argument("--entities", type=int, default=100_000, metavar="N", help="a tenth of them walk (100,000)")
-    command.add_argument("--clients", type=int, default=200, metavar="N", help="that join (200)")
-    command.add_argument("--seeds", type=int, default=2, metavar="N", help="runs (2)")
+    command = commands.add_parser("entities", parents=[each], help="time of a tick of a large world")
+    command.add_argument(
+        "--entities", type=int, default=100_000, metavar="N", help="entities, a tenth of which walk (default: 100,000)"
+    )
+    command.add_argument("--clients", type=int, default=200, metavar="N", help="clients that join (default: 200)")
+    command.add_argument("--seeds", type=int, default=2, metavar="N", help="number of runs (default: 2)")
     command.set_defaults(run=run_entities)
     command = commands.add_parser(
-        "jitter", parents=[each], help="how late ticks are, by garbage collection and event loop (Linux)"
+        "jitter", parents=[each], help="lateness of ticks, by garbage collection and event loop (Linux)"
     )
-    command.add_argument("--clients", type=int, default=200, metavar="N", help="that play (200)")
-    command.add_argument("--rounds", type=int, default=4, metavar="N", help="of 10 s for each variant (4)")
+    command.add_argument("--clients", type=int, default=200, metavar="N", help="clients that play (default: 200)")
+    command.add_argument(
+        "--rounds", type=int, default=4, metavar="N", help="rounds of 10 s for each variant (default: 4)"
+    )
     command.add_argument("--quick", action="store_true", help="one round of 3 s each, within a minute")
     command.set_defaults(run=jitter.run)
     args = parser.parse_args(argv)

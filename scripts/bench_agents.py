@@ -1,6 +1,7 @@
-"""How fast agents learn: agent-steps per second of CPU time, over the in-process game, for several numbers of agents.
+"""Measures the speed of the environment for agents: agent-steps per second of CPU time, for several numbers of agents.
 
-Each step has its observations, rewards and infos made; actions are drawn ahead. Medians of five runs with their range.
+The game runs in the same process. Each step includes its observations, rewards and infos. Actions are drawn in advance.
+The output is the median of five runs, with the range.
 """
 
 import argparse
@@ -14,14 +15,14 @@ RUNS = 5
 
 
 def measure(scene: str, agents: int, steps: int) -> list[float]:
-    """Agent-steps per second of CPU time, run by run, ascending."""
+    """Returns the agent-steps per second of CPU time of each run, ascending."""
     env = Arena(scene, agents, seconds=1e6)
     env.reset(seed=1)
     for i, agent in enumerate(env.agents):
         env.action_space(agent).seed(i)
     actions = [{agent: env.action_space(agent).sample() for agent in env.agents} for _ in range(ACTIONS)]
     found = []
-    for run in range(-1, RUNS):  # the first one is left out
+    for run in range(-1, RUNS):  # run -1 only warms up
         began = time.process_time()
         for i in range(steps):
             env.step(actions[i % ACTIONS])
@@ -34,7 +35,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--agents", type=int, nargs="+", default=[2, 8, 32, 100], help="default: %(default)s")
     parser.add_argument("--scene", default="hills", help="default: %(default)s")
-    parser.add_argument("--steps", type=int, default=300, help="of one run (default: %(default)s)")
+    parser.add_argument("--steps", type=int, default=300, help="steps per run (default: %(default)s)")
     args = parser.parse_args()
     print("agents   agent-steps per second   x real time")
     for agents in args.agents:

@@ -1,12 +1,14 @@
-"""What saving a world costs: the latency of verdicts, the ticks' time, checkpoints, bytes and the way back.
+"""Measures the cost of saving a world: latency of command results, time of ticks, checkpoints, bytes, and loading.
 
-Four parts, each in a new directory under DIR (by default one for temporary files, so mind what disk that is):
+It has four parts, each with a new directory under DIR (default: the system's folder for temporary files; check which
+disk that is on):
 
-`verdicts`: a game in real time with one client that edits a block in every tick, without a link in between. From the
-step that carried an edit out to the snapshot that holds the verdict; and from a step to its record on disk.
-`ticks`: CPU time of a step of walkers, saved and not, in turns; the thread that writes is not in it.
-`checkpoint`: many entities, a hundred of which walk, and 500 segments of which every one has been edited; the step that
-copies them beside the others, how long until the checkpoint is on disk, and the steps until then.
+`verdicts`: a game in real time, with one client in the same process that edits a block in every tick. Measures the time
+from the step that did an edit to the snapshot with its result, and from a step to its record on disk.
+`ticks`: CPU time of a step of 100 walkers, saved and not saved, in turns. The time of the thread that writes is not
+included.
+`checkpoint`: many entities, a hundred of which walk, and 500 edited segments. Measures the step that copies them
+against the other steps, the time until the checkpoint is on disk, and the steps during that time.
 `way back`: CPU time to load a checkpoint and a log.
 """
 
@@ -37,11 +39,11 @@ from shared.snapshot import VERDICT
 from shared.units import SEGMENT
 
 HOW = {"nowhere": None, "process": False, "power": True}
-"""Where verdicts wait for, and `Store`'s `power`."""
+"""Kinds of durability that command results wait for, with the argument `power` of `Store`; None: there is no store."""
 
 
 class Client:
-    """A link to a client that keeps what it is sent."""
+    """A link to a client that keeps all messages."""
 
     def __init__(self) -> None:
         self.sent: list[bytes] = []
@@ -79,7 +81,7 @@ def quantiles(samples: list[float]) -> dict[str, float]:
 
 
 def verdicts(directory: str | None, ticks: int) -> dict[str, Any]:
-    """Latencies in ms by what the verdicts wait for."""
+    """Returns latencies in ms, by the kind of durability."""
     report: dict[str, Any] = {}
     scene = load_scene("flat")
     for name, power in HOW.items():
@@ -94,7 +96,7 @@ def verdicts(directory: str | None, ticks: int) -> dict[str, Any]:
 
 
 def edit_on(game: Game, ticks: int) -> list[float]:
-    """One edit per tick, in real time; ms from its step to its verdict."""
+    """Plays in real time with one edit per tick. Returns the times from an edit's step to its result, in ms."""
     link, tick_s = Client(), 1 / game.scene.tick_rate
     start = time.monotonic()
     session = game.open(link, start)
@@ -123,7 +125,7 @@ def edit_on(game: Game, ticks: int) -> list[float]:
 
 
 def walkers(store_or_none: Store | None, scene: Scene, n: int) -> Any:
-    """A world with walkers on hills."""
+    """Returns a world with `n` players on hills."""
     world = Game(scene).world if store_or_none is None else store_or_none.world
     side = int(np.ceil(np.sqrt(n)))
     x, y = np.meshgrid(*(np.linspace(4, part * SEGMENT - 4, side) for part in scene.size[:2]))
@@ -132,7 +134,7 @@ def walkers(store_or_none: Store | None, scene: Scene, n: int) -> Any:
 
 
 def ticks(directory: str | None, rounds: int) -> dict[str, Any]:
-    """CPU us per step of 100 walkers, all with a new input every 16 ticks."""
+    """Returns the CPU time in us per step of 100 walkers, all of which get a new input every 16 ticks."""
     scene = load_scene("hills")
     with opened(directory, scene) as store:
         worlds = {"nowhere": walkers(None, scene, 100), "saved": walkers(store, scene, 100)}
@@ -152,7 +154,7 @@ def ticks(directory: str | None, rounds: int) -> dict[str, Any]:
 
 
 def checkpoint(directory: str | None, entities: int, rounds: int) -> dict[str, Any]:
-    """The step that copies, in ms, with so many entities and 500 edited segments."""
+    """Returns the times in ms of the step that copies, and of others, with `entities` and 500 edited segments."""
     scene = replace(load_scene("hills"), size=(25, 20, 1))
     every = 40
     names = ("others", "others_time", "copies", "packed", "packed_time")
@@ -168,7 +170,7 @@ def checkpoint(directory: str | None, entities: int, rounds: int) -> dict[str, A
             world.step({entity: Input(127, 0, 0) for entity in range(1, 101)})
             wall, cpu = (time.monotonic() - began) * 1e3, (time.thread_time() - cpu) * 1e3
             if turn < 3 * every:
-                pass  # they are still falling to the ground
+                pass  # the walkers are still falling to the ground
             elif world.tick % every == 0:
                 report["copies"].append(cpu)
             elif turn % every != every // 2:
@@ -181,7 +183,7 @@ def checkpoint(directory: str | None, entities: int, rounds: int) -> dict[str, A
 
 
 def way_back(directory: str | None, log_ticks: int) -> dict[str, float]:
-    """Seconds to load a checkpoint and a log of so many ticks of 100 walkers."""
+    """Returns the CPU time in seconds to load a checkpoint and a log of `log_ticks` ticks of 100 walkers."""
     scene = load_scene("hills")
     with tempfile.TemporaryDirectory(dir=directory) as data, tempfile.TemporaryDirectory(dir=directory) as copy:
         store = Store(data, scene, checkpoint_s=3600)
@@ -206,9 +208,13 @@ def way_back(directory: str | None, log_ticks: int) -> dict[str, float]:
 
 def main(argv: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--dir", metavar="DIR", help="where to put the directories")
-    parser.add_argument("--quick", action="store_true", help="a tenth of it")
-    parser.add_argument("--json", type=Path, metavar="OUT", help="write the figures there")
+    parser.add_argument(
+        "--dir",
+        metavar="DIR",
+        help="folder in which to create the directories (default: the system's for temporary files)",
+    )
+    parser.add_argument("--quick", action="store_true", help="a tenth of the rounds, and fewer entities")
+    parser.add_argument("--json", type=Path, metavar="OUT", help="write the figures to this file")
     args = parser.parse_args(argv)
     scale = 1 if args.quick else 10
     crowds = (1_000, 10_000) if args.quick else (1_000, 10_000, 100_000)

@@ -1,9 +1,9 @@
-"""The published rules of six systems for steering input timing, as lead controllers.
+"""The published rules of six systems for the timing of inputs, as lead controllers.
 
-Each is fed with what that system knows, and nothing else: pings at its own interval, the snapshots' ticks as they
-arrive, or the margins that the server reports. The rules are theirs, the code is ours; the files named are where
-each project states its rule. Times in seconds, timelines in ticks (`client_sdk.clock`). Where a rule keeps a distance
-for safety, that is a parameter here, so that the league can ask what the rule could do with a better one.
+Each controller gets only the data that its system has: pings at its own interval, the ticks of arriving snapshots, or
+the margins that the server reports. The rules are those of the systems, the code is ours. Each docstring names the
+files in which a project states its rule. Times are in seconds, timelines in ticks (`client_sdk.clock`). A rule's safety
+distance is a parameter here, so that the league can measure the rule with a better one.
 """
 
 import math
@@ -13,18 +13,18 @@ from client_sdk.clock import ServerClock
 
 
 class Rival:
-    """What a controller may react to; by default to nothing.
+    """The base of the controllers, with the events that one can react to. It reacts to none.
 
     Args:
         rate: ticks per second.
-        more: ticks on top of the rule's own safety.
-        spread: the rule's multiple of the jitter, times this.
+        more: ticks to add to the rule's own safety distance.
+        spread: factor on the rule's multiple of the jitter.
     """
 
     ping_s = 1.0
-    """Pings are so far apart, once there have been five of them."""
+    """Seconds between two pings, after the first five."""
     spreads: tuple[float, ...] = (1.0,)
-    """What to try for `spread`; none: the rule keeps no distance, so there is nothing to set."""
+    """Values of `spread` that the league tries; empty if the rule keeps no safety distance."""
 
     def __init__(self, rate: float, more: float = 0.0, spread: float = 1.0) -> None:
         self.rate = rate
@@ -32,33 +32,34 @@ class Rival:
         self.spread = spread
 
     def answered(self, rtt_s: float, phase: float, now: float) -> None:
-        """A ping came back: the round trip, and the server's phase if both ways took the same time."""
+        """Takes the result of a ping: the round trip, and the server's phase if both directions took the same time."""
 
     def heard(self, tick: int, now: float) -> None:
-        """The snapshot of `tick` has arrived; the margins that it carried have been observed."""
+        """Takes the arrival of the snapshot of `tick`, after `observe` has taken its margins."""
 
     def observe(self, tick: int, margin: float, phase: float, now: float) -> None:
-        """As for `LeadController`."""
+        """Takes an input's arrival margin (`LeadController.observe`)."""
 
     def start(self, clock: ServerClock, now: float) -> float:
-        """As for `LeadController`."""
+        """Returns the first phase: half a round trip ahead of the server (`LeadController.start`)."""
         return clock.phase + clock.rtt_s / 2 * self.rate
 
     def steer(self, phase: float, elapsed: float, clock: ServerClock, now: float) -> float:
-        """As for `LeadController`."""
+        """Returns the new phase, here the old one (`LeadController.steer`)."""
         return phase
 
     def step(self, clock: ServerClock) -> float:
-        """As for `LeadController`; in the league no clock steps."""
+        """Returns the phase after a step of the clock (`LeadController.step`). In the league no clock steps."""
         return clock.phase + clock.rtt_s / 2 * self.rate
 
 
 class UnityN4E(Rival):
     """Netcode for Entities, `NetworkTimeSystem.cs` and `CommandReceiveSystem.cs`: closed loop on a mean.
 
-    Each tick the server averages (1/8) by how much the newest command is older than the tick; every snapshot carries
-    that age. The client adds a slack of two ticks, subtracts its own corrections of the last round trip, and runs
-    10 % faster or slower per tick of the rest, at most by 10 %; ten ticks off, it starts from the estimate again.
+    In each tick the server averages (weight 1/8) how much older than the tick the newest command is. Every snapshot
+    carries that age. The client adds a slack of two ticks and subtracts its own corrections of the last round trip. It
+    runs 10 % faster or slower per tick of the rest, at most by 10 %. If the rest is ten ticks, it starts from the
+    estimate again.
     """
 
     SLACK = 2.0
@@ -73,15 +74,15 @@ class UnityN4E(Rival):
         self._corrections: deque[tuple[float, float]] = deque()
 
     def start(self, clock: ServerClock, now: float) -> float:
-        """The estimate of the newest snapshot plus round trip and slack is half a round trip ahead of the server."""
+        """Returns the estimate: the newest snapshot + RTT + slack, which is half an RTT + slack ahead of the server."""
         return super().start(clock, now) + self.SLACK + self.more
 
     def observe(self, tick: int, margin: float, phase: float, now: float) -> None:
-        """When the command arrived on the server, in ticks: what the server averages by itself."""
+        """Remembers when a command arrived at the server, in ticks, for the server's average."""
         self._arrivals.append((tick - margin, tick))
 
     def heard(self, tick: int, now: float) -> None:
-        """Carries on the server's average up to the snapshot's tick."""
+        """Advances the server's average up to the snapshot's tick."""
         if self._tick < 0:
             self._tick = tick - 1
         while self._tick < tick:
@@ -93,7 +94,7 @@ class UnityN4E(Rival):
                 self._told = self._age
 
     def steer(self, phase: float, elapsed: float, clock: ServerClock, now: float) -> float:
-        """Timescale from what is left of the age."""
+        """Changes the speed in proportion to the rest of the age."""
         while self._corrections and self._corrections[0][0] < now - clock.rtt_s:
             self._corrections.popleft()
         if self._told is None:
@@ -111,9 +112,10 @@ class UnityN4E(Rival):
 class Lightyear(Rival):
     """lightyear, `timeline/sync.rs`, `input.rs`, `remote.rs`, `ping/estimator.rs`: open loop on pings.
 
-    Ten pings a second; smoothed round trip (1/12) and deviation (1/6), outliers clamped; jitter is half the
-    deviation. Aims at the remote timeline + RTT/2 + 4 jitter + three ticks. More than a tick off for three frames of
-    the same sign, it runs up to 10 % faster or slower; ten ticks off, it snaps.
+    It sends ten pings a second, and smooths the round trip (weight 1/12) and its deviation (1/6), with outliers
+    clamped. The jitter is half the deviation. The objective is the remote timeline + RTT/2 + 4 jitter + three ticks.
+    After three frames that are more than a tick off in the same direction, it runs up to 10 % faster or slower. If it
+    is ten ticks off, it snaps.
     """
 
     ping_s = 0.1
@@ -129,7 +131,7 @@ class Lightyear(Rival):
         self._speed = 0.0
 
     def answered(self, rtt_s: float, phase: float, now: float) -> None:
-        """Smoothing with clamped outliers."""
+        """Smooths the round trip and its deviation, with outliers clamped."""
         if self._rtt is None:
             self._rtt, self._deviation = rtt_s, rtt_s / 2
             return
@@ -138,7 +140,7 @@ class Lightyear(Rival):
         self._rtt += (rtt_s - self._rtt) / 12
 
     def heard(self, tick: int, now: float) -> None:
-        """The remote timeline: this tick, half a round trip ago; the more jitter, the smoother."""
+        """Smooths the remote timeline, where `tick` was half a round trip ago. More jitter smooths more."""
         if self._rtt is None:
             return
         phase = tick + self._rtt / 2 * self.rate - self.rate * now
@@ -152,11 +154,11 @@ class Lightyear(Rival):
         return remote + (rtt / 2 + self.spread * 4 * self._deviation / 2) * self.rate + 3.0 + self.more
 
     def start(self, clock: ServerClock, now: float) -> float:
-        """At the objective."""
+        """Returns the objective."""
         return self._target(clock)
 
     def steer(self, phase: float, elapsed: float, clock: ServerClock, now: float) -> float:
-        """Speed in proportion to the error, fading by 10 % a frame."""
+        """Sets a speed in proportion to the error, which fades by 10 % per frame."""
         off = self._target(clock) - phase
         if abs(off) > 10:
             self._same = 0
@@ -173,9 +175,10 @@ class Lightyear(Rival):
 class Naia(Rival):
     """naia, `connection/time_manager.rs`: open loop on pings.
 
-    One ping a second; averages (1/10) of offset and round trip from samples within one deviation. The sending
-    timeline is latency + 3 jitter + four ticks + one of danger ahead of the server; within 50 ms it runs at normal
-    speed; beyond, 20 ms more double or halve it, and so on up to tenfold.
+    It sends one ping a second, and averages (weight 1/10) offset and round trip over the samples within one deviation.
+    The sending timeline is ahead of the server by latency + 3 jitter + four ticks + one tick against danger. Within
+    50 ms of that it runs at normal speed. A distance of 20 ms more doubles or halves the speed, 40 ms more triple it or
+    divide it by three, and so on up to tenfold.
     """
 
     spreads = (0.5, 1.0)
@@ -188,7 +191,7 @@ class Naia(Rival):
         self._first: list[tuple[float, float]] = []
 
     def answered(self, rtt_s: float, phase: float, now: float) -> None:
-        """Both averages, pruned."""
+        """Updates both averages, without the samples beyond one deviation."""
         sample = (rtt_s, phase / self.rate)
         if self._raw is None:
             self._first.append(sample)
@@ -203,12 +206,12 @@ class Naia(Rival):
             self._mean = (0.9 * self._mean[0] + 0.1 * rtt_s, 0.9 * self._mean[1] + 0.1 * sample[1])
 
     def start(self, clock: ServerClock, now: float) -> float:
-        """At the target."""
+        """Returns the target."""
         jitter = math.sqrt(self._var[0]) / 2
         return (self._mean[1] + self._mean[0] / 2 + self.spread * 3 * jitter) * self.rate + 5.0 + self.more
 
     def steer(self, phase: float, elapsed: float, clock: ServerClock, now: float) -> float:
-        """Speed by distance, never beyond the target."""
+        """Sets a speed by the distance from the target, without passing it."""
         off = self.start(clock, now) - phase
         beyond = (abs(off) / self.rate - 0.05) * 1000
         if beyond <= 0:
@@ -219,10 +222,10 @@ class Naia(Rival):
 
 
 class Netfox(Rival):
-    """netfox, `network-time-synchronizer.gd`: the client lives at the server's time.
+    """netfox, `network-time-synchronizer.gd`: the client's time is the server's time.
 
-    Eight samples, 0.25 s apart, weighted by log(1 + RTT); an eighth of the mean offset at each; two seconds off, it
-    resets. There is no lead: every input is late, and the server rolls back for it.
+    It takes eight samples, 0.25 s apart, weighted by log(1 + RTT), and corrects an eighth of the mean offset at each.
+    If it is two seconds off, it resets. There is no lead: every input is late, and the server rolls back for it.
     """
 
     ping_s = 0.25
@@ -234,18 +237,18 @@ class Netfox(Rival):
         self._phase: float | None = None
 
     def answered(self, rtt_s: float, phase: float, now: float) -> None:
-        """Nudges its clock."""
+        """Corrects an eighth of the offset."""
         self._samples.append((math.log(1 + rtt_s), phase))
         mean = sum(w * p for w, p in self._samples) / sum(w for w, _ in self._samples)
         mine = mean if self._phase is None else self._phase
         self._phase = mean if abs(mean - mine) > 2 * self.rate else mine + (mean - mine) / 8
 
     def start(self, clock: ServerClock, now: float) -> float:
-        """At the server's time."""
+        """Returns the server's time."""
         return clock.phase if self._phase is None else self._phase
 
     def steer(self, phase: float, elapsed: float, clock: ServerClock, now: float) -> float:
-        """Stretched by at most a quarter."""
+        """Approaches the corrected time, at most a quarter faster or slower."""
         assert self._phase is not None
         return phase + max(-0.25 * elapsed, min(self._phase - phase, 0.25 * elapsed))
 
@@ -253,10 +256,10 @@ class Netfox(Rival):
 class DDNet(Rival):
     """DDNet, `smooth_time.cpp`, `client.cpp`, `server.cpp`: closed loop on each input's time left.
 
-    Every input is answered with its time left; the target is where it would have had 10 ms. A lateness beyond 50 ms
-    adds 5 to a counter (each good input takes 1) and is ignored below 15. The way up is gone at a speed (share of it
-    per second) that doubles with each late input, up to 30, and falls by 5 % with each good one, down to 2; the way
-    down at 0.3.
+    The server answers every input with its time left. The target is the time at which the input would have had 10 ms
+    left. An input more than 50 ms late adds 5 to a counter, from which each good input takes 1. Such an input is
+    ignored while the counter is below 15. Upwards, the timeline goes a share of the distance per second that doubles
+    with each late input, up to 30, and falls by 5 % with each good one, down to 2. Downwards, the share is 0.3.
     """
 
     MARGIN_S = 0.010
@@ -268,7 +271,7 @@ class DDNet(Rival):
         self._target: float | None = None
 
     def observe(self, tick: int, margin: float, phase: float, now: float) -> None:
-        """A new target, and a new speed."""
+        """Updates the target and the speed."""
         if margin < 0:
             spike = margin / self.rate < -0.05
             if spike:
@@ -283,11 +286,11 @@ class DDNet(Rival):
         self._target = phase - margin + self.MARGIN_S * self.rate + self.more
 
     def start(self, clock: ServerClock, now: float) -> float:
-        """Half a round trip and the margin ahead."""
+        """Returns half a round trip and the margin ahead of the server."""
         return super().start(clock, now) + self.MARGIN_S * self.rate + self.more
 
     def steer(self, phase: float, elapsed: float, clock: ServerClock, now: float) -> float:
-        """A share of the way."""
+        """Goes a share of the distance to the target."""
         if self._target is None:
             return phase
         way = self._target - phase
@@ -297,9 +300,9 @@ class DDNet(Rival):
 class Mirror(Rival):
     """Mirror, `NetworkTime.cs`, predicted time: open loop on the server's answer to pings.
 
-    Ten pings a second; the server answers how far its time at the ping's arrival was ahead of the client's at
-    sending, and the client adds the average of that (over 20) to its clock. So half of all inputs come too late by
-    design: the mean is met.
+    It sends ten pings a second. The server answers by how much its time at a ping's arrival was ahead of the client's
+    time at sending. The client adds the average of the last 20 answers to its clock. Half of all inputs arrive too
+    late by design, because the timeline is at the mean.
     """
 
     ping_s = 0.1
@@ -310,16 +313,16 @@ class Mirror(Rival):
         self._ahead: float | None = None
 
     def answered(self, rtt_s: float, phase: float, now: float) -> None:
-        """An exponential average over 20."""
+        """Updates an exponential average over 20 pings."""
         ahead = phase + rtt_s / 2 * self.rate
         self._ahead = ahead if self._ahead is None else self._ahead + 2 / 21 * (ahead - self._ahead)
 
     def start(self, clock: ServerClock, now: float) -> float:
-        """At the average."""
+        """Returns the average."""
         return super().start(clock, now) if self._ahead is None else self._ahead
 
     def steer(self, phase: float, elapsed: float, clock: ServerClock, now: float) -> float:
-        """Follows at once, as its clock does."""
+        """Jumps to the average, as the system's clock does."""
         return phase if self._ahead is None else self._ahead
 
 

@@ -1,13 +1,13 @@
 #!/usr/bin/env python3
-"""Fuzzes what takes bytes from others: the decoders, the session of a client, and the settings.
+"""Fuzzes the code that takes bytes from outside: the decoders, a client's session, and the settings.
 
     python scripts/fuzz.py [--inputs 10000000] [--seed 1] [--target client ...] [--keep] [--json OUT]
 
-Inputs are changed copies of those of the corpus (tests/fuzz/corpus, small files) and of some that are well-formed. One
-is added to those that are changed further when something new comes of it: another outcome or, in the inputs that are
-traced (all of the first thousand, then one in 256, for tracing makes them ten times slower), a line of the project's
-code that none has reached. --keep writes those to the corpus. Everything follows from the seed: a failure tells the
-number of its input, and ends with 1.
+Inputs are changed copies of the corpus (tests/fuzz/corpus, small files) and of some well-formed messages. An input with
+a new result joins the pool of inputs to change. A result is new if its outcome is, or if a traced input reaches a line
+of the project's code that none has reached. The first thousand inputs are traced, then one in 256, because tracing
+takes ten times as long. --keep writes inputs with new results to the corpus. Everything depends on the seed only. A
+failure is reported with the number of its input. Exits with 1 if there was a failure.
 """
 
 import argparse
@@ -35,19 +35,19 @@ CODE = tuple(str(ROOT / part) for part in ("shared", "server"))
 TRACED_FIRST, TRACED_EACH = 1000, 256
 BATCH = 2000
 KEPT_BYTES_MAX = 1024
-"""Of what is new, only so small a file goes into the corpus."""
+"""Largest input, in bytes, that --keep writes to the corpus."""
 
 Figures = dict[str, Any]
 
 
 class Traced:
-    """Lines of the project's code that have been reached."""
+    """The lines of the project's code that have been reached."""
 
     def __init__(self) -> None:
         self.lines: set[tuple[Any, int]] = set()
 
     def run(self, target: Target, data: bytes) -> tuple[str, bool]:
-        """The outcome, and whether a new line was reached."""
+        """Runs a target. Returns the outcome, and whether it reached a new line."""
         before = len(self.lines)
         sys.settrace(self._enter)
         try:
@@ -68,9 +68,14 @@ class Traced:
 def fuzz(
     name: str, inputs: int, seed: int, *, corpus: Path = CORPUS, keep: bool = False, tick: Callable[[int], object] = id
 ) -> Figures:
-    """One target; `tick` is told how many inputs there have been since it was told last. The figures.
+    """Fuzzes one target. Returns the figures; "failure" is empty, or describes a failure with the input in hexadecimal.
 
-    What goes wrong is told in `failure`, with the input in hexadecimal digits.
+    Args:
+        name: the target (`TARGETS`).
+        inputs: number of inputs.
+        corpus: folder of the corpus.
+        keep: whether to write inputs with new results to the corpus.
+        tick: called from time to time with the number of inputs since the last call.
     """
     make, seeds, _ = TARGETS[name]
     target, rng, trace = make(), random.Random(f"{seed} {name}"), Traced()
@@ -120,10 +125,14 @@ def main(argv: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter, allow_abbrev=False
     )
-    parser.add_argument("--inputs", type=int, default=200_000, metavar="N", help="in all (default: %(default)s)")
+    parser.add_argument(
+        "--inputs", type=int, default=200_000, metavar="N", help="number of inputs (default: %(default)s)"
+    )
     parser.add_argument("--seed", type=int, default=1, help="default: %(default)s")
-    parser.add_argument("--target", action="append", choices=sorted(TARGETS), help="only this one; may be repeated")
-    parser.add_argument("--keep", action="store_true", help="write what is new to the corpus")
+    parser.add_argument(
+        "--target", action="append", choices=sorted(TARGETS), help="fuzz only this target; may be repeated"
+    )
+    parser.add_argument("--keep", action="store_true", help="write inputs with new results to the corpus")
     parser.add_argument("--json", type=Path, metavar="OUT", help="write the figures to this file")
     args = parser.parse_args(argv)
     console = Console()

@@ -1,20 +1,23 @@
 #!/usr/bin/env python3
-"""The league of lead controllers: late inputs against added latency, per link, in simulated time.
+"""Compares lead controllers: late inputs against added latency, per link, in simulated time.
 
-A trial has no physics: a server that ticks, a client whose clock drifts and starts anywhere, pings, one input per
-tick up the link, one snapshot per tick down it that tells the margins, and the controller. Its *oracle* is the least
-constant lead that would have met the same share of late inputs, from the run's own arrival times.
+A trial has no physics. It consists of a server that ticks, a client whose clock drifts and starts at a random time,
+pings, one input per tick to the server, one snapshot per tick to the client with the arrival margins, and the
+controller. Its *oracle* is the least constant lead that would have had the same share of late inputs, computed from the
+run's own arrival times.
 
     added latency   mean lead of an input over the server's true time when it was made, minus half the round trip
-    fair            without what no controller can know beforehand: spikes and the 250 ms after, a dip's first second
-    above           of the fair ones, what is added beyond the oracle
-    it needs        what the other would add at our late share, with the safety that is best for it on this very run
-    ours then       what ours adds at the other's late share, likewise with other settings
-    front           no other controller is both less late and less ahead
+    fair            only inputs for which a controller could prepare: not those made during a spike or the 250 ms after
+                    it, or in a dip's first second
+    above           latency added beyond the oracle, over the fair inputs
+    it needs        latency that the other controller would add at our late share, with its best setting for this run
+    ours then       latency that ours would add at the other's late share, with its best setting for this run
+    front           no other controller has both fewer late inputs and less latency
 
-Ours is compared at its default, which is the same on every link. A setting found on the run that it is judged by is
-more than anybody has in practice: both columns favour the one that is set. With `--seeds`, what a rule needs at our
-late share is compared with ours on each run, for a run of ten minutes decides it by a few ms either way.
+Our controller is compared at its default setting, which is the same on every link. A setting chosen from the run that
+it is judged by is better than any that is possible in practice, so both columns favour the controller that is set. With
+`--seeds`, the latency that a rule needs at our late share is compared with ours on each run, because one run of ten
+minutes decides it only to within a few ms.
 """
 
 import argparse
@@ -51,13 +54,13 @@ AFTER_DIP_S = 1.0
 TIE_MS = 0.1 * TICK_MS
 OURS = "ours"
 BOUNDS = {"lan": 0.005, "regional": 0.005, "typical": 0.01, "far": 0.02, "wifi": 0.02, "dip": 0.01}
-"""Share of late inputs that a preset allows, of the fair ones."""
+"""Largest share of late inputs, among the fair ones, that each preset allows."""
 SHARE_MAX = 0.5
-"""Who is late more often does not steer for his inputs to be on time, and is left out of the comparison."""
+"""Share of late inputs from which a controller is not compared, because it does not try to be on time."""
 LONG_S = 4.0
-"""A longest stall that takes the presets' spikes for stalls, and covers them."""
+"""Longest stall, in seconds, as a setting of our controller with which it treats the presets' spikes as stalls."""
 SEARCH = 8
-"""Trials per search for a rival's setting."""
+"""Trials per search for another controller's setting."""
 
 Row = dict[str, Any]
 
@@ -66,9 +69,9 @@ class Trial:
     """One controller on one link.
 
     Args:
-        preset: see `client_sdk.links.PRESETS`.
-        lead: the controller; a `Rival` hears of pings and snapshots, too.
-        seed: everything random comes from it, and nothing of it from what the controller does.
+        preset: a name in `client_sdk.links.PRESETS`.
+        lead: the controller; a `Rival` also gets the results of pings and the ticks of snapshots.
+        seed: source of everything random, which does not depend on the controller.
     """
 
     def __init__(self, preset: str, lead: LeadController, seed: int) -> None:
@@ -77,11 +80,11 @@ class Trial:
         self.lead = lead
         self.weather = Weather(PRESETS[preset], rng.getrandbits(32))
         self.leads: dict[int, float] = {}
-        """By tick: how far ahead of the server's true time the input was made."""
+        """Lead of each tick's input over the server's true time when it was made, in ticks."""
         self.margins: dict[int, float] = {}
-        """By tick: by how much it arrived before its deadline."""
+        """Arrival margin of each tick's input, in ticks."""
         self.made: dict[int, float] = {}
-        """By tick: when it was made."""
+        """Time at which each tick's input was made."""
         self._rival = lead if isinstance(lead, Rival) else None
         self._drift = rng.uniform(-DRIFT, DRIFT)
         self._clock_start = rng.uniform(0, 1e5)
@@ -102,11 +105,11 @@ class Trial:
         self._next_ping = 0.0
 
     def at(self, when: float, act: Callable[[], None]) -> None:
-        """See `client_sdk.links.Scheduler`."""
+        """Schedules a call for a time (`client_sdk.links.Scheduler`)."""
         heapq.heappush(self._queue, (when, next(self._number), act))
 
     def run(self, seconds: float) -> None:
-        """From connecting on."""
+        """Runs the trial, from connecting on."""
         self._server()
         self._client()
         queue = self._queue
@@ -184,17 +187,17 @@ class Trial:
         self._going_up.append((tick, 0.0))
         self._up.send(bytes(INPUT_BYTES))
 
-    # -- what came of it -----------------------------------------------------------------------------------
+    # -- results -------------------------------------------------------------------------------------------
 
     def fair(self, tick: int) -> bool:
-        """Whether the input was made when the weather was as before."""
+        """Returns whether a tick's input was made outside of spikes and the start of a dip."""
         made, weather = self.made[tick], self.weather
         if 0 <= weather.dipped(made) < AFTER_DIP_S:
             return False
         return not any(begin - 2 * weather.path.rtt_s <= made < end + AFTER_SPIKE_S for begin, end, _ in weather.spikes)
 
     def figures(self, ticks: Iterable[int]) -> tuple[float, float, float, float]:
-        """Of these inputs: late share; mean and 99th percentile of the added latency, and the oracle's, in ticks."""
+        """Returns the late share of these inputs, and in ticks the mean and p99 of added latency, and the oracle's."""
         leads, needs, late = [], [], 0
         for tick in ticks:
             leads.append(self.leads[tick])
@@ -210,7 +213,7 @@ class Trial:
         return late / len(leads), mean - half, p99 - half, oracle - half
 
     def row(self, preset: str, controller: str, seed: int) -> Row:
-        """The trial's line in the table; latencies in ms."""
+        """Returns the trial's row of the table. Latencies are in ms."""
         known = sorted(self.margins)
         share, mean, p99, oracle = self.figures(known)
         fair_share, fair_mean, _, fair_oracle = self.figures(filter(self.fair, known))
@@ -232,7 +235,7 @@ class Trial:
 
 
 def trial(preset: str, controller: str, minutes: float, seed: int, setting: tuple[float, ...] = ()) -> Row:
-    """One controller by name, with a setting, if one is given: of `PricedLead`, or of a `Rival` after its rate."""
+    """Runs a controller by name. `setting` has arguments for `PricedLead`, or for a `Rival` after its rate."""
     lead: LeadController = PricedLead(*setting) if controller == OURS else RIVALS[controller](RATE, *setting)
     run = Trial(preset, lead, seed)
     run.run(60 * minutes)
@@ -240,13 +243,13 @@ def trial(preset: str, controller: str, minutes: float, seed: int, setting: tupl
 
 
 def run(preset: str, minutes: float, seed: int) -> list[Row]:
-    """Every controller on one link, ours first: rows as of `Trial.row`, and for each
+    """Runs every controller on one link. Returns the rows of `Trial.row`, ours first, and in each further
 
-    its_latency_ms      what it would add at our late share; None: it cannot, or there is nothing to set
+    its_latency_ms      latency that it would add at our late share; None: it cannot reach it, or has no setting
     first               ours adds less than that, or the same within `TIE_MS`
-    equal_latency_ms    what ours would add at its late share; None beyond the curve
+    equal_latency_ms    latency that ours would add at its late share; None beyond the curve
     beaten              ours adds less at that share, or the same within `TIE_MS`
-    on_front            no other controller is both less late and less ahead
+    on_front            no other controller has both fewer late inputs and less latency
     """
     rows = [trial(preset, name, minutes, seed) for name in (OURS, *RIVALS)]
     ours = rows[0]
@@ -266,7 +269,10 @@ def run(preset: str, minutes: float, seed: int) -> list[Row]:
 
 
 def set_to(row: Row, ours: Row, minutes: float) -> float | None:
-    """What a rival adds with the least safety that makes it no later than ours, for one who may switch between two."""
+    """Returns the latency that another controller adds with the least safety at which it is no later than ours.
+
+    It may switch between two settings (`curve`). None: no setting reaches our late share.
+    """
     best: list[float] = []
     for spread in RIVALS[row["controller"]].spreads:
         points = [point(row)]
@@ -282,7 +288,7 @@ def set_to(row: Row, ours: Row, minutes: float) -> float | None:
 
 
 def settings(preset: str) -> list[tuple[float, float, float]]:
-    """Price in ticks, safety in ticks, longest stall in seconds: what ours is tried with, from careless to careful."""
+    """Returns settings to try ours with: price, safety and longest stall in seconds, from careless to careful."""
     ticks = [(price, SAFETY_S * RATE) for price in (3.0, 10.0, 30.0, 80.0, 600.0, 2000.0)]
     ticks += [(PRICE_S * RATE, 0.08), (PRICE_S * RATE, 0.15)]
     ticks += [(2000.0, safety) for safety in (0.3, 0.6, 1.0, 1.5, 2.0)]
@@ -292,7 +298,7 @@ def settings(preset: str) -> list[tuple[float, float, float]]:
 
 
 def curve(points: list[tuple[float, float]], late: float) -> float | None:
-    """The least latency at a late share, for one who may switch between the points."""
+    """Returns the least latency at a late share, where a controller may switch between the settings of two points."""
     under = [point for point in points if point[0] <= late]
     over = [point for point in points if point[0] > late]
     between = [a + (b - a) * (late - x) / (y - x) for x, a in under for y, b in over]
@@ -302,12 +308,12 @@ def curve(points: list[tuple[float, float]], late: float) -> float | None:
 
 
 def point(row: Row) -> tuple[float, float]:
-    """Late share and added latency."""
+    """Returns the late share and the added latency of a row."""
     return row["late_inputs_share"], row["added_latency_ms"]
 
 
 def table(rows: list[Row]) -> Table:
-    """What `run` found, for people. Latencies in ms."""
+    """Returns the rows of `run` as a table for people. Latencies are in ms."""
     result = Table(title="Lead controllers: late inputs against added latency (ms)", box=box.SIMPLE_HEAD)
     for column in ("preset", "controller"):
         result.add_column(column, no_wrap=True)
@@ -335,7 +341,7 @@ def table(rows: list[Row]) -> Table:
 
 
 def summary(rows: list[Row]) -> Table:
-    """Means over the seeds, and how much less ours adds than each other would at our late share, with its scatter."""
+    """Returns a table of means over the seeds, and of how much less ours adds than each other at our late share."""
     result = Table(title="At our late share: added latency (ms), means over the seeds", box=box.SIMPLE_HEAD)
     for column in ("preset", "controller"):
         result.add_column(column, no_wrap=True)
@@ -362,11 +368,11 @@ def mean(rows: list[Row], name: str) -> float:
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--preset", choices=PRESETS, action="append", help="one or more; without, all")
-    parser.add_argument("--minutes", type=float, default=10, help="of simulated play (default: %(default)g)")
-    parser.add_argument("--seed", type=int, default=1, help="everything random comes from it (default: %(default)d)")
-    parser.add_argument("--seeds", type=int, default=1, help="so many, from that one on (default: %(default)d)")
-    parser.add_argument("--json", type=File, metavar="OUT", help="writes the rows")
+    parser.add_argument("--preset", choices=PRESETS, action="append", help="play only on this link; may be repeated")
+    parser.add_argument("--minutes", type=float, default=10, help="simulated time per trial (default: %(default)g)")
+    parser.add_argument("--seed", type=int, default=1, help="first seed (default: %(default)d)")
+    parser.add_argument("--seeds", type=int, default=1, help="number of seeds, from --seed on (default: %(default)d)")
+    parser.add_argument("--json", type=File, metavar="OUT", help="write the rows to this file")
     chosen = parser.parse_args()
     names = chosen.preset or list(PRESETS)
     seeds = range(chosen.seed, chosen.seed + max(chosen.seeds, 1))

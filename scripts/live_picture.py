@@ -1,4 +1,4 @@
-"""A picture of the live page: a real server, bots that play on it, and a headless Chromium that looks."""
+"""Takes a picture of the live page: a real server, bots that play on it, and a headless Chromium."""
 
 import argparse
 import asyncio
@@ -18,7 +18,7 @@ PLAYED = ("wander", "follow", "wander", "run-and-jump", "dig-and-place")
 
 
 async def look(args: argparse.Namespace, browser: str) -> bytes:
-    """The PNG, after so many seconds of play."""
+    """Plays for `args.seconds`. Returns the picture as PNG."""
     async with own_server(args) as (_, url), asyncio.TaskGroup() as group:
         clients = []
         for i, name in enumerate(NAMES):
@@ -46,15 +46,17 @@ def _photograph(browser: str, url: str, seconds: float, light: bool) -> bytes:
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, allow_abbrev=False)
-    parser.add_argument("--seconds", type=float, default=40.0, help="of play (default: %(default)g)")
-    parser.add_argument("--light", action="store_true", help="as a browser with a light theme shows it")
+    parser.add_argument(
+        "--seconds", type=float, default=40.0, help="seconds of play before the picture (default: %(default)g)"
+    )
+    parser.add_argument("--light", action="store_true", help="use the page's light theme")
     parser.add_argument("--scene", default="hills", help="default: %(default)s")
     parser.add_argument("--out", type=Path, default=Path("docs/live.png"), help="default: %(default)s")
     args = parser.parse_args()
     args.tick_rate = None
     browser = installed()
     if browser is None:
-        print("error: there is no Chromium on this machine", file=sys.stderr)
+        print("error: no Chromium was found on this machine", file=sys.stderr)
         return 2
     args.out.write_bytes(asyncio.run(look(args, browser)))
     print(args.out)

@@ -1,4 +1,4 @@
-"""Runs `sovereign-loadtest` of this checkout: bots on real sockets against a real server. `--help` says more."""
+"""Runs `sovereign-loadtest` of this checkout: bots on real sockets against a real server. See `--help`."""
 
 import sys
 

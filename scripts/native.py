@@ -1,11 +1,11 @@
 #!/usr/bin/env python3
-"""Runs a program of the repository on the same sources, compiled by mypyc: half the time in the network lab.
+"""Runs a program of the repository with its sources compiled by mypyc. The network lab takes half the time.
 
     python scripts/native.py scripts/netlab.py --preset typical --minutes 60
     python scripts/native.py -m server --scene hills
 
-Needs a C compiler and Python's headers. A copy of the sources is compiled in `build/native`, once for each state of
-them (a minute, 30 MB), and the program runs there; without this script nothing knows of it.
+Needs a C compiler and Python's headers. A copy of the sources is compiled in `build/native`, once for each state of the
+sources (a minute, 30 MB), and the program runs there. Nothing else uses the compiled copy.
 """
 
 from __future__ import annotations
@@ -33,15 +33,15 @@ MODULES = (
     "shared/edits.py", "shared/inputs.py", "shared/messages.py", "shared/ring.py", "shared/snapshot.py",
     "sovereign_netcode/playtest/match.py",
 )  # fmt: skip
-"""What a tick of a server and of a client goes through. Classes in here cannot be derived from by other programs, so
-rules, policies and transports are none of it."""
+"""Modules that a tick of a server and of a client runs. Other programs cannot derive from the classes of a compiled
+module, so rules, policies and transports are not among them."""
 
 
 def built() -> Path:
-    """The folder with the compiled copy of the sources as they are now.
+    """Returns the folder with the compiled copy of the current sources. Compiles them if there is none.
 
     Raises:
-        SystemExit: they cannot be compiled.
+        SystemExit: the sources cannot be compiled.
     """
     digest = hashlib.sha256(sys.version.encode())
     for file in sources():
@@ -58,7 +58,7 @@ def built() -> Path:
 
 
 def sources() -> list[Path]:
-    """All that a program of the repository may need."""
+    """Returns all files that a program of the repository may need."""
     files = (file for folder in SOURCES for file in (ROOT / folder).rglob("*") if "__pycache__" not in file.parts)
     return [ROOT / "pyproject.toml", *sorted(file for file in files if file.is_file())]
 
@@ -66,8 +66,11 @@ def sources() -> list[Path]:
 def build(place: Path, optimise: int = 3) -> None:
     """Copies the sources to a new folder, and compiles them there.
 
+    Args:
+        optimise: the C compiler's level of optimisation, from 0 to 3.
+
     Raises:
-        SystemExit: they cannot be compiled.
+        SystemExit: the sources cannot be compiled.
     """
     for file in sources():
         copy = place / file.relative_to(ROOT)
@@ -78,8 +81,10 @@ def build(place: Path, optimise: int = 3) -> None:
     done = subprocess.run(command, cwd=place, env=environment, capture_output=True, text=True, check=False)
     if done.returncode:
         shutil.rmtree(place)
-        sys.exit(f"failed\n{done.stdout[-2000:]}{done.stderr[-2000:]}\nAre a C compiler and Python's headers there?")
-    shutil.rmtree(place / "build")  # in C
+        sys.exit(
+            f"failed\n{done.stdout[-2000:]}{done.stderr[-2000:]}\nAre a C compiler and Python's headers installed?"
+        )
+    shutil.rmtree(place / "build")  # the C sources and object files
 
 
 def main(arguments: list[str]) -> None:
@@ -90,14 +95,14 @@ def main(arguments: list[str]) -> None:
         os.execv(PYTHON, (str(PYTHON), __file__, *arguments))
     place = built()
     if arguments[0] == "-m":
-        command = ["-P", *arguments]  # not from the folder that one is in
+        command = ["-P", *arguments]  # modules in the current folder cannot hide others
     else:
         script = Path(arguments[0]).resolve()
         if not script.is_relative_to(ROOT):
-            sys.exit(f"{arguments[0]}: is no program of {ROOT}")
+            sys.exit(f"{arguments[0]}: not a program in {ROOT}")
         command = [str(place / script.relative_to(ROOT)), *arguments[1:]]
     path = os.pathsep.join(filter(None, (str(place), os.environ.get("PYTHONPATH"))))
-    # In the place of this one, so that what ends it ends the program.
+    # Replaces this process, so that a signal to it reaches the program.
     os.execve(sys.executable, (sys.executable, *command), os.environ | {"PYTHONPATH": path})
 
 

@@ -1,11 +1,11 @@
 #!/usr/bin/env python3
-"""What the player feels under a stated link: full matches in simulated time, one seed, a table and a picture.
+"""Measures what a player feels on each kind of link: full matches in simulated time, from one seed.
 
     python scripts/netlab.py [--preset wifi] [--clients 10] [--minutes 10] [--seed 1] [--json OUT] [--plot OUT.png]
 
-The real server core and real SDK cores play over modelled TCP connections (`client_sdk/links.py`). All players wander
-on `hills`, where they meet now and then. Late inputs are a share of all inputs; snapshot age is how old the newest
-snapshot is, looked at once per tick; lead is how far ahead of the server the player's own tick is.
+The real server core and real SDK cores play over simulated TCP connections (`client_sdk/links.py`). All players wander
+on `hills`, where they sometimes meet. Late inputs are a share of all inputs. Snapshot age is the age of the newest
+snapshot, sampled once per tick. Lead is the time by which the player's own tick is ahead of the server.
 """
 
 import argparse
@@ -34,11 +34,11 @@ from shared.scene import load_scene
 from sovereign_netcode.playtest import Match, Player, wander
 
 SETTLE_S = 10.0
-"""The first seconds after the last player has joined do not count."""
+"""Seconds after the last join that are not counted."""
 
 
 def quantiles(values: list[float], *shares: float) -> dict[str, float]:
-    """Named quantiles ("p50", ..., "max"), rounded for reading; zeros where there is nothing."""
+    """Returns quantiles by name ("p50", ..., "max"), rounded to four digits; zeros if there are no values."""
     if not values:
         return {**{f"p{share:g}": 0.0 for share in shares}, "max": 0.0}
     found = {f"p{share:g}": round(float(np.percentile(values, share)), 4) for share in shares}
@@ -46,7 +46,7 @@ def quantiles(values: list[float], *shares: float) -> dict[str, float]:
 
 
 class Watch:
-    """Looks at every player once per tick."""
+    """Samples the snapshot age and the lead of every player once per tick."""
 
     def __init__(self, match: Match) -> None:
         self.match = match
@@ -66,7 +66,7 @@ class Watch:
 
 
 def play(preset: str, clients: int, minutes: float, seed: int) -> dict[str, Any]:
-    """The figures of one preset."""
+    """Plays a match on one preset. Returns its figures."""
     match = Match(load_scene("hills"), seed)
     path = PRESETS[preset]
     players = [match.join(wander, path) for _ in range(clients)]
@@ -83,7 +83,7 @@ def play(preset: str, clients: int, minutes: float, seed: int) -> dict[str, Any]
 
 
 def figures(match: Match, players: list[Player], before: list[Stats], watch: Watch, minutes: float) -> dict[str, Any]:
-    """All that is reported of one run."""
+    """Returns all figures of one match."""
 
     def gained(name: str) -> float:
         return float(
@@ -116,7 +116,7 @@ def figures(match: Match, players: list[Player], before: list[Stats], watch: Wat
 
 
 def table(presets: dict[str, dict[str, Any]]) -> Table:
-    """The report as a table."""
+    """Returns the figures as a table for people."""
     shown = Table(title="what the player feels")
     for name in (
         "preset", "late inputs", "corrections /min", "blocks p50 / p99 / max", "causes", "replay p50 / max",
@@ -143,13 +143,13 @@ def table(presets: dict[str, dict[str, Any]]) -> Table:
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--preset", choices=PRESETS, action="append", help="only this one (may be repeated)")
-    parser.add_argument("--clients", type=int, default=10)
-    parser.add_argument("--minutes", type=float, default=10.0)
-    parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--no-league", action="store_true", help="leave the comparison of lead controllers out")
-    parser.add_argument("--json", type=Path)
-    parser.add_argument("--plot", type=Path)
+    parser.add_argument("--preset", choices=PRESETS, action="append", help="play only on this link; may be repeated")
+    parser.add_argument("--clients", type=int, default=10, help="default: %(default)s")
+    parser.add_argument("--minutes", type=float, default=10.0, help="simulated time per link (default: %(default)g)")
+    parser.add_argument("--seed", type=int, default=1, help="default: %(default)s")
+    parser.add_argument("--no-league", action="store_true", help="do not compare the lead controllers")
+    parser.add_argument("--json", type=Path, metavar="OUT", help="write all figures to this file")
+    parser.add_argument("--plot", type=Path, metavar="OUT.png", help="draw the figures")
     chosen = parser.parse_args()
     if chosen.plot and (why := lacking("matplotlib")):
         parser.error(f"--plot: {why}")

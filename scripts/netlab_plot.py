@@ -1,4 +1,4 @@
-"""The picture of the network lab: what the player feels per link, and the league of lead controllers."""
+"""Draws the picture of the network lab: the figures per link, and the league of lead controllers."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -14,7 +14,7 @@ MARKS = "osD^vPX"
 
 
 def draw(presets: dict[str, dict[str, Any]], league: list[dict[str, Any]], out: Path) -> None:
-    """Writes a PNG: four bars per link above, late inputs against added latency below."""
+    """Writes a PNG: four bars per link at the top, late inputs against added latency below."""
     links = [name for name in presets if any(row["preset"] == name for row in league)]
     columns = max(len(links), 4)
     figure = plt.figure(figsize=(2.6 * columns, 6.4 if links else 3.2), layout="constrained")

@@ -1,7 +1,8 @@
 #!/usr/bin/env python3
-"""Writes tests/golden/physics.json anew. Only on purpose: every client in the world must be updated with it.
+"""Writes tests/golden/physics.json, the hashes that the physics must reach.
 
-Both executors must agree on every hash first. Run by the environment of the repository: `.venv/bin/python`.
+Run it only for an intended change of the physics: every client must then be updated. The compiled and the plain
+executor must agree on every hash first. It needs the environment of the repository: `.venv/bin/python`.
 """
 
 import json
@@ -20,7 +21,7 @@ def main() -> int:
     for name in SCRIPTS:
         plain = dict(run(name, compiled=False))
         if kernels.available() and dict(run(name, compiled=True)) != plain:
-            print(f"{name}: compiled and plain differ; nothing is written", file=sys.stderr)
+            print(f"{name}: compiled and plain Python differ; nothing was written", file=sys.stderr)
             return 1
         goldens[name] = {str(tick): digest for tick, digest in plain.items()}
         print(f"{name:<8} {plain[max(plain)]}")

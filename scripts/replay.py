@@ -1,4 +1,4 @@
-"""Runs `sovereign-replay` of this checkout: a recording again, tick by tick. `--help` says more."""
+"""Runs `sovereign-replay` of this checkout: replays a recording tick by tick. `--help` lists the options."""
 
 import sys
 

@@ -1,16 +1,16 @@
-// A client in plain Node.js, from docs/protocol.md alone: joins, walks in squares, and tells where everybody is.
+// A client in plain Node.js, written from docs/protocol.md alone: joins, walks in squares, and prints all positions.
 //
 //     npm ci && node bot.mjs ws://127.0.0.1:8765 [seconds]
 //
-// It lives ahead of the server, sends an input per tick, and believes the snapshots. It neither predicts nor looks at
-// the terrain: what that does to anybody, the snapshots tell.
+// Its timeline is ahead of the server, and it sends an input per tick. It does not predict, and ignores the terrain:
+// the snapshots contain the effects of both on every entity.
 
 import { decode, encode } from "@msgpack/msgpack";
 import WebSocket from "ws";
 
 const [url = "ws://127.0.0.1:8765", seconds = 10] = process.argv.slice(2);
 const HELLO = 1, INPUTS = 2, PING = 3, BYE = 4, WELCOME = 17, SNAPSHOT = 18, PONG = 20, GOING_AWAY = 1001;
-const STOP = [1, 2, 4], GO = [8, 16], FALL = 32, LAUNCH = 64, TOLD = 128; // what may happen in an entity's turn
+const STOP = [1, 2, 4], GO = [8, 16], FALL = 32, LAUNCH = 64, TOLD = 128; // events in an entity's turn
 const BLOCK = 2 ** 24, SIDE = 32 * BLOCK, SPEED = 2 ** 16, KEYFRAME = -1, USED = 0, REFUSED = -32768;
 const SQUARE = [[127, 0], [0, 127], [-127, 0], [0, -127]]; // east, north, west, south
 
@@ -22,7 +22,7 @@ const socket = new WebSocket(url, { perMessageDeflate: false });
 const send = (...message) => socket.send(encode(message));
 const now = () => performance.now() / 1000;
 const rounded = value => Math.sign(value) * Math.round(Math.abs(value)); // halves away from zero
-const home = at => at.map(part => Math.floor(part / SIDE)).join(); // a place's segment, as text
+const home = at => at.map(part => Math.floor(part / SIDE)).join(); // a position's segment, as text
 const ints = (bin, ...offsets) => offsets.map(offset => bin.readInt32LE(offset));
 const reader = (bin, at = 0) => ({ i8: () => bin.readInt8(at++), i32: () => bin.readInt32LE((at += 4) - 4) });
 function* records(size, bin = []) { for (let at = 0; at < bin.length; at += size) yield bin.subarray(at, at + size); }
@@ -33,7 +33,7 @@ socket.on("message", data => {
   if (kind === WELCOME) welcome(...fields);
   else if (kind === PONG) pong(...fields);
   else if (kind === SNAPSHOT) snapshot(...fields);
-  else if (kind === BYE) console.error(`told to go: ${fields[0]} ${fields[1]}`);
+  else if (kind === BYE) console.error(`the server says goodbye: ${fields[0]} ${fields[1]}`);
 });
 socket.on("close", code => { tell(); process.exit(code === GOING_AWAY ? 0 : 1); });
 socket.on("error", error => { console.error(error.message); process.exit(1); });
@@ -50,7 +50,7 @@ function tell() {
   console.log(JSON.stringify({ tick: acked, me, name: said.get(me)?.name, used, places }));
 }
 
-function pong(at, tick) { // the server's time is tick_rate * now + phase; the quickest answers know best
+function pong(at, tick) { // the server's time is tick_rate * now + phase; the quickest answers measure it best
   const { tick_rate } = scene, trip = now() - at;
   pongs = [...pongs, { trip, phase: tick - tick_rate * (at + trip / 2) }].slice(-15);
   const best = [...pongs].sort((a, b) => a.trip - b.trip).slice(0, Math.ceil(pongs.length / 3));
@@ -60,7 +60,7 @@ function pong(at, tick) { // the server's time is tick_rate * now + phase; the q
   setInterval(walk, 250 / tick_rate);
 }
 
-function walk() { // a row for each tick that our own clock has reached; a hop at each corner
+function walk() { // sends a row for each tick that our timeline has reached; jumps at each corner
   const tick = Math.floor(scene.tick_rate * now() + phase + lead), side = 2 * scene.tick_rate;
   if (tick - sent > 16) sent = tick - 1; // the first time, or after a pause
   if (tick <= sent) return;
@@ -69,10 +69,10 @@ function walk() { // a row for each tick that our own clock has reached; a hop a
   sent = tick;
 }
 
-function turn(entity, events, tail) { // the entity after a tick in which this happened to it
+function turn(entity, events, tail) { // returns the entity after a tick with these events
   const { tick, template, at } = entity, { walk_speed, jump_speed } = scene.templates[template];
   const { gravity, terminal_speed, tick_rate, integrator } = scene;
-  const move = events & TOLD ? [tail.i8(), tail.i8(), tail.i8()] : entity.move; // the third are buttons
+  const move = events & TOLD ? [tail.i8(), tail.i8(), tail.i8()] : entity.move; // the third byte has the buttons
   const v = entity.v.map((old, k) =>
     k < 2 && walk_speed && events & (TOLD | GO[k]) ? rounded(walk_speed * SPEED * move[k] / 127) : old);
   if (events & LAUNCH) v[2] = rounded(jump_speed * SPEED);
@@ -82,12 +82,12 @@ function turn(entity, events, tail) { // the entity after a tick in which this h
   const way = [2 * v[0], 2 * v[1], before + v[2]].map(sum => rounded(sum * 128 / tick_rate));
   const to = at.map((from, k) => events & STOP[k] ? Math.floor(from / SIDE) * SIDE + tail.i32() : from + way[k]);
   if (events & STOP[2] && before + v[2] < 0) falls = 0;
-  if (home(to) !== home(at)) return { ...entity, tick: tick + 1, move }; // a row will tell
+  if (home(to) !== home(at)) return { ...entity, tick: tick + 1, move }; // a row has the new state
   return { tick: tick + 1, template, falls, at: to, v: v.map((speed, k) => events & STOP[k] ? 0 : speed), move };
 }
 
 function snapshot(tick, newest, early, first, fates, verdicts, drops, ...parts) {
-  const told = new Map(), left = new Set(); // told: by rows; left: "segment", or "segment:entity"
+  const told = new Map(), left = new Set(); // told: entities with a row; left: "segment", or "segment:entity"
   for (const drop of records(12, drops)) left.add(ints(drop, 0, 4, 8).join());
   for (const [x, y, z, ago, heads, tails, rows, gone] of parts) {
     const segment = [x, y, z], tail = reader(tails);
@@ -102,7 +102,7 @@ function snapshot(tick, newest, early, first, fates, verdicts, drops, ...parts) 
       v: ints(row, 18, 22, 26), move: [row.readInt8(30), row.readInt8(31)],
     });
   }
-  for (let [id, entity] of entities) { // all others go on as they did
+  for (let [id, entity] of entities) { // all others continue without an event
     while (entity.tick < tick) entity = turn(entity, 0);
     entities.set(id, entity);
     if (left.has(home(entity.at)) || left.has(`${home(entity.at)}:${id}`)) entities.delete(id);

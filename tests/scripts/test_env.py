@@ -26,11 +26,11 @@ def env(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> ModuleType:
 def test_a_set_up_says_where_with_what_and_how_long(env: ModuleType, capsys: pytest.CaptureFixture[str]) -> None:
     assert env.ensure(env.RUNTIME) == env.PYTHON
     said = capsys.readouterr().out
-    assert said.startswith(f"setting up {env.VENV} with what requirements.txt pins, once: up to a minute ... done in ")
+    assert said.startswith(f"setting up {env.VENV} with the pins of requirements.txt, once: up to a minute ... done in ")
     assert env.ensure(env.RUNTIME) == env.PYTHON
     assert capsys.readouterr().out == "", "it is there"
     env.ensure(env.DEV)
-    assert "with what requirements-dev.txt pins" in capsys.readouterr().out
+    assert "with the pins of requirements-dev.txt" in capsys.readouterr().out
     env.ensure(env.RUNTIME)
     assert capsys.readouterr().out == "", "more than that is there"
 
