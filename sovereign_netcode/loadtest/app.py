@@ -54,10 +54,16 @@ def arguments(argv: list[str] | None = None) -> argparse.Namespace:
         formatter_class=argparse.RawDescriptionHelpFormatter,
         allow_abbrev=False,
     )
-    parser.add_argument("--clients", type=_positive, default=50, metavar="N", help="bots (default: %(default)s)")
-    parser.add_argument("--seconds", type=_duration, default=10.0, metavar="S", help="window (default: %(default)g)")
+    parser.add_argument(
+        "--clients", type=_positive, default=50, metavar="N", help="number of bots (default: %(default)s)"
+    )
+    parser.add_argument(
+        "--seconds", type=_duration, default=10.0, metavar="S", help="length of the window (default: %(default)g)"
+    )
     parser.add_argument("--url", help="URL of a running server, like ws://localhost:8765 (default: starts one)")
-    parser.add_argument("--policy", choices=sorted(POLICIES), default="wander", help="default: %(default)s")
+    parser.add_argument(
+        "--policy", choices=sorted(POLICIES), default="wander", help="behaviour of the bots (default: %(default)s)"
+    )
     parser.add_argument("--scene", default="hills", help="scene of the server that is started (default: %(default)s)")
     parser.add_argument(
         "--tick-rate",

@@ -26,7 +26,9 @@ def env(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> ModuleType:
 def test_a_set_up_says_where_with_what_and_how_long(env: ModuleType, capsys: pytest.CaptureFixture[str]) -> None:
     assert env.ensure(env.RUNTIME) == env.PYTHON
     said = capsys.readouterr().out
-    assert said.startswith(f"setting up {env.VENV} with the pins of requirements.txt, once: up to a minute ... done in ")
+    assert said.startswith(
+        f"setting up {env.VENV} with the pins of requirements.txt, once: up to a minute ... done in "
+    )
     assert env.ensure(env.RUNTIME) == env.PYTHON
     assert capsys.readouterr().out == "", "it is there"
     env.ensure(env.DEV)
