@@ -72,7 +72,7 @@ def utf8(value: str) -> bool:
 
 
 def text(value: object, at: str, longest: int = 64, shortest: int = 1) -> str:
-    """A text of so many characters that UTF-8 can hold."""
+    """Returns a text of `shortest` to `longest` characters that UTF-8 can hold."""
     if not isinstance(value, str) or not shortest <= len(value) <= longest:
         raise SceneError(f"{at} = {shown(value)}: must be a text of {shortest} to {longest} characters")
     if not utf8(value):
