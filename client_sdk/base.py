@@ -74,7 +74,9 @@ class BaseClient:
         self.core.link = link
 
     def set_input(self, x: float, y: float, *, jump: bool = False) -> None:
-        """What the player wishes from now on: a direction (east, north) of length 0 to 1, and whether to jump.
+        """Sets the player's input from now on: a direction (east, north) of length 0 to 1, and whether to jump.
+
+        Call it as often as you like. A jump that is set and taken back between two ticks counts in the next tick.
 
         Raises:
             ValueError: the direction is not finite.

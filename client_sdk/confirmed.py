@@ -79,7 +79,7 @@ class Confirmed:
         if len(states):
             if max(states[:, FLAGS].tolist()) > FALLING:
                 self._act(states, snapshot.tick)
-            world.write(states)
+            world.put(states)
         for part in parts:
             if len(part.edits):
                 self._edit(part)

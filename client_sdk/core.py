@@ -10,12 +10,14 @@
 """
 
 import math
+import operator
 from collections import deque
 from typing import Any, SupportsIndex
 
 from client_sdk.advice import advised
 from client_sdk.clock import ServerClock, Timeline
 from client_sdk.comeback import Comeback
+from client_sdk.controls import Controls
 from client_sdk.events import (
     Disconnected,
     Event,
@@ -34,8 +36,8 @@ from client_sdk.prediction import Prediction
 from client_sdk.replica import Replica
 from client_sdk.stats import Stats
 from shared import edits, kernels, messages
-from shared.checks import SceneError, duration, shown, text, whole
-from shared.inputs import NEUTRAL, Input, checked_input, clamp
+from shared.checks import text
+from shared.inputs import Input, clamp
 from shared.messages import ProtocolError, decode_from_server, encode
 from shared.scene import Scene
 
@@ -74,15 +76,13 @@ class Core:
         neighbours: bool = True,
     ) -> None:
         self.name = text(name, "name", NAME_MAX, shortest=0)
-        if scene is not None and not isinstance(scene, Scene):
-            raise SceneError(f"scene = {shown(scene)}: must be a `Scene`, or None for the server's")
         self.scene = scene
         self.state = "joining"
         self.close_request: tuple[int, str] | None = None
         """The code and reason with which the connection should be closed now, if any."""
         self.stats = Stats()
-        self.comeback = Comeback(duration(patience_s, "patience_s", endless=True))
-        self.wish = NEUTRAL
+        self.comeback = Comeback(patience_s)
+        self.controls = Controls()
         self.shared: dict[str, Any] = {}
         """The values that the game shares with all clients."""
         self._token = text(token, "token", messages.TOKEN_MAX, shortest=0)
@@ -182,9 +182,8 @@ class Core:
         Raises:
             RuntimeError: the client has not joined.
             TypeError: something is not a whole number.
-            EditError: it is out of range (a `ValueError`).
         """
-        play, edit = self._joined("edit"), edits.checked(x, y, z, kind)
+        play, edit = self._joined("edit"), edits.Edit(*map(operator.index, (x, y, z, kind)))
         payload = edits.pack(edit)  # first: what cannot be sent is not predicted
         number = self._orders.number()
         tick = play.world.prediction.edit(number, edit)
@@ -198,13 +197,14 @@ class Core:
             self.close_request = (1000, "")
             self._end(Left(1000, "closed by this client"))
 
-    def set_input(self, wish: Input) -> None:
-        """What the player wishes from the next tick on, until told otherwise.
+    @property
+    def wish(self) -> Input:
+        """The input that was set last."""
+        return self.controls.held
 
-        Raises:
-            ValueError: it is no `Input`.
-        """
-        self.wish = clamp(checked_input(wish, "wish"))
+    def set_input(self, wish: Input) -> None:
+        """Sets the player's input from the next tick on. A button that is down for a moment counts in that tick."""
+        self.controls.set(clamp(wish))
 
     def set_input_delay(self, ticks: int) -> None:
         """Shows the effect of inputs so many ticks (0 to 3) later than they are sent: fewer and shorter replays.
@@ -212,7 +212,9 @@ class Core:
         Raises:
             ValueError: not 0 to 3.
         """
-        ticks = self._delay = whole(ticks, "ticks", 0, INPUT_DELAY_MAX)
+        if not 0 <= ticks <= INPUT_DELAY_MAX:
+            raise ValueError(f"ticks = {ticks!r}: must be 0 to {INPUT_DELAY_MAX}")
+        self._delay = ticks
         if self.prediction is not None:
             self.prediction.ahead = ticks
 
@@ -231,8 +233,10 @@ class Core:
         if self.state in ("joining", "away") and self._filled and self._filled.complete:
             self._begin(self._filled, now)
         if self._play and self.state != "closed":
-            for message in self._play.update(now, self.wish, online=self.state == "playing"):
+            for message in self._play.update(now, self.controls, online=self.state == "playing"):
                 self._send(message)
+        else:
+            self.controls.forget()
 
     def next_update(self, now: float) -> float:
         """The local time at which `update` has something to do."""

@@ -12,6 +12,7 @@ import math
 from struct import iter_unpack
 
 from client_sdk.clock import PricedLead, Timeline, jump_ticks
+from client_sdk.controls import Controls
 from client_sdk.events import Diverged, Resynchronised
 from client_sdk.pending_events import PendingEvents
 from client_sdk.picture import View
@@ -19,9 +20,10 @@ from client_sdk.prediction import NONDETERMINISM, NOTHING
 from client_sdk.replica import Replica
 from client_sdk.stats import Stats
 from shared.bounds import AHEAD_S, bounds
-from shared.inputs import Input, row
+from shared.inputs import row
 from shared.messages import (
     IDLE,
+    INPUT_ROW_BYTES,
     MARGIN_REFUSED,
     NEUTRALISED,
     REPEATED,
@@ -119,8 +121,8 @@ class Play:
         if self._settling is not None and sent > self._settling:
             self._settling, self._settled = None, True
 
-    def update(self, now: float, wish: Input, *, online: bool) -> list[Message]:
-        """Predicts every tick whose time has come, with `wish`; what to send.
+    def update(self, now: float, controls: Controls, *, online: bool) -> list[Message]:
+        """Predicts every tick whose time has come, with the input of `controls`; what to send.
 
         Without a connection (not `online`), nothing new can be known, and nothing is sent.
         """
@@ -134,7 +136,7 @@ class Play:
             shown = world.picture.advance(server_tick, now)
             if not self._draws:
                 self.seen = shown
-        messages = self._predict(now, wish)
+        messages = self._predict(now, controls)
         stats.snapshot_age_s = max(server_tick - world.prediction.confirmed.tick, 0.0) / clock.rate
         if not online:
             return []
@@ -238,12 +240,13 @@ class Play:
         world.wrong = ""
         return True
 
-    def _predict(self, now: float, wish: Input) -> list[Message]:
-        """Files the wish for every tick up to now, and predicts up to there but for the input delay; what to send."""
+    def _predict(self, now: float, controls: Controls) -> list[Message]:
+        """Files an input for every tick up to now, and predicts up to there but for the input delay; what to send."""
         prediction, timeline, stats = self.world.prediction, self.timeline, self._stats
         confirmed, to = prediction.confirmed.tick, math.floor(timeline.tick(now))
         end = confirmed + self._bounds.unconfirmed
         if to - self.newest > self._bounds.update:
+            controls.forget()
             if to <= end:
                 self.restart(now, SILENT if self._silent else PAUSED)
             return []
@@ -255,16 +258,22 @@ class Play:
         if to >= first:
             clock, phase = self.world.clock, timeline.phase
             timeline.made(timeline.tick(now) - first, now)
+            rows = b""
             for tick in range(first, to + 1):
+                wish = controls.take()
                 prediction.file(tick, wish)
+                rows += row(wish)
                 # How late the program itself was with it is no need of the path.
                 self._phases.put(tick, phase - (timeline.tick(now) - tick) if timeline.own else phase)
             stats.inputs_sent += to + 1 - first
             stats.lead_ticks = phase - clock.phase
             stats.lead_s = stats.lead_ticks / clock.rate
             inputs += [
-                Inputs(at, confirmed, row(wish) * min(to + 1 - at, ROWS_MAX)) for at in range(first, to + 1, ROWS_MAX)
+                Inputs(first + at, confirmed, rows[INPUT_ROW_BYTES * at : INPUT_ROW_BYTES * (at + ROWS_MAX)])
+                for at in range(0, to + 1 - first, ROWS_MAX)
             ]
+        elif self._silent:
+            controls.forget()
         while prediction.predicted.tick < self.newest - prediction.ahead:
             prediction.step()
         return inputs

@@ -28,12 +28,10 @@ from client_sdk.transports.connection import (
     UNSENT_MAX,
     ConnectError,
     Connection,
-    checked_tls,
     insecure,
     stalled,
     unreachable,
 )
-from shared.checks import duration
 from shared.scene import Scene
 
 TIMEOUT_S = 5.0
@@ -97,10 +95,10 @@ class AsyncClient(BaseClient):
         COMPILER.begin()
         core = LinkedCore(name, scene, token=token, patience_s=patience_s)
         core.link = link
-        client = cls(core, url, before_update, checked_tls(tls))
+        client = cls(core, url, before_update, tls)
         connection = client._connection
         try:
-            await client._dial(duration(timeout, "timeout"))
+            await client._dial(timeout)
         except BaseException as error:
             client._drop()
             if isinstance(error, ssl.SSLError):

@@ -50,6 +50,8 @@ class Window:
         self.client, self.core, self.title = client, client.core, title
         self.events: list[Event] = []
         """Events of the latest frame."""
+        self.pressed: set[int] = set()
+        """Keys that went down since the frame before."""
         self.actors: list[Actor] = []
         """All figures in sight."""
         self.ghost = False
@@ -74,6 +76,7 @@ class Window:
         view = self.client.view(now)
         for event in self.events:
             self._take(event, view, now)
+        self.pressed.clear()
         for act in pygame.event.get():
             self._handle(act, view)
         if self.client.playing:
@@ -123,6 +126,7 @@ class Window:
         elif event.type == pygame.QUIT or (event.type == pygame.KEYDOWN and event.key == pygame.K_ESCAPE):
             self.over = CLOSED
         elif event.type == pygame.KEYDOWN:
+            self.pressed.add(event.key)
             if event.key == pygame.K_g:
                 self.ghost = not self.ghost
             elif event.key == pygame.K_LEFTBRACKET:
@@ -234,12 +238,12 @@ class Window:
 
 
 def keyboard(window: Window, view: View, now: float) -> Wish:
-    """Returns the input of the keys that are held."""
+    """Returns the input of the keys that are held; the space bar also counts if it went down and up again."""
     held = pygame.key.get_pressed()
     x = sum(way[0] for key, way in KEYS.items() if held[key])
     y = sum(way[1] for key, way in KEYS.items() if held[key])
     length = math.hypot(x, y) or 1.0
-    return x / length, y / length, held[pygame.K_SPACE]
+    return x / length, y / length, held[pygame.K_SPACE] or pygame.K_SPACE in window.pressed
 
 
 @functools.lru_cache(1)

@@ -12,6 +12,8 @@ import numpy as np
 import numpy.typing as npt
 
 Point = tuple[float, float]
+Standing = tuple[Callable[[], list[Point]], Callable[[], object]]
+"""Functions of a stand-in: one returns where figures are shown, one presses and releases the space bar at once."""
 FIGURE_PIXELS = 5
 """A figure is at least so many pixels wide; the lines on the ground are narrower."""
 
@@ -90,17 +92,17 @@ class Body(Thing):
         return [((east - x) / (z - above), (north - y) / (z - above)) for east, north, above in seen]
 
 
-def pyglet() -> Callable[[], list[Point]]:
+def pyglet() -> Standing:
     frames: list[Callable[[float], None]] = []
-    draws: list[Callable[[], None]] = []
+    calls: dict[str, Callable[..., None]] = {}
 
     class Window(Thing):
         def __init__(self, width: int, height: int) -> None:
             Flat.size = width, height
 
-        def event(self, call: Callable[[], None]) -> None:
-            assert call.__name__ == "on_draw"
-            draws.append(call)
+        def event(self, call: Callable[..., None]) -> None:
+            assert call.__name__ in ("on_draw", "on_key_press")
+            calls[call.__name__] = call
 
         def clear(self) -> None:
             Flat.clear()
@@ -117,7 +119,7 @@ def pyglet() -> Callable[[], list[Point]]:
             return False
 
     def loop() -> None:
-        ever(lambda: (frames[0](1 / 60), draws[0]()))
+        ever(lambda: (frames[0](1 / 60), calls["on_draw"]()))
 
     module("pyglet")
     module("pyglet.window", Window=Window)
@@ -125,10 +127,10 @@ def pyglet() -> Callable[[], list[Point]]:
     module("pyglet.shapes", Circle=Circle, Line=Thing)
     module("pyglet.clock", schedule_interval=lambda call, every: frames.append(call))
     module("pyglet.app", run=loop)
-    return Flat.lit
+    return Flat.lit, lambda: calls["on_key_press"](32, 0)
 
 
-def arcade() -> Callable[[], list[Point]]:
+def arcade() -> Standing:
     windows: list[Any] = []
 
     class Window:
@@ -147,11 +149,17 @@ def arcade() -> Callable[[], list[Point]]:
     color = SimpleNamespace(WHITE=(255, 255, 255))
     module("arcade", Window=Window, run=loop, draw_circle_filled=Flat.draw, draw_line=Thing, color=color)
     module("arcade.key", A=97, D=100, S=115, W=119, SPACE=32)
-    return Flat.lit
+
+    def tap() -> None:
+        windows[0].on_key_press(32, 0)
+        windows[0].on_key_release(32, 0)
+
+    return Flat.lit, tap
 
 
-def panda3d() -> Callable[[], list[Point]]:
+def panda3d() -> Standing:
     tasks: list[Callable[[Any], Any]] = []
+    keys: dict[str, Callable[[], None]] = {}
     Body.camera = Body()
 
     class ShowBase:
@@ -160,7 +168,7 @@ def panda3d() -> Callable[[], list[Point]]:
         taskMgr = SimpleNamespace(add=lambda call, name: tasks.append(call))  # noqa: N815  # as Panda3D has it
 
         def accept(self, key: str, call: Callable[..., None], more: list[Any]) -> None:
-            call(*more)
+            keys[key] = lambda: call(*more)
 
         def disableMouse(self) -> None:  # noqa: N802  # likewise
             pass
@@ -173,10 +181,10 @@ def panda3d() -> Callable[[], list[Point]]:
     module("direct.showbase.ShowBase", ShowBase=ShowBase)
     module("panda3d")
     module("panda3d.core", LineSegs=Thing)
-    return Body.lit
+    return Body.lit, lambda: (keys["space"](), keys["space-up"]())
 
 
-def ursina() -> Callable[[], list[Point]]:
+def ursina() -> Standing:
     games: list[Any] = []
 
     class Entity:
@@ -204,7 +212,7 @@ def ursina() -> Callable[[], list[Point]]:
     Body.camera = camera._body
     names = {"Entity": Entity, "Ursina": Ursina, "camera": camera, "destroy": destroy, "held_keys": held}
     module("ursina", **names, Grid=lambda width, height: "grid", color=SimpleNamespace(gray=None))
-    return Body.lit
+    return Body.lit, lambda: [game.input(key) for game in games for key in ("space", "space up")]
 
 
 def shown(engine: str) -> list[Point]:
@@ -243,12 +251,24 @@ def _pixels(engine: str) -> npt.NDArray[np.uint8]:
     return np.frombuffer(data, np.uint8).reshape(image.height, image.width, 3)[::-1]
 
 
-def prepare(engine: str) -> tuple[bool, Callable[[], list[Point]]]:
-    """Makes an engine run without a display; whether it is the real one, and what tells where figures are shown."""
+def _tap_pygame() -> None:
+    import pygame
+
+    for kind in (pygame.KEYDOWN, pygame.KEYUP):
+        pygame.event.post(pygame.event.Event(kind, key=pygame.K_SPACE))
+
+
+def prepare(engine: str) -> tuple[bool, Callable[[], list[Point]], Callable[[], object] | None]:
+    """Makes an engine run without a display.
+
+    Returns:
+        Whether it is the real engine, a function that returns where figures are shown, and one that presses and
+        releases the space bar between two frames, if there is a way to.
+    """
     os.environ |= {"SDL_VIDEODRIVER": "dummy", "PYGAME_HIDE_SUPPORT_PROMPT": "1", "ARCADE_HEADLESS": "True"}
     package = {"pygame-ce": "pygame", "Panda3D": "direct"}.get(engine, engine)
     if importlib.util.find_spec(package) is None:
-        return False, {"pyglet": pyglet, "arcade": arcade, "Panda3D": panda3d, "ursina": ursina}[engine]()
+        return False, *{"pyglet": pyglet, "arcade": arcade, "Panda3D": panda3d, "ursina": ursina}[engine]()
     if engine == "pyglet":
         importlib.import_module("pyglet").options["headless"] = True
     if engine in ("Panda3D", "ursina"):
@@ -258,4 +278,4 @@ def prepare(engine: str) -> tuple[bool, Callable[[], list[Point]]]:
         real: Any = importlib.import_module("ursina")
         without = real.Ursina
         real.Ursina = lambda: without(window_type="offscreen", development_mode=False)
-    return True, lambda: shown(engine)
+    return True, lambda: shown(engine), _tap_pygame if engine == "pygame-ce" else None

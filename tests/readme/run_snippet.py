@@ -32,6 +32,7 @@ COMPANY = ((9, 0), (0, 6))
 NEAR = 0.07
 """The own figure is shown at most this far from the middle, in heights of the window."""
 FRAMES_MAX = 3000
+TAP_FRAME = 10
 
 
 class EnoughError(Exception):
@@ -47,17 +48,21 @@ class Company(Rules):
             self.game.spawn("player", (x + i, y + j, z))
 
 
-def in_this_process(wish: tuple[float, float, bool], done: Callable[[View], None]) -> None:
+def in_this_process(
+    wish: tuple[float, float], done: Callable[[View], None], tap: Callable[[], object] | None = None
+) -> None:
     """Makes `Client` one of a game within this process.
 
     Args:
-        wish: what the program is to wish.
+        wish: the direction that the program is to set.
         done: called once the player has walked, with what the program has drawn last.
+        tap: presses and releases the space bar between two frames; the program has to set a jump for it, once.
     """
     frames = itertools.count()
     now = [0.0]
     start: list[float] = []
     drawn: list[View] = []
+    jumps: list[float] = []
     poll, set_input, view = Client.poll, Client.set_input, Client.view
 
     def connect(url: str, *, name: str) -> Client:
@@ -67,13 +72,19 @@ def in_this_process(wish: tuple[float, float, bool], done: Callable[[View], None
     def counted(self: Client) -> list[Any]:
         if drawn and start[-1] > start[0] + FAR_BLOCKS and len(drawn[-1].others) == len(COMPANY):
             done(drawn[-1])
+            assert len(jumps) == (tap is not None)
             raise EnoughError
-        now[0] = next(frames) / 30
+        frame = next(frames)
+        if frame == TAP_FRAME and tap is not None:
+            tap()
+        now[0] = frame / 30
         assert now[0] < FRAMES_MAX / 30, "the player did not walk"
         return poll(self)
 
     def wished(self: Client, x: float, y: float, *, jump: bool) -> None:
-        assert (x, y, jump) == wish
+        assert (x, y) == wish
+        if jump:
+            jumps.append(now[0])
         set_input(self, 1, 0, jump=True)  # the ground is not even
 
     def looked(self: Client) -> View:
@@ -142,11 +153,11 @@ def main(name: str, url: str = "") -> None:
         return
     if name in LOOPS:
         said = "walked"
-        in_this_process((1, 0, False), lambda view: None)
+        in_this_process((1, 0), lambda view: None)
     else:
-        real, lit = engines.prepare(name)
+        real, lit, tap = engines.prepare(name)
         said = f"walked, and all are shown by {'the engine' if real else 'a stand-in'}"
-        in_this_process((0, 0, False), lambda view: compare(lit(), view))
+        in_this_process((0, 0), lambda view: compare(lit(), view), tap)
     try:
         exec(program, space)
     except EnoughError:

@@ -1,0 +1,65 @@
+"""A press counts in one input, however short it is; a button that is held counts as long as it is held."""
+
+import random
+
+from client_sdk.controls import Controls
+from shared.inputs import NEUTRAL, Input
+
+JUMP, OTHER = Input(5, 7, 1), Input(0, 0, 2)
+
+
+def filled(*wishes: Input) -> Controls:
+    controls = Controls()
+    for wish in wishes:
+        controls.set(wish)
+    return controls
+
+
+def test_a_press_that_is_over_counts_once() -> None:
+    controls = filled(JUMP, NEUTRAL)
+    assert [controls.take() for _ in range(3)] == [Input(0, 0, 1), NEUTRAL, NEUTRAL]
+
+
+def test_the_direction_is_the_newest_one() -> None:
+    assert filled(JUMP, Input(-9, 3, 0)).take() == Input(-9, 3, 1)
+
+
+def test_what_is_held_counts_until_it_is_released() -> None:
+    controls = filled(JUMP)
+    assert [controls.take() for _ in range(3)] == [JUMP] * 3
+    controls.set(JUMP)
+    controls.set(NEUTRAL)
+    assert controls.take() == NEUTRAL, "it was down in the tick before, and is not any more"
+
+
+def test_a_release_and_a_press_between_two_ticks_are_a_press() -> None:
+    controls = filled(JUMP)
+    controls.take()
+    for wish in (NEUTRAL, JUMP, NEUTRAL):
+        controls.set(wish)
+    assert [controls.take().buttons for _ in range(2)] == [1, 0]
+
+
+def test_each_button_is_one_of_its_own() -> None:
+    controls = filled(JUMP, OTHER, NEUTRAL)
+    assert [controls.take().buttons for _ in range(2)] == [3, 0]
+
+
+def test_a_press_is_forgotten_with_its_tick_and_what_is_held_is_not() -> None:
+    controls = filled(JUMP, OTHER)
+    controls.forget()
+    assert [controls.take() for _ in range(2)] == [OTHER, OTHER]
+
+
+def test_any_sequence_is_that_of_the_definition() -> None:
+    rng, controls = random.Random(1), Controls()
+    before, pressed = 0, 0
+    for _ in range(5000):
+        if rng.random() < 0.3:
+            assert controls.take().buttons == before | pressed
+            pressed = 0
+        else:
+            buttons = rng.randrange(4)
+            controls.set(Input(0, 0, buttons))
+            pressed |= buttons & ~before
+            before = buttons
