@@ -20,8 +20,9 @@ from client_sdk.events import Event
 from client_sdk.linked import LinkedCore
 from client_sdk.links import Path
 from client_sdk.picture import View
-from client_sdk.transports.connection import Connection
+from client_sdk.transports.connection import Connection, checked_tls
 from client_sdk.transports.polling import PollingTransport
+from shared.checks import duration, finite
 from shared.scene import Scene
 
 PATIENCE_S = 30.0
@@ -88,11 +89,11 @@ class Client(BaseClient):
         COMPILER.begin()
         core = LinkedCore(name, scene, token=token, patience_s=patience_s)
         core.link = link
-        return cls(core, PollingTransport(Connection(url, core), timeout, tls))
+        return cls(core, PollingTransport(Connection(url, core), duration(timeout, "timeout"), checked_tls(tls)))
 
     def poll(self, now: float | None = None) -> list[Event]:
         """What has happened since the last call, in order: `Joined`, `Corrected`, `Left`, ... Never blocks."""
-        self._transport.poll(time.monotonic() if now is None else now)
+        self._transport.poll(_time(now))
         return self.core.events()
 
     def edit(self, x: int, y: int, z: int, kind: int) -> int:
@@ -104,6 +105,7 @@ class Client(BaseClient):
         Raises:
             RuntimeError: the client has not joined.
             TypeError: something is not a whole number.
+            ValueError: it is out of range.
         """
         return self.core.edit(x, y, z, kind)
 
@@ -120,13 +122,13 @@ class Client(BaseClient):
 
     def update(self, now: float | None = None) -> None:
         """Predicts up to now and sends the inputs of the ticks that have come."""
-        now = time.monotonic() if now is None else now
+        now = _time(now)
         self.core.update(now)
         self._transport.send(now)
 
     def view(self, now: float | None = None) -> View:
         """What to draw now; positions in blocks."""
-        return self.core.view(time.monotonic() if now is None else now)
+        return self.core.view(_time(now))
 
     def close(self, timeout: float = 1.0) -> None:
         """Says goodbye, and waits for the server to do so for at most `timeout` seconds. Again: does nothing."""
@@ -140,3 +142,8 @@ class Client(BaseClient):
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
         self.close()
+
+
+def _time(now: float | None) -> float:
+    """The time of a call: the one that was handed in, or else that of the clock."""
+    return time.monotonic() if now is None else finite(now, "now")

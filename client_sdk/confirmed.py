@@ -79,7 +79,7 @@ class Confirmed:
         if len(states):
             if max(states[:, FLAGS].tolist()) > FALLING:
                 self._act(states, snapshot.tick)
-            world.put(states)
+            world.write(states)
         for part in parts:
             if len(part.edits):
                 self._edit(part)

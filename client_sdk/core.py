@@ -10,7 +10,6 @@
 """
 
 import math
-import operator
 from collections import deque
 from typing import Any, SupportsIndex
 
@@ -36,8 +35,8 @@ from client_sdk.prediction import Prediction
 from client_sdk.replica import Replica
 from client_sdk.stats import Stats
 from shared import edits, kernels, messages
-from shared.checks import text
-from shared.inputs import Input, clamp
+from shared.checks import SceneError, duration, shown, text, whole
+from shared.inputs import Input, checked_input, clamp
 from shared.messages import ProtocolError, decode_from_server, encode
 from shared.scene import Scene
 
@@ -76,12 +75,14 @@ class Core:
         neighbours: bool = True,
     ) -> None:
         self.name = text(name, "name", NAME_MAX, shortest=0)
+        if scene is not None and not isinstance(scene, Scene):
+            raise SceneError(f"scene = {shown(scene)}: must be a `Scene`, or None for the server's")
         self.scene = scene
         self.state = "joining"
         self.close_request: tuple[int, str] | None = None
         """The code and reason with which the connection should be closed now, if any."""
         self.stats = Stats()
-        self.comeback = Comeback(patience_s)
+        self.comeback = Comeback(duration(patience_s, "patience_s", endless=True))
         self.controls = Controls()
         self.shared: dict[str, Any] = {}
         """The values that the game shares with all clients."""
@@ -182,8 +183,9 @@ class Core:
         Raises:
             RuntimeError: the client has not joined.
             TypeError: something is not a whole number.
+            EditError: it is out of range (a `ValueError`).
         """
-        play, edit = self._joined("edit"), edits.Edit(*map(operator.index, (x, y, z, kind)))
+        play, edit = self._joined("edit"), edits.checked(x, y, z, kind)
         payload = edits.pack(edit)  # first: what cannot be sent is not predicted
         number = self._orders.number()
         tick = play.world.prediction.edit(number, edit)
@@ -203,8 +205,12 @@ class Core:
         return self.controls.held
 
     def set_input(self, wish: Input) -> None:
-        """Sets the player's input from the next tick on. A button that is down for a moment counts in that tick."""
-        self.controls.set(clamp(wish))
+        """Sets the player's input from the next tick on. A button that is down for a moment counts in that tick.
+
+        Raises:
+            ValueError: it is no `Input`.
+        """
+        self.controls.set(clamp(checked_input(wish, "wish")))
 
     def set_input_delay(self, ticks: int) -> None:
         """Shows the effect of inputs so many ticks (0 to 3) later than they are sent: fewer and shorter replays.
@@ -212,9 +218,7 @@ class Core:
         Raises:
             ValueError: not 0 to 3.
         """
-        if not 0 <= ticks <= INPUT_DELAY_MAX:
-            raise ValueError(f"ticks = {ticks!r}: must be 0 to {INPUT_DELAY_MAX}")
-        self._delay = ticks
+        ticks = self._delay = whole(ticks, "ticks", 0, INPUT_DELAY_MAX)
         if self.prediction is not None:
             self.prediction.ahead = ticks
 

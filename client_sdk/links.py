@@ -19,6 +19,8 @@ from dataclasses import dataclass, replace
 from itertools import count
 from typing import Protocol
 
+from shared.checks import SceneError, duration, shown
+
 PACKET_BYTES = 1448
 HEADER_BYTES = 66
 """Ethernet, IP, and TCP with its time stamps, per packet."""
@@ -60,6 +62,14 @@ class Path:
     spike: tuple[float, float, float] | None = None
     outage: tuple[float, float] | None = None
 
+    def __post_init__(self) -> None:
+        for name in ("delay_s", "jitter_s", "loss"):
+            duration(getattr(self, name), name)
+        if not self.loss <= 1:
+            raise SceneError(f"loss = {shown(self.loss)}: must be from 0 to 1")
+        if duration(self.rate, "rate", endless=True) == 0:
+            raise SceneError(f"rate = {shown(self.rate)}: must be more than 0")
+
     @property
     def rtt_s(self) -> float:
         """The round trip, on average and in fair weather."""
@@ -91,8 +101,10 @@ def named(link: str | Path | None) -> Path | None:
     """
     if isinstance(link, str):
         if link not in PRESETS:
-            raise ValueError(f"link = {link!r}: must be one of {', '.join(PRESETS)}, a Path, or None")
+            raise ValueError(f"link = {shown(link)}: must be one of {', '.join(PRESETS)}, a Path, or None")
         return PRESETS[link]
+    if link is not None and not isinstance(link, Path):
+        raise ValueError(f"link = {shown(link)}: must be one of {', '.join(PRESETS)}, a Path, or None")
     return link
 
 

@@ -1,5 +1,6 @@
 """What to draw: the own entity (and templates shown so) as predicted, all others a moment ago, corrections smoothed."""
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from types import MappingProxyType
@@ -63,6 +64,8 @@ class Picture:
         self._templates = [template.name for template in scene.templates]
         self._predicted = {i for i, template in enumerate(scene.templates) if template.shown == "predicted"}
         self._smoothing: dict[int, Smoothing] = {}
+        self._delay = 0.0  # the input delay as it is drawn, in ticks
+        self._viewed = -math.inf  # the own tick of the latest view
 
     def advance(self, server_tick: float, now: float) -> float:
         """Adapts the delay of the others; the tick at which they are drawn."""
@@ -86,6 +89,9 @@ class Picture:
         """The picture at `now`."""
         prediction = self._prediction
         tick, server_tick = timeline.tick(now), clock.tick(now)
+        # A longer input delay lets the figure stand for as many ticks: it is never drawn further back than it was.
+        self._delay = min(prediction.ahead, self._delay + max(tick - self._viewed, 0.0))
+        self._viewed = tick
         states, places = self.interpolation.sample(server_tick)
         others = []
         for state, place in zip(states.tolist(), places.tolist(), strict=True):
@@ -101,7 +107,7 @@ class Picture:
         prediction = self._prediction
         if entity not in prediction.predicted:
             return None
-        before, after, share = prediction.around(entity, tick - prediction.ahead - 1)
+        before, after, share = prediction.around(entity, tick - self._delay - 1)
         old, new = np.array(before[X : X + 3]) / BLOCK, np.array(after[X : X + 3]) / BLOCK
         smoothing = self._smoothing.get(entity)
         place = old + (new - old) * share + (smoothing.offset(now) if smoothing else 0.0)

@@ -1,7 +1,6 @@
 """From settings to what decides on players, and to what speaks TLS for the server."""
 
 import importlib
-import inspect
 import os
 import ssl
 from typing import Any
@@ -9,6 +8,7 @@ from typing import Any
 from server import tokens
 from server.auth import Authenticator
 from server.kinds import SettingsError
+from server.rules import RulesError, checked_function
 from server.settings import Settings
 
 
@@ -27,10 +27,12 @@ def authenticator(settings: Settings) -> Authenticator | None:
         found: Any = getattr(importlib.import_module(module), name)
     except (ImportError, AttributeError, TypeError, ValueError) as error:  # the latter two: no name of a module
         raise SettingsError(f"auth = {settings.auth!r}: cannot be used ({error})") from error
-    if not callable(found) or isinstance(found, type):
-        raise SettingsError(f"auth = {settings.auth!r}: must name a function, or an object that can be called")
-    if inspect.iscoroutinefunction(found) or inspect.iscoroutinefunction(type(found).__call__):
-        raise SettingsError(f"auth = {settings.auth!r}: must not be async, for nothing waits for it")
+    if isinstance(found, type):
+        raise SettingsError(f"auth = {settings.auth!r}: is a class; name a function, or an object that can be called")
+    try:
+        checked_function(found, f"auth = {settings.auth!r}")
+    except RulesError as error:
+        raise SettingsError(str(error)) from error
     checked: Authenticator = found
     return checked
 

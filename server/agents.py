@@ -20,10 +20,10 @@ from server.extras import install
 from server.game import Game
 from server.limits import Limits
 from server.recorder import RecordedWorld
-from server.rules import Rules
+from server.rules import Rules, prepared
 from server.session import InputQueue, Session
 from server.stage import Stage
-from shared.checks import text
+from shared.checks import finite, text, whole
 from shared.inputs import MOVE_MAX, NEUTRAL, Input, clamp
 from shared.layout import FALLING, FLAGS, ID, TEMPLATE, VX, Int64s, X
 from shared.messages import NAME_MAX, Command, pack_value
@@ -37,6 +37,7 @@ try:
 except ImportError as missing:
     raise ImportError(f"agents need PettingZoo, which is not installed here: {install('agents')}") from missing
 
+MANY = 1 << 20
 OTHERS = 8
 """So many of the nearest entities an agent sees,"""
 OTHER_COLUMNS = 8
@@ -90,12 +91,14 @@ class Arena(ParallelEnv):  # type: ignore[misc]  # it says nothing of its types
         repeat: int = 1,
         compiled: bool | None = None,
     ) -> None:
-        if min(agents, seconds, repeat) <= 0:
+        whole(agents, "agents", -MANY, MANY)
+        whole(repeat, "repeat", -MANY, MANY)
+        if min(agents, finite(seconds, "seconds"), repeat) <= 0:
             raise ValueError(f"agents = {agents}, seconds = {seconds}, repeat = {repeat}: must be positive")
         first = rules()
         named = scene if scene is not None else first.scene or "flat"
         self._bare = load_scene(named) if isinstance(named, str) else named
-        self.scene = first.prepare(self._bare)
+        self.scene = prepared(first, self._bare)
         self.possible_agents = [f"player_{i}" for i in range(agents)]
         self.agents: list[str] = []
         self._rules, self._over, self._repeat = rules, over, repeat
@@ -142,14 +145,15 @@ class Arena(ParallelEnv):  # type: ignore[misc]  # it says nothing of its types
         world = RecordedWorld(self.scene, compiled=self._blank.compiled)
         world.restore(self._blank)
         rules = self._rules()
-        rules.prepare(self._bare)
+        prepared(rules, self._bare)
         game = self._game = Game(self.scene, limits=Limits(resume_s=0.0), world=world, rules=rules, seed=self._seed)
         game.tick(0.0, 0.0)  # the rules set their scene before anybody comes
         self.agents = list(self.possible_agents)
         self._seats = {agent: Session(_Nobody(), 0.0) for agent in self.agents}
         self._wheels: dict[str, InputQueue] = {}
         for agent, seat in self._seats.items():
-            player = game.roster.enter(seat, agent)
+            with game.stage.turn:
+                player = game.roster.enter(seat, agent)
             if player is None:
                 raise ValueError(f"{len(self.agents)} agents: no room to spawn {agent} in {self.scene.name}")
             self._wheels[agent] = player.inputs

@@ -29,7 +29,7 @@ from server.metrics import metrics_page
 from server.pages import Pages, json_page, ready_page
 from server.process import announce_compiling, freeze, leave, loop_factory, on_signals, rss_mb, signals
 from server.recorder import RecordedWorld
-from server.rules import Rules, RulesError, load_rules
+from server.rules import Rules, RulesError, load_rules, prepared
 from server.settings import Settings, parse
 from server.store import Store
 from server.ticker import Ticker, best_alarm
@@ -97,7 +97,7 @@ def run(settings: Settings) -> int:
         scene = dataclasses.replace(scene, tick_rate=settings.tick_rate)
     if settings.reach is not None:
         scene = dataclasses.replace(scene, reach=settings.reach)
-    scene = rules.prepare(scene)
+    scene = prepared(rules, scene)
     kernels.force(settings.kernel)
     if settings.kernel == kernels.AUTO and kernels.trouble():
         logger.warning("the physics is slower, or has to be compiled", kernel=kernels.describe())

@@ -15,7 +15,8 @@ from shared.blocks import DIGEST_BYTES, Kinds, digest_of, pack, unpack
 from shared.checks import Cell
 from shared.layout import FALLING, FLAGS, ID, Int64s
 from shared.scene import Scene
-from shared.world import STATES, World, hash_of
+from shared.states import STATES
+from shared.world import World, hash_of
 
 Segment = tuple[int, int, int, bytes | None]
 """Index of a loaded segment, and its packed blocks (None: as the generator makes them)."""
@@ -139,7 +140,7 @@ def restored(scene: Scene, checkpoint: Checkpoint, *, compiled: bool | None = No
     world = RecordedWorld(scene, compiled=compiled)
     for cell, kinds in loaded.items():
         world.load_segment(cell, kinds)
-    world.put(states)
+    world.write(states)
     world.next_id = checkpoint.next_id
     world.rebase(checkpoint.tick)
     return world

@@ -22,11 +22,12 @@ from server.orders import Orders
 from server.recorder import RecordedWorld, Saves
 from server.rewind import Rewind
 from server.roster import Roster
-from server.rules import Rules
+from server.rules import Rules, checked_function
 from server.session import Link, Session
 from server.stage import Stage
 from shared import messages
 from shared.bounds import in_ticks
+from shared.checks import SceneError, shown, whole
 from shared.inputs import Input
 from shared.messages import (
     INPUT_ROW_BYTES,
@@ -50,6 +51,7 @@ RESYNC_S = 1.0
 BURST_S, BURST_TICKS_MIN = 1.0, 32
 """A client may send this many seconds' (at least this many ticks') worth of messages at once, and as many more as the
 server itself is behind."""
+SEED_MAX = (1 << 63) - 1
 AWAY_S = 1.0
 """After a pause between two ticks of more than this many seconds, the clients' silence is not counted against them."""
 
@@ -82,6 +84,14 @@ class Game:
         seed: int = 0,
         authenticate: Callable[[str], str] | None = None,
     ) -> None:
+        for value, at, kind in ((scene, "scene", Scene), (limits, "limits", Limits), (world, "world", RecordedWorld)):
+            if not isinstance(value, kind) and (value is not None or kind is Scene):
+                raise SceneError(f"{at} = {shown(value)}: must be a `{kind.__name__}`")
+        if world is not None and world.scene.fingerprint != scene.fingerprint:
+            raise SceneError(f"world: is one of {world.scene!r}, and not of {scene!r}")
+        if authenticate is not None:
+            checked_function(authenticate, "authenticate")
+        whole(seed, "seed", -SEED_MAX, SEED_MAX)
         self.scene = scene
         self.limits = limits or Limits()
         if world is None:
@@ -188,12 +198,13 @@ class Game:
         """One tick. `deadline`: the time it was due, by the same clock as `now`; it ends tick T at `deadline`."""
         self._excuse(now)
         self._deadline, self._ticked = deadline, now
-        self.stage.start()
-        self.roster.leave(now)
-        self._join()
-        self.roster.revive()
-        self.orders.carry_out()
-        self.stage.act()
+        with self.stage.turn:
+            self.stage.start()
+            self.roster.leave(now)
+            self._join()
+            self.roster.revive()
+            self.orders.carry_out()
+            self.stage.act()
         inputs = self._take_inputs()
         self.world.step(inputs)
         self.stage.stepped()

@@ -34,14 +34,14 @@ import msgpack
 import numpy as np
 
 from server import former
-from shared import terrain
+from shared import states, terrain
 from shared.blocks import unpack
 from shared.checks import SceneError
-from shared.inputs import MOVE_MAX, Input
-from shared.layout import BUTTONS, FALLING, FLAGS, ID, MOVE_X, TEMPLATE, VX, Int64s, X
+from shared.inputs import Input
+from shared.layout import FALLING, FLAGS, ID, Int64s
 from shared.scene import Scene
-from shared.units import BLOCK, RANGE_BLOCKS
-from shared.world import ID_MAX, STATES, World
+from shared.states import STATES
+from shared.world import World
 
 MAGIC = b"\x89SNJ\r\n\x1a\n"
 VERSION = 3
@@ -50,9 +50,6 @@ UNCHECKED_HEAD = 2
 HASH_TICKS = 32
 """A full hash so often, in ticks."""
 FRAME = struct.Struct("<III")
-
-PLACE_MAX, FAST = 2 * RANGE_BLOCKS * BLOCK, 1 << 30
-"""No position in a file is further from 0 along an axis, no velocity greater: more than any world gets to."""
 
 PUT, REMOVE, FILL, LOAD, UNLOAD, WRITE, REBASE, NOTE = range(8)
 Call = list[Any]
@@ -153,7 +150,7 @@ class Recording:
         world = World(Scene.from_table(table), compiled=compiled)
         for x, y, z, packed in segments:
             apply(world, [LOAD, x, y, z, packed])
-        world.put(checked_states(world.scene, np.frombuffer(states, "<i8").astype(np.int64)))
+        world.write(checked_states(world.scene, np.frombuffer(states, "<i8").astype(np.int64)))
         world.next_id = next_id
         world.rebase(tick)
         return world
@@ -226,19 +223,17 @@ def checked_states(scene: Scene, numbers: Int64s) -> Int64s:
     Raises:
         ValueError: they are no states, or there is none like that in such a scene.
     """
-    states = numbers.reshape(-1, STATES)
-    parts = (ID, 1, ID_MAX), (TEMPLATE, 0, len(scene.templates) - 1), (slice(MOVE_X, BUTTONS), -MOVE_MAX, MOVE_MAX)
-    for columns, low, high in (*parts, (slice(X, VX), -PLACE_MAX, PLACE_MAX), (slice(VX, MOVE_X), -FAST, FAST)):
-        if ((states[:, columns] < low) | (states[:, columns] > high)).any():
-            raise ValueError("a state is out of range")
-    return states
+    try:
+        return states.checked_states(numbers.reshape(-1, STATES), len(scene.templates))
+    except SceneError as error:
+        raise ValueError(f"a state is out of range ({error})") from error
 
 
 def apply(world: World, call: Call) -> None:
     """Does what a call did."""
     match call:
         case [int(op), *numbers] if op == PUT:
-            world.put(checked_states(world.scene, np.array(numbers, np.int64)))
+            world.write(checked_states(world.scene, np.array(numbers, np.int64)))
         case [int(op), entity] if op == REMOVE:
             world.remove(entity)
         case [int(op), x0, y0, z0, x1, y1, z1, kind, push] if op == FILL:

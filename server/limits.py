@@ -1,12 +1,14 @@
 """Every bound of the server, with its unit; what is reached is answered with a close code, never with a queue."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 from server.kinds import Kind, setting
 from shared.bounds import in_ticks
+from shared.checks import boolean, duration, whole
 from shared.messages import CLIENT_MESSAGE_MAX, INPUT_ROWS_MAX, NAME_MAX
 
 HOUR_S = 3600.0
+MOST = 1 << 62
 CATCH_UP_S, CATCH_UP_TICKS_MIN = 0.125, 4
 """After a pause, at most this many seconds' worth of ticks (at least this many) run at once; the rest is dropped."""
 
@@ -75,5 +77,13 @@ class Limits:
     """and lets go of those further away than this."""
 
     def __post_init__(self) -> None:
+        for f in fields(self):
+            value, default = getattr(self, f.name), f.default
+            if isinstance(default, bool):
+                boolean(value, f.name)
+            elif isinstance(default, int):
+                whole(value, f.name, 0, MOST)
+            else:
+                duration(value, f.name, endless=True)
         assert self.see_radius <= self.keep_radius
         assert self.terrain_chunk_bytes <= self.terrain_bytes_per_tick

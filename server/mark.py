@@ -1,4 +1,4 @@
-"""How much of a saved world has been promised: `world.mark`, a small file beside the database.
+"""A note of how much of a saved world has been acknowledged: `world.mark`, a small file beside the database.
 
 SQLite opens a file whose -wal is damaged without a word: it takes what comes before the damage for all there is. That
 is right after a crash, which leaves a transaction half written. It is wrong when a byte of a finished one has changed,
@@ -137,7 +137,7 @@ def read(path: Path) -> Mark | None:
 
 
 def boot() -> bytes:
-    """What the system calls its latest start; `UNKNOWN` where it does not tell."""
+    """Returns the identifier of the system's latest start; `UNKNOWN` where the system has none."""
     try:
         return bytes.fromhex(Path("/proc/sys/kernel/random/boot_id").read_text("ascii").strip().replace("-", ""))
     except (OSError, ValueError):

@@ -32,7 +32,8 @@ from shared.blocks import Kinds, pack, segment_of
 from shared.checks import Cell, SceneError
 from shared.inputs import Input
 from shared.layout import FALLING, FLAGS, ID, Int64s
-from shared.world import STATES, OverlapError, World
+from shared.states import STATES
+from shared.world import OverlapError, World
 
 FRESHENED_PER_TICK = 1
 """Digests of changed segments that are computed after each step, so that no later tick has to compute many at once."""
@@ -162,13 +163,13 @@ class RecordedWorld(World):
 
     # -- what changes a world --------------------------------------------------------------------------------
 
-    def put(self, states: Iterable[tuple[int, ...]] | Int64s) -> None:
+    def _put(self, states: Iterable[tuple[int, ...]] | Int64s) -> None:
         if self._pens and not self._inside:
             states = states if isinstance(states, np.ndarray) else list(states)
             rows = np.array(states, np.int64).reshape(-1, STATES)
             self._forget(rows[:, ID].tolist())
             self._call([PUT, *rows.ravel().tolist()])
-        super().put(states)
+        super()._put(states)
 
     def spawn_many(self, template: str, positions: npt.ArrayLike) -> range:
         self._inside += 1  # if it fails, it removes what it has put, and nothing has happened
@@ -182,22 +183,22 @@ class RecordedWorld(World):
             self._call([PUT, *states.ravel().tolist()])
         return ids
 
-    def remove(self, entity: int) -> None:
-        super().remove(entity)
+    def _remove(self, entity: int) -> None:
+        super()._remove(entity)
         if self._pens and not self._inside:
             self._forget([entity])
-            self._call([REMOVE, int(entity)])
+            self._call([REMOVE, entity])
 
-    def fill(self, low: Cell, high: Cell, kind: int, *, push: bool = False) -> int:
+    def _fill(self, low: Cell, high: Cell, kind: int, push: bool) -> int:
         if not self._pens:
-            return super().fill(low, high, kind, push=push)
+            return super()._fill(low, high, kind, push)
         (x0, y0, z0), (x1, y1, z1) = segment_of(*low), segment_of(*(part - 1 for part in high))
         for segment in ((x, y, z) for z in range(z0, z1 + 1) for y in range(y0, y1 + 1) for x in range(x0, x1 + 1)):
             self._touch(segment)
-        call = [FILL, *map(int, low), *map(int, high), kind, push]
+        call = [FILL, *low, *high, kind, push]
         self._inside += 1  # what it pushes is not a call of its own
         try:
-            changed = super().fill(low, high, kind, push=push)
+            changed = super()._fill(low, high, kind, push)
         except OverlapError:
             self._call(call)
             raise
@@ -206,27 +207,26 @@ class RecordedWorld(World):
         self._call(call)
         return changed
 
-    def load_segment(self, index: Cell, kinds: Kinds) -> None:
+    def _load(self, index: Cell, kinds: Kinds) -> None:
         self._touch(index)
-        super().load_segment(index, kinds)
+        super()._load(index, kinds)
         if self._pens:
             self._call([LOAD, *index, packed(self, index)])
 
-    def unload_segment(self, index: Cell) -> None:
+    def _unload(self, index: Cell) -> None:
         self._touch(index)
-        super().unload_segment(index)
+        super()._unload(index)
         if self._pens:
             self._call([UNLOAD, *index])
 
-    def write_blocks(self, segment: Cell, offsets: Iterable[int], kinds: Iterable[int]) -> None:
+    def _write_blocks(self, segment: Cell, offsets: list[int], kinds: list[int]) -> None:
         self._touch(segment)
-        offsets, kinds = list(offsets), list(kinds)
-        super().write_blocks(segment, offsets, kinds)
+        super()._write_blocks(segment, offsets, kinds)
         if self._pens:
             self._call([WRITE, *segment, offsets, kinds])
 
-    def rebase(self, tick: int) -> None:
-        super().rebase(tick)
+    def _rebase(self, tick: int) -> None:
+        super()._rebase(tick)
         if self._pens:
             self._call([REBASE, tick])
 

@@ -189,6 +189,9 @@ class Player:
         self.outbox = Outbox()
         """What the rules have sent, to be told."""
 
+    def __repr__(self) -> str:
+        return f"<Player {self.name!r}, entity {self.entity}>"
+
     def heard(self) -> None:
         """The client has got its newest token: it may throw away the one before, and so is that one worth nothing."""
         del self.tokens[:-1]

@@ -21,7 +21,7 @@ from typing import TypeVar
 import numpy as np
 import numpy.typing as npt
 
-from shared.checks import Cell
+from shared.checks import Cell, MissingError, SceneError, shown
 from shared.layout import CELLS
 from shared.units import SEGMENT, SEGMENT_SHIFT
 
@@ -65,6 +65,19 @@ def unpack(data: bytes) -> Kinds:
     if len(raw) != BLOCKS or not unpacker.eof or unpacker.unused_data:
         raise ValueError("packed segment: not 32768 blocks")
     return np.frombuffer(raw, np.uint8)
+
+
+def checked_kinds(kinds: npt.ArrayLike) -> Kinds:
+    """The blocks of one segment as [32768] kinds.
+
+    Raises:
+        SceneError: they are not 32768 whole numbers from 0 to 255.
+    """
+    found = np.asarray(kinds)
+    good = found.dtype.kind in "iu" and found.size == BLOCKS
+    if not good or (found.dtype != np.uint8 and not AIR <= found.min() <= found.max() <= KIND_MAX):
+        raise SceneError(f"kinds = {shown(kinds)}: must be {BLOCKS} whole numbers from {AIR} to {KIND_MAX}")
+    return found.reshape(-1).astype(np.uint8, copy=False)
 
 
 def segment_of(x: int, y: int, z: int) -> Cell:
@@ -135,43 +148,78 @@ class Blocks:
     def unload(self, index: Cell) -> None:
         """Forgets a segment, which is solid from then on; its entities must have left or been removed.
 
-        Raises as `segment` does.
+        Raises as `row` does.
         """
-        row = self.rows.pop(index)
+        row = self.row(index)
+        del self.rows[index]
         self._free.append(row)
         self._stale.discard(row)
         self._rebuild(len(self.table))
+
+    def row(self, index: Cell) -> int:
+        """The row of a loaded segment.
+
+        Raises:
+            MissingError: it is not loaded.
+        """
+        row = self.rows.get(index)
+        if row is None:
+            raise MissingError(f"segment = {shown(index)}: is not loaded")
+        return row
 
     def get(self, x: int, y: int, z: int) -> int | None:
         """The kind of a block; None where no segment is loaded."""
         row = self.rows.get(segment_of(x, y, z))
         return None if row is None else int(self.kinds[row, offset_of(x, y, z)])
 
+    def different(self, low: Cell, high: Cell, kind: int) -> list[tuple[Cell, int]]:
+        """The blocks of a box (`high` excluded) that are not of a kind, and the kinds they have, by z, y, x.
+
+        Raises:
+            SceneError: a segment in it is not loaded.
+        """
+        (x0, y0, z0), (x1, y1, z1) = low, high
+        if (x1 - x0, y1 - y0, z1 - z0) == (1, 1, 1):  # 1 us, not 60
+            before = self.get(x0, y0, z0)
+            if before is not None:
+                return [(low, before)] if before != kind else []
+        found = np.zeros((z1 - z0, y1 - y0, x1 - x0), np.uint8)
+        spans = [range(a >> SEGMENT_SHIFT, (b - 1 >> SEGMENT_SHIFT) + 1) for a, b in zip(low, high, strict=True)]
+        for z, y, x in itertools.product(*reversed(spans)) if found.size else ():
+            row = self.rows.get((x, y, z))
+            corner = x * SEGMENT, y * SEGMENT, z * SEGMENT
+            first = [max(a, part) for a, part in zip(low, corner, strict=True)]
+            if row is None:
+                raise SceneError(f"block {tuple(first)}: its segment is not loaded")
+            ends = [min(b, part + SEGMENT) for b, part in zip(high, corner, strict=True)]
+            here = tuple(slice(a - part, b - part) for a, b, part in zip(first, ends, corner, strict=True))
+            there = tuple(slice(a - part, b - part) for a, b, part in zip(first, ends, low, strict=True))
+            found[there[::-1]] = self.kinds[row].reshape(SEGMENT, SEGMENT, SEGMENT)[here[::-1]]
+        at = np.argwhere(found != kind)
+        kinds: list[int] = found[tuple(at.T)].tolist()
+        return [((x0 + x, y0 + y, z0 + z), was) for (z, y, x), was in zip(at.tolist(), kinds, strict=True)]
+
     def set(self, x: int, y: int, z: int, kind: int) -> None:
-        """Changes one block of a loaded segment. Raises as `segment` does."""
-        row, at = self.rows[segment_of(x, y, z)], offset_of(x, y, z)
+        """Changes one block of a loaded segment. Raises as `row` does."""
+        row, at = self.row(segment_of(x, y, z)), offset_of(x, y, z)
         self.kinds[row, at] = kind
         word, bit = at >> SEGMENT_SHIFT, 1 << (at & (SEGMENT - 1))
         self.solid[row, word] = int(self.solid[row, word]) & ~bit | (bit if kind != AIR else 0)
         self._touch(row)
 
     def segment(self, index: Cell) -> Kinds:
-        """The blocks of a loaded segment, [z, y, x], read-only.
-
-        Raises:
-            KeyError: it is not loaded.
-        """
-        view: Kinds = self.kinds[self.rows[index]].reshape(SEGMENT, SEGMENT, SEGMENT)
+        """The blocks of a loaded segment, [z, y, x], read-only. Raises as `row` does."""
+        view: Kinds = self.kinds[self.row(index)].reshape(SEGMENT, SEGMENT, SEGMENT)
         view.flags.writeable = False
         return view
 
     def version(self, index: Cell) -> int:
-        """The number of a loaded segment's latest change; see the module. Raises as `segment` does."""
-        return int(self.versions[self.rows[index]])
+        """The number of a loaded segment's latest change; see the module. Raises as `row` does."""
+        return int(self.versions[self.row(index)])
 
     def digest(self, index: Cell) -> bytes:
-        """The digest of a loaded segment. Raises as `segment` does."""
-        row = self.rows[index]
+        """The digest of a loaded segment. Raises as `row` does."""
+        row = self.row(index)
         if row in self._stale:
             self._freshen(row)
         return bytes(self.digests[row])

@@ -11,8 +11,9 @@ from typing import Any
 
 import numpy as np
 
-NUMBERS = (int, float, np.integer, np.floating)
-"""Types of which a value is a number, if it is no truth value."""
+WHOLE = (int, np.integer)
+NUMBERS = (*WHOLE, float, np.floating)
+"""Types of which a value is a number, if it is no truth value; `WHOLE`: a whole one."""
 
 Vec = tuple[float, float, float]
 Cell = tuple[int, int, int]
@@ -20,6 +21,13 @@ Cell = tuple[int, int, int]
 
 class SceneError(ValueError):
     """A value that no world can hold; the message names the field and the value."""
+
+
+class MissingError(KeyError):
+    """Something is named that is not there: an entity, or a segment; the message says which."""
+
+    def __str__(self) -> str:
+        return str(self.args[0])
 
 
 def shown(value: object) -> str:
@@ -45,6 +53,15 @@ def finite(value: object, at: str) -> float:
     return number
 
 
+def duration(value: object, at: str, *, endless: bool = False) -> float:
+    """A number of 0 or more: a time in seconds, for example. With `endless`, math.inf is one, too."""
+    if endless and value == math.inf:
+        return math.inf
+    if finite(value, at) < 0:
+        raise SceneError(f"{at} = {shown(value)}: must not be negative")
+    return finite(value, at)
+
+
 def utf8(value: str) -> bool:
     """Whether UTF-8 can hold a text: a lone surrogate, half of a character, it cannot."""
     try:
@@ -55,7 +72,7 @@ def utf8(value: str) -> bool:
 
 
 def text(value: object, at: str, longest: int = 64, shortest: int = 1) -> str:
-    """A text of so many characters that UTF-8 can hold."""
+    """Returns a text of `shortest` to `longest` characters that UTF-8 can hold."""
     if not isinstance(value, str) or not shortest <= len(value) <= longest:
         raise SceneError(f"{at} = {shown(value)}: must be a text of {shortest} to {longest} characters")
     if not utf8(value):
@@ -72,7 +89,9 @@ def boolean(value: object, at: str) -> bool:
 
 def whole(value: object, at: str, low: int, high: int) -> int:
     """A whole number from `low` to `high`; not a truth value."""
-    if isinstance(value, bool) or not isinstance(value, int | np.integer) or not low <= value <= high:
+    if type(value) is int and low <= value <= high:
+        return value
+    if isinstance(value, bool) or not isinstance(value, WHOLE) or not low <= value <= high:
         raise SceneError(f"{at} = {shown(value)}: must be a whole number from {low} to {high}")
     return int(value)
 

@@ -4,7 +4,8 @@ from typing import NamedTuple
 
 import msgpack
 
-from shared.checks import SceneError
+from shared.blocks import AIR, KIND_MAX
+from shared.checks import WHOLE, SceneError, shown, whole
 from shared.layout import X
 from shared.messages import DONE, INVALID, OUT_OF_REACH, OVERLAPS
 from shared.units import BLOCK
@@ -23,6 +24,31 @@ class Edit(NamedTuple):
     kind: int
 
 
+class EditError(SceneError, OverflowError):
+    """An edit of a block beyond all worlds, or to a kind that there is not."""
+
+
+FAR = (1 << 28) - 1
+"""No block is further from 0 along an axis."""
+
+
+def checked(x: object, y: object, z: object, kind: object) -> Edit:
+    """An edit of whole numbers.
+
+    Raises:
+        EditError: one of them is out of range.
+        TypeError: one of them is none.
+    """
+    for value, at in ((x, "x"), (y, "y"), (z, "z"), (kind, "kind")):
+        if isinstance(value, bool) or not isinstance(value, WHOLE):
+            raise TypeError(f"{at} = {shown(value)}: must be a whole number")
+    try:
+        at_x, at_y, at_z = (whole(value, at, -FAR, FAR) for value, at in ((x, "x"), (y, "y"), (z, "z")))
+        return Edit(at_x, at_y, at_z, whole(kind, "kind", AIR, KIND_MAX))
+    except SceneError as error:
+        raise EditError(str(error)) from None
+
+
 def pack(edit: Edit) -> bytes:
     """The payload of the command."""
     return msgpack.packb(tuple(edit))  # type: ignore[no-any-return]
@@ -37,7 +63,7 @@ def unpack(payload: bytes) -> Edit | None:
     if type(parts) is not list or len(parts) != 4 or any(type(part) is not int for part in parts):
         return None
     edit = Edit(*parts)
-    return edit if all(abs(part) < 1 << 28 for part in edit[:3]) and 0 <= edit.kind <= 255 else None
+    return edit if all(abs(part) <= FAR for part in edit[:3]) and AIR <= edit.kind <= KIND_MAX else None
 
 
 def apply(world: World, entity: int, edit: Edit) -> int:

@@ -182,6 +182,9 @@ class Scene:
         Raises:
             SceneError: a field is unknown, missing or out of range; the message names it.
         """
+        given: object = table
+        if not isinstance(given, Mapping):
+            raise SceneError(f"scene = {shown(given)}: must be a table")
         known = {f.name for f in fields(cls)}
         for key in table:
             if key not in known:
@@ -279,22 +282,23 @@ class Scene:
         return templates, walk, p
 
 
-def load_scene(name_or_path: str) -> Scene:
+def load_scene(name_or_path: str | Path) -> Scene:
     """A scene that comes with the package, by name, or any other by the path of its TOML file.
 
     Raises:
         SceneError: there is no such scene, or its file is broken; the message says where.
     """
-    path = SCENES / f"{name_or_path}.toml"
-    if not path.is_file():
-        path = Path(name_or_path)
+    if not isinstance(name_or_path, str | Path):
+        raise SceneError(f"scene = {shown(name_or_path)}: must be a name, or the path of a file")
+    built_in, path = SCENES / f"{name_or_path}.toml", Path(name_or_path)
     try:
+        path = built_in if built_in.is_file() else path
         table = tomllib.loads(path.read_text("utf-8"))
-    except (OSError, UnicodeDecodeError) as error:
-        names = ", ".join(sorted(file.stem for file in SCENES.glob("*.toml")))
-        raise SceneError(f"scene {name_or_path!r}: cannot be read ({error}); built in are {names}") from error
     except tomllib.TOMLDecodeError as error:
         raise SceneError(f"scene {path}: not valid TOML ({error})") from error
+    except (OSError, ValueError) as error:  # no such file; or its text, or its path, is none
+        names = ", ".join(sorted(file.stem for file in SCENES.glob("*.toml")))
+        raise SceneError(f"scene {name_or_path!r}: cannot be read ({error}); built in are {names}") from error
     try:
         return Scene.from_table({"name": path.stem} | table)
     except SceneError as error:

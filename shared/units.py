@@ -10,7 +10,7 @@ import math
 import numpy as np
 import numpy.typing as npt
 
-from shared.checks import SceneError, finite
+from shared.checks import SceneError, finite, shown
 
 BLOCK_SHIFT = 24
 BLOCK = 1 << BLOCK_SHIFT
@@ -56,7 +56,13 @@ def to_positions(values: npt.ArrayLike, field: str) -> npt.NDArray[np.int64]:
     Raises:
         SceneError: another shape, or a row in which a value is not finite or out of range.
     """
-    blocks = np.asarray(values, np.float64)
+    try:
+        given = np.asarray(values)
+    except (TypeError, ValueError) as error:  # rows of different lengths
+        raise SceneError(f"{field} = {shown(values)}: must be rows of three numbers") from error
+    if given.dtype.kind not in "iuf":
+        raise SceneError(f"{field} = {shown(values)}: must be rows of three numbers")
+    blocks = given.astype(np.float64)
     if blocks.ndim != 2 or blocks.shape[1] != 3:
         raise SceneError(f"{field}: must be rows of three numbers, not of shape {blocks.shape}")
     bad = np.flatnonzero(~(np.abs(blocks) <= RANGE_BLOCKS).all(axis=1))

@@ -10,6 +10,7 @@ are told the same in the same order have the same `state_hash()` at every tick, 
 """
 
 import hashlib
+import math
 import struct
 from collections.abc import Iterable, Mapping
 from typing import Any
@@ -18,17 +19,20 @@ import numpy as np
 import numpy.typing as npt
 
 from shared import blocks, kernels, layout, terrain
-from shared.checks import Cell, SceneError, whole
-from shared.inputs import Input
+from shared.checks import Cell, MissingError, SceneError, boolean, cell, shown, vector, whole
+from shared.inputs import BUTTONS_MAX, WISH_MAX, Input, checked_input
 from shared.layout import ENTITY, FALLING, FLAGS, ID, NEXT, PREV, TEMPLATE, VX, Arrays, X
 from shared.scene import Scene
-from shared.units import BLOCK, SEGMENT, SPEED, to_position, to_positions, to_velocity
+from shared.states import ID_MAX, STATES, checked_states
+from shared.units import BLOCK, RANGE_BLOCKS, SEGMENT, SPEED, to_position, to_positions, to_velocity
 
-STATES = layout.CELL
-"""Columns of an entity's state: id, template, flags, x, y, z, vx, vy, vz, move_x, move_y, buttons."""
 HASH_BYTES = 20
 """Bytes of a world's hash."""
-ID_MAX = (1 << 31) - 1
+SEGMENT_MAX = RANGE_BLOCKS // SEGMENT
+"""No index of a segment is further from 0 along an axis."""
+FILL_MAX = 1 << 20
+"""The most blocks that one `fill` sets."""
+TICK_MAX = (1 << 53) - 1
 COLLECT_MAX = 1024
 """Up to so many rows, the kernel sorts states by insertion: 1 us for some ten, instead of 9."""
 
@@ -40,12 +44,18 @@ class OverlapError(SceneError):
 class World:
     """All of a scene's state at one tick.
 
+    What names an entity raises `MissingError` (a `KeyError`) if there is none of that number. A wrong value raises
+    `SceneError`, with the field and the value in its text, before anything has changed.
+
     Args:
         scene: the rules.
         compiled: run a compiled kernel, or the plain one; None: the one that `kernels` chooses.
     """
 
     def __init__(self, scene: Scene, *, compiled: bool | None = None) -> None:
+        rules: object = scene
+        if not isinstance(rules, Scene):
+            raise SceneError(f"scene = {shown(rules)}: must be a `Scene`")
         self.scene = scene
         self.tick = 0
         """How many ticks have passed; see `rebase`."""
@@ -80,8 +90,8 @@ class World:
     def __len__(self) -> int:
         return len(self._row_of)
 
-    def __contains__(self, entity: int) -> bool:
-        return entity in self._row_of
+    def __contains__(self, entity: object) -> bool:
+        return isinstance(entity, int | np.integer) and not isinstance(entity, bool) and entity in self._row_of
 
     @property
     def entities(self) -> np.ndarray[Any, np.dtype[Any]]:
@@ -89,12 +99,13 @@ class World:
         return self.rows(sorted(self._row_of)).view(ENTITY).reshape(-1)
 
     def rows(self, entities: Iterable[int]) -> layout.Int64s:
-        """Some entities as an int64 matrix [n, 16] in the order asked for (columns as in `layout`). A copy.
-
-        Raises:
-            KeyError: there is no such entity.
-        """
-        return self._entities[[self._row_of[entity] for entity in entities]]
+        """Some entities as an int64 matrix [n, 16] in the order asked for (columns as in `layout`). A copy."""
+        asked = list(entities)
+        try:
+            rows = [self._row_of[entity] for entity in asked]
+        except (KeyError, TypeError):
+            rows = [self._row_at(entity) for entity in asked]
+        return self._entities[rows]
 
     def states(self) -> layout.Int64s:
         """The whole states of all entities, [n, 12], ascending by id: equal worlds have equal ones. A copy."""
@@ -108,32 +119,28 @@ class World:
         return rows
 
     def state(self, entity: int) -> tuple[int, ...]:
-        """The whole state of one entity as 12 whole numbers (the columns before `cell`).
-
-        Raises:
-            KeyError: there is no such entity.
-        """
-        state = self._entities[self._row_of[entity], :STATES].copy()
+        """The whole state of one entity as 12 whole numbers (the columns before `cell`)."""
+        state = self._entities[self._row_at(entity), :STATES].copy()
         state[FLAGS] &= FALLING
         return tuple(state.tolist())
 
     def position(self, entity: int) -> tuple[float, float, float]:
-        """Where an entity is, in blocks. Raises as `state` does."""
-        x, y, z = self._entities[self._row_of[entity], X : X + 3].tolist()
+        """Where an entity is, in blocks."""
+        x, y, z = self._entities[self._row_at(entity), X : X + 3].tolist()
         return x / BLOCK, y / BLOCK, z / BLOCK
 
     def velocity(self, entity: int) -> tuple[float, float, float]:
-        """How fast an entity is, in blocks/s. Raises as `state` does."""
-        x, y, z = self._entities[self._row_of[entity], VX : VX + 3].tolist()
+        """How fast an entity is, in blocks/s."""
+        x, y, z = self._entities[self._row_at(entity), VX : VX + 3].tolist()
         return x / SPEED, y / SPEED, z / SPEED
 
     def falling(self, entity: int) -> bool:
-        """Whether the gravity flag of an entity is up: it falls, or rises. Raises as `state` does."""
-        return bool(self._entities[self._row_of[entity], FLAGS] & FALLING)
+        """Whether the gravity flag of an entity is up: it falls, or rises."""
+        return bool(self._entities[self._row_at(entity), FLAGS] & FALLING)
 
     def awake(self, entity: int) -> bool:
-        """Whether an entity will have a turn in the next tick without an input. Raises as `state` does."""
-        return bool(self._entities[self._row_of[entity], FLAGS] & layout.AWAKE)
+        """Whether an entity will have a turn in the next tick without an input."""
+        return bool(self._entities[self._row_at(entity), FLAGS] & layout.AWAKE)
 
     @property
     def awake_count(self) -> int:
@@ -169,15 +176,13 @@ class World:
         """The id of the next entity to be spawned.
 
         Raises:
-            SceneError: it was set to a lower one than it is.
+            SceneError: it was set to a lower one than it is, or to more than there are.
         """
         return self._next_id
 
     @next_id.setter
     def next_id(self, entity: int) -> None:
-        if entity < self._next_id:
-            raise SceneError(f"next_id = {entity!r}: must be at least {self._next_id}")
-        self._next_id = entity
+        self._next_id = whole(entity, "next_id", self._next_id, ID_MAX + 1)
 
     @property
     def fell(self) -> list[int]:
@@ -189,9 +194,9 @@ class World:
         """The entities whose position lies in a loaded segment, [n, 16], ascending by id. A copy.
 
         Raises:
-            KeyError: the segment is not loaded.
+            MissingError: the segment is not loaded.
         """
-        row = self.blocks.rows[index]
+        row = self.blocks.row(index)
         found: list[int] = []
         heads = self.blocks.heads[row * layout.CELLS : (row + 1) * layout.CELLS]
         for head in heads[heads >= 0].tolist():
@@ -217,10 +222,14 @@ class World:
     def load_terrain(self, indices: Iterable[Cell] | None = None) -> None:
         """Generates segments by the scene's generator (all of the scene's by default)."""
         for index in self.scene.segments() if indices is None else indices:
-            self.load_segment(index, terrain.generate(self.scene.terrain, index))
+            segment = _segment(index)
+            self._load(segment, terrain.generate(self.scene.terrain, segment))
 
     def load_segment(self, index: Cell, kinds: blocks.Kinds) -> None:
         """Adds or replaces a segment ([32768] kinds) and wakes what may stand on it or have waited for it."""
+        self._load(_segment(index), blocks.checked_kinds(kinds))
+
+    def _load(self, index: Cell, kinds: blocks.Kinds) -> None:
         if self.blocks.load(index, kinds):
             self._bind()
         if self._lengths[layout.N_HOMELESS]:
@@ -231,40 +240,53 @@ class World:
         """Forgets a segment; it is solid from then on.
 
         Raises:
-            KeyError: it is not loaded.
+            MissingError: it is not loaded.
             OverlapError: entities are still in it.
         """
-        if len(self.in_segment(index)):
-            raise OverlapError(f"segment {index}: entities are in it")
+        segment = _segment(index)
+        if len(self.in_segment(segment)):
+            raise OverlapError(f"segment {segment}: entities are in it")
+        self._unload(segment)
+
+    def _unload(self, index: Cell) -> None:
         self.blocks.unload(index)
         self._wake_segment(index)  # below the scene's floor, what is not loaded is void
 
+    def block(self, x: int, y: int, z: int) -> int | None:
+        """The kind of a block; None where no segment is loaded."""
+        return self.blocks.get(*_block(x, y, z))
+
     def set_block(self, x: int, y: int, z: int, kind: int, *, push: bool = False) -> bool:
         """Places (kind 1 to 255) or removes (0) a block; whether anything changed. Raises as `fill` does."""
-        return self.fill((x, y, z), (x + 1, y + 1, z + 1), kind, push=push) > 0
+        x, y, z = _block(x, y, z)
+        kind, push = whole(kind, "kind", blocks.AIR, blocks.KIND_MAX), boolean(push, "push")
+        return self._fill((x, y, z), (x + 1, y + 1, z + 1), kind, push) > 0
 
     def fill(self, low: Cell, high: Cell, kind: int, *, push: bool = False) -> int:
-        """Sets every block of the box between two corners (`high` excluded), or none; how many changed.
+        """Sets every block of the box between two corners (`high` excluded), or none; returns how many changed.
 
         With `push`, solid entities in the way go to their nearest free places as in `place`, in ascending order of id.
 
         Raises:
             OverlapError: a solid entity is in the way (and, with `push`, cannot be pushed out of it).
-            SceneError: not a kind, or no segment is loaded there.
+            SceneError: not a kind, more than `FILL_MAX` blocks, or no segment is loaded there.
         """
-        whole(kind, "kind", blocks.AIR, blocks.KIND_MAX)
-        cells = [
-            (x, y, z) for z in range(low[2], high[2]) for y in range(low[1], high[1]) for x in range(low[0], high[0])
-        ]
-        for cell in cells:
-            if blocks.segment_of(*cell) not in self.blocks:
-                raise SceneError(f"block {cell}: its segment is not loaded")
+        low, high = (cell(corner, at, -RANGE_BLOCKS, RANGE_BLOCKS) for corner, at in ((low, "low"), (high, "high")))
+        kind, push = whole(kind, "kind", blocks.AIR, blocks.KIND_MAX), boolean(push, "push")
+        sides = [b - a for a, b in zip(low, high, strict=True)]
+        if min(sides) < 0:
+            raise SceneError(f"high = {high}: must not be below low = {low} along any axis")
+        if math.prod(sides) > FILL_MAX:
+            raise SceneError(f"low = {low}, high = {high}: {math.prod(sides)} blocks; at most {FILL_MAX} at once")
+        return self._fill(low, high, kind, push) if min(sides) else 0
+
+    def _fill(self, low: Cell, high: Cell, kind: int, push: bool) -> int:
+        changed = self.blocks.different(low, high, kind)
         in_the_way: list[int] = []
-        if kind != blocks.AIR and cells:
+        if kind != blocks.AIR:
             in_the_way = self._overlapping(-1, [part * BLOCK for part in (*low, *high)])
             if in_the_way and not push:
                 raise OverlapError(f"blocks {low} to {high}: entity {in_the_way[0]} is there")
-        changed = [(cell, before) for cell in cells if (before := self.blocks.get(*cell) or blocks.AIR) != kind]
         for (x, y, z), before in changed:
             self.blocks.set(x, y, z, kind)
             self.editing.setdefault((x, y, z), before)
@@ -278,7 +300,7 @@ class World:
         except OverlapError:
             for cell, before in changed:
                 self.blocks.set(*cell, before)
-            self.put(states)
+            self._put(states)
             self.placing = placing
             raise
         return len(changed)
@@ -305,13 +327,13 @@ class World:
             OverlapError: the place is taken (and, with `push`, so is everything near).
             SceneError: a value is not finite or out of range, or there is no such template.
         """
-        kind = self._template(template)
-        at = self._free_place(-1, kind, position, push)
+        kind = self.scene.template(template)
+        at = self._free_place(-1, kind, position, boolean(push, "push"))
         speed = _velocity(velocity)
         if self._next_id > ID_MAX:
             raise SceneError("ids: used up")
         entity = self._next_id
-        self.put([(entity, kind, self._thrown(speed[2]), *at, *speed, 0, 0, 0)])
+        self._put([(entity, kind, self._thrown(speed[2]), *at, *speed, 0, 0, 0)])
         return entity
 
     def spawn_many(self, template: str, positions: npt.ArrayLike) -> range:
@@ -325,7 +347,7 @@ class World:
             OverlapError: a place is taken, if only by an earlier one.
             SceneError: a value is not finite or out of range, or there is no such template.
         """
-        kind = self._template(template)
+        kind = self.scene.template(template)
         at = to_positions(positions, "positions")
         n, first = len(at), self._next_id
         if first + n - 1 > ID_MAX:
@@ -341,43 +363,43 @@ class World:
             for entity in ids[settled:]:
                 self._free.append(self._row_of.pop(entity))
             for entity in ids[:settled]:
-                self.remove(entity)
+                self._remove(entity)
             self._next_id = first
             place = (at[settled] / BLOCK).tolist()
             raise OverlapError(f"positions[{settled}] = {place}: no room for a {template!r} there")
         return ids
 
     def place(self, entity: int, position: tuple[float, float, float], *, push: bool = False) -> None:
-        """Teleports an entity, which keeps its velocity. Raises as `spawn` does, and `KeyError`."""
-        row = self._row_of[entity]
+        """Teleports an entity, which keeps its velocity. Raises as `spawn` does, and `MissingError`."""
+        row = self._row_at(entity)
         state = list(self.state(entity))
-        state[X : X + 3] = self._free_place(row, state[TEMPLATE], position, push)
-        self.put([tuple(state)])
-        self.placing.add(entity)
+        state[X : X + 3] = self._free_place(row, state[TEMPLATE], position, boolean(push, "push"))
+        self._put([tuple(state)])
+        self.placing.add(state[ID])
 
     def set_velocity(self, entity: int, velocity: tuple[float, float, float]) -> None:
-        """Throws an entity, in blocks/s; upwards raises its gravity flag. Raises as `spawn` does, and `KeyError`."""
+        """Throws an entity, in blocks/s; upwards raises its gravity flag. Raises as `place` does."""
         state = list(self.state(entity))
         state[VX : VX + 3] = _velocity(velocity)
         state[FLAGS] |= self._thrown(state[VX + 2])
-        self.put([tuple(state)])
+        self._put([tuple(state)])
 
     def set_template(self, entity: int, template: str) -> None:
-        """Changes what an entity is, and so its box. Raises as `spawn` does, and `KeyError`."""
-        row = self._row_of[entity]
+        """Changes what an entity is, and so its box. Raises as `place` does."""
+        row = self._row_at(entity)
         state = list(self.state(entity))
-        state[TEMPLATE] = self._template(template)
+        state[TEMPLATE] = self.scene.template(template)
         box = self._box_at(state[TEMPLATE], state[X : X + 3])
         if self._taken(row, state[TEMPLATE], box):
             raise OverlapError(f"entity {entity}: no room for the box of {template!r}")
-        self.put([tuple(state)])
+        self._put([tuple(state)])
 
     def remove(self, entity: int) -> None:
-        """Takes an entity out of the world and wakes what stood on it.
+        """Takes an entity out of the world and wakes what stood on it."""
+        self._row_at(entity)
+        self._remove(int(entity))
 
-        Raises:
-            KeyError: there is no such entity.
-        """
+    def _remove(self, entity: int) -> None:
         row = self._row_of.pop(entity)
         self._leave(row)
         self.kernel.unlink(self._bound, row)
@@ -385,7 +407,14 @@ class World:
         (self._limbo if self._entities[row, FLAGS] & layout.AWAKE else self._free).append(row)
 
     def put(self, states: Iterable[tuple[int, ...]] | layout.Int64s) -> None:
-        """Writes whole states ([n, 12], as `state` gives them), new or known: what a snapshot says, verbatim."""
+        """Writes whole states ([n, 12], as `state` gives them), new or known, as they are: nothing is in their way."""
+        self._put(checked_states(states, len(self.scene.templates)))
+
+    def write(self, states: layout.Int64s) -> None:
+        """Writes whole states as `put` does, without its checks: for what `snapshot.decode_parts` has checked."""
+        self._put(states)
+
+    def _put(self, states: Iterable[tuple[int, ...]] | layout.Int64s) -> None:
         new = np.asarray(states if isinstance(states, np.ndarray) else list(states), np.int64).reshape(-1, STATES)
         ids = new[:, ID].tolist()
         known = list(map(self._row_of.get, ids))
@@ -393,11 +422,22 @@ class World:
         self.kernel.store(self._bound, self.kernel.lent(rows), self.kernel.lent(new), len(rows), self.tick + 1)
 
     def write_blocks(self, segment: Cell, offsets: Iterable[int], kinds: Iterable[int]) -> None:
-        """Changes blocks of a loaded segment (by index z << 10 | y << 5 | x): what a snapshot says, verbatim.
+        """Changes blocks of a loaded segment (by index z << 10 | y << 5 | x), as they are: nothing is in their way.
 
         Raises:
-            KeyError: the segment is not loaded.
+            MissingError: the segment is not loaded.
         """
+        where, what = list(offsets), list(kinds)
+        if len(where) != len(what):
+            raise SceneError(f"kinds: {len(what)} of them, for {len(where)} offsets")
+        segment = _segment(segment)
+        self.blocks.row(segment)
+        where = [whole(at, f"offsets[{i}]", 0, blocks.BLOCKS - 1) for i, at in enumerate(where)]
+        self._write_blocks(
+            segment, where, [whole(kind, f"kinds[{i}]", 0, blocks.KIND_MAX) for i, kind in enumerate(what)]
+        )
+
+    def _write_blocks(self, segment: Cell, offsets: list[int], kinds: list[int]) -> None:
         for at, kind in zip(offsets, kinds, strict=True):
             x, y, z = (
                 part * SEGMENT + ((at >> shift) & (SEGMENT - 1))
@@ -420,6 +460,8 @@ class World:
         Returns:
             Whether there is an entity for every turn.
         """
+        if turns.dtype != np.int64 or turns.ndim != 2 or turns.shape[1] != layout.TURN:
+            raise SceneError(f"turns = {shown(turns)}: must be int64 rows of {layout.TURN}")
         if len(turns):
             row_of = self._row_of
             turns[:, 0] = [row_of.get(entity, -1) for entity in turns[:, 0].tolist()]
@@ -429,6 +471,9 @@ class World:
 
     def rebase(self, tick: int) -> None:
         """Declares what has been written to be the world at the end of `tick`, without a step."""
+        self._rebase(whole(tick, "tick", -1, TICK_MAX))
+
+    def _rebase(self, tick: int) -> None:
         self._entities[: self._rows, layout.CHANGED] = -1  # it may be a tick that has been before
         self._lengths[layout.N_CHANGED] = self._lengths[layout.N_FELL] = 0
         self._rebased(tick)
@@ -449,16 +494,10 @@ class World:
     # -- time ----------------------------------------------------------------------------------------------
 
     def step(self, inputs: Mapping[int, Input] | None = None) -> None:
-        """One tick: `inputs` by entity id; an entity without one goes on with its latest.
-
-        Raises:
-            KeyError: an input for an entity that does not exist.
-        """
+        """One tick: `inputs` by entity id; an entity without one goes on with its latest."""
         n = len(inputs) if inputs else 0
         if inputs:
-            told: list[int] = []
-            for entity, wish in inputs.items():
-                told += (self._row_of[entity], *wish)
+            told = self._told_of(inputs)
             if len(told) > len(self._inputs):
                 self._inputs = np.zeros(2 * len(told), np.int64)
                 self._told = self.kernel.lent(self._inputs)
@@ -472,6 +511,25 @@ class World:
             self._free += self._limbo
             self._limbo.clear()
 
+    def _told_of(self, inputs: Mapping[int, Input]) -> list[int]:
+        """Inputs as the kernel wants them: the row, the move intent and the buttons of each."""
+        told: list[int] = []
+        rows, most = self._row_of, WISH_MAX
+        try:
+            for entity, (x, y, buttons) in inputs.items():
+                if not (
+                    type(x) is type(y) is type(buttons) is int
+                    and -most <= x <= most >= y >= -most
+                    and 0 <= buttons <= BUTTONS_MAX
+                ):
+                    raise ValueError
+                told += (rows[entity], x, y, buttons)
+        except (KeyError, TypeError, ValueError):  # one of them is not right, or numpy's
+            told = []
+            for entity, wish in inputs.items():
+                told += (self._row_at(entity), *checked_input(wish, f"inputs[{entity}]"))
+        return told
+
     def copy(self) -> "World":
         """Another world in the same state."""
         other = World(self.scene, compiled=self.compiled)
@@ -479,7 +537,18 @@ class World:
         return other
 
     def restore(self, other: "World") -> None:
-        """Becomes equal to `other`, a world of the same scene; cheap where little differs."""
+        """Becomes equal to `other`, a world of the same scene; cheap where little differs.
+
+        Raises:
+            SceneError: it is not of the same scene.
+        """
+        source: object = other
+        if not isinstance(source, World):
+            raise SceneError(f"other = {shown(source)}: must be a `World`")
+        theirs, mine = other.scene, self.scene
+        if theirs is not mine and theirs.fingerprint != mine.fingerprint:
+            differ = sorted(name for name, digest in mine.digests.items() if theirs.digests[name] != digest)
+            raise SceneError(f"other = a world of {theirs.name!r}: its scene has another {', '.join(differ)}")
         cells = self._entities[: self._rows, layout.CELL]
         self.blocks.heads[cells[cells >= 0]] = -1
         moved = len(self._entities) != len(other._entities)
@@ -529,6 +598,18 @@ class World:
         self._arrays = Arrays(*map(self.kernel.lent, arrays))
         self._bound = self.kernel.bound(self._arrays)
 
+    def _row_at(self, entity: int) -> int:
+        """The row of an entity.
+
+        Raises:
+            MissingError: there is no such entity.
+        """
+        row = self._row_of.get(entity if type(entity) is int else whole(entity, "entity", 1, ID_MAX))
+        if row is None:
+            why = "has been removed" if 0 < entity < self._next_id else "there is no such entity"
+            raise MissingError(f"entity = {entity}: {why}")
+        return row
+
     def _row(self, entity: int) -> int:
         """The row of an entity, a new one if it is not known."""
         row = self._row_of.get(entity)
@@ -550,12 +631,6 @@ class World:
     def _thrown(self, speed: int) -> int:
         """The flags of what flies up: it is not held by what it stands on."""
         return FALLING if speed > 0 and self._parameters[layout.GRAVITY] else 0
-
-    def _template(self, name: str) -> int:
-        kind = self.scene.index_of.get(name)
-        if kind is None:
-            raise SceneError(f"template = {name!r}: no such template (there are {', '.join(self.scene.index_of)})")
-        return kind
 
     def _box_at(self, kind: int, position: Iterable[int]) -> list[int]:
         """Low and high corner of a template's box at a position."""
@@ -584,10 +659,8 @@ class World:
         """Whether entities of a template are stopped by solid entities."""
         return bool(self._parameters[layout.PAIRS] and self._templates[kind, layout.SOLID])
 
-    def _free_place(self, row: int, kind: int, position: Iterable[float], push: bool) -> list[int]:
-        parts = tuple(position)
-        if len(parts) != 3:
-            raise SceneError(f"position = {position!r}: must have three numbers")
+    def _free_place(self, row: int, kind: int, position: object, push: bool) -> list[int]:
+        parts = vector(position, "position")
         at = [to_position(part, f"position.{axis}") for axis, part in zip("xyz", parts, strict=True)]
         if not self._taken(row, kind, self._box_at(kind, at)):
             return at
@@ -660,8 +733,15 @@ PUSHES = ((2, 1), (0, -1), (0, 1), (1, -1), (1, 1), (2, -1))
 """Where an overlapping box is pushed, in the order of preference at equal distance: axis and sign."""
 
 
-def _velocity(velocity: Iterable[float]) -> list[int]:
-    parts = tuple(velocity)
-    if len(parts) != 3:
-        raise SceneError(f"velocity = {velocity!r}: must have three numbers")
+def _velocity(velocity: object) -> list[int]:
+    parts = vector(velocity, "velocity")
     return [to_velocity(part, f"velocity.{axis}") for axis, part in zip("xyz", parts, strict=True)]
+
+
+def _block(x: object, y: object, z: object) -> Cell:
+    i, j, k = (whole(part, at, -RANGE_BLOCKS, RANGE_BLOCKS - 1) for at, part in (("x", x), ("y", y), ("z", z)))
+    return i, j, k
+
+
+def _segment(index: object) -> Cell:
+    return cell(index, "segment", -SEGMENT_MAX, SEGMENT_MAX - 1)

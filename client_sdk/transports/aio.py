@@ -28,10 +28,12 @@ from client_sdk.transports.connection import (
     UNSENT_MAX,
     ConnectError,
     Connection,
+    checked_tls,
     insecure,
     stalled,
     unreachable,
 )
+from shared.checks import duration
 from shared.scene import Scene
 
 TIMEOUT_S = 5.0
@@ -95,10 +97,10 @@ class AsyncClient(BaseClient):
         COMPILER.begin()
         core = LinkedCore(name, scene, token=token, patience_s=patience_s)
         core.link = link
-        client = cls(core, url, before_update, tls)
+        client = cls(core, url, before_update, checked_tls(tls))
         connection = client._connection
         try:
-            await client._dial(timeout)
+            await client._dial(duration(timeout, "timeout"))
         except BaseException as error:
             client._drop()
             if isinstance(error, ssl.SSLError):

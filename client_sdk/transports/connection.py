@@ -21,6 +21,7 @@ from websockets.uri import WebSocketURI, parse_uri
 
 from client_sdk.advice import TLS_ALERT, untrusted
 from client_sdk.core import Core
+from shared.checks import shown
 from shared.messages import MESSAGE_MAX, REASON_MAX, TEXT, TOO_SLOW
 
 UNSENT_MAX = 64 * 1024
@@ -196,8 +197,21 @@ def insecure(connection: Connection, error: ssl.SSLError) -> ConnectError:
     return ConnectError(untrusted(connection.url, error.reason or str(error), why))
 
 
-def _parse(url: str) -> WebSocketURI:
+def checked_tls(tls: object) -> ssl.SSLContext | None:
+    """The trust that a program has given, or None for the system's.
+
+    Raises:
+        ValueError: it is something else.
+    """
+    if tls is not None and not isinstance(tls, ssl.SSLContext):
+        raise ValueError(f"tls = {shown(tls)}: must be an ssl.SSLContext, or None to trust whom the system trusts")
+    return tls
+
+
+def _parse(url: object) -> WebSocketURI:
     hint = "a server's address looks like ws://localhost:8765"
+    if not isinstance(url, str):
+        raise ConnectError(f"url = {shown(url)}: must be a text; {hint}")
     try:
         uri = parse_uri(url)
         urlsplit(url).port  # noqa: B018  # raises for a port that is none

@@ -14,6 +14,7 @@ from typing import Any, Protocol
 from client_sdk.client import PATIENCE_S, Client
 from client_sdk.linked import LinkedCore
 from client_sdk.links import Path
+from shared.checks import SceneError, shown
 from shared.scene import Scene
 
 LEAP_S = 2.0
@@ -47,6 +48,8 @@ class Loopback:
     """
 
     def __init__(self, game: Host) -> None:
+        if isinstance(game, type) or not callable(getattr(game, "tick", None)):
+            raise SceneError(f"game = {shown(game)}: must be a `Game`")
         self.game = game
         self._seats: list[_Seat] = []
         self._began = -math.inf

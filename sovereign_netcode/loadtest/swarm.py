@@ -26,6 +26,7 @@ from client_sdk.stats import Stats
 from client_sdk.transports.aio import AsyncClient
 from client_sdk.transports.connection import ConnectError
 from server.histogram import Histogram
+from shared import kernels
 
 REPORT_S = 0.2
 LAG_S = 0.02
@@ -192,6 +193,7 @@ def say(what: dict[str, Any]) -> None:
 
 def run(order: dict[str, Any]) -> int:
     """Runs the whole process. Returns the exit code."""
+    kernels.get()  # where it has to be compiled, that is over before the first bot plays
     try:
         import uvloop
     except ImportError:

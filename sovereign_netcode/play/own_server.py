@@ -4,6 +4,7 @@ import asyncio
 import contextlib
 import queue
 import random
+import signal
 import subprocess
 import sys
 import threading
@@ -26,24 +27,52 @@ NAMES = ("Kim", "Lou", "Mio", "Nia", "Oz", "Pia", "Quin", "Rex", "Sol", "Tess", 
 @contextlib.contextmanager
 def process(*command: str) -> Iterator[tuple[subprocess.Popen[str], Stderr]]:
     """Runs a process of this Python within the block. At the end it gets SIGTERM, and is killed after `END_S`."""
-    errors = Stderr()
+    errors, running = Stderr(), None
     try:
-        running = subprocess.Popen(
-            [sys.executable, *command], stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=errors.pipe, text=True
-        )
-    finally:
-        errors.started()
-    try:
+        with uninterrupted():
+            running = subprocess.Popen(
+                [sys.executable, *command],
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.PIPE,
+                stderr=errors.pipe,
+                text=True,
+            )
+            errors.started()
         yield running, errors
     finally:
-        running.terminate()
-        try:
-            running.wait(END_S)
-        except subprocess.TimeoutExpired:
-            running.kill()
-            running.wait()
-        if running.stdout is not None:
-            running.stdout.close()
+        if running is not None:
+            end(running)
+
+
+@contextlib.contextmanager
+def uninterrupted() -> Iterator[None]:
+    """Holds SIGINT and SIGTERM back, so that no process is started that nobody knows.
+
+    Raises:
+        KeyboardInterrupt: one of them has come meanwhile.
+    """
+    came: list[int] = []
+    numbers = (signal.SIGINT, signal.SIGTERM)
+    before = {number: signal.signal(number, lambda number, frame: came.append(number)) for number in numbers}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+    if came:
+        raise KeyboardInterrupt
+
+
+def end(running: subprocess.Popen[str]) -> None:
+    """Ends a process: with SIGTERM, and if that does not do, at once."""
+    running.terminate()
+    try:
+        running.wait(END_S)
+    except subprocess.TimeoutExpired:
+        running.kill()
+        running.wait()
+    if running.stdout is not None:
+        running.stdout.close()
 
 
 @contextlib.contextmanager

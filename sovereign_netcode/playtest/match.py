@@ -18,7 +18,7 @@ from client_sdk.links import Path as Path
 from client_sdk.links import Weather, Wire
 from server.game import Game
 from server.limits import Limits
-from server.rules import Rules
+from server.rules import Rules, prepared
 from server.session import Session
 from shared.inputs import Input
 from shared.scene import Scene
@@ -161,7 +161,7 @@ class Match:
     """
 
     def __init__(self, scene: Scene, seed: int, *, limits: Limits | None = None, rules: Rules | None = None) -> None:
-        self.game = Game(scene if rules is None else rules.prepare(scene), limits=limits, rules=rules, seed=seed)
+        self.game = Game(scene if rules is None else prepared(rules, scene), limits=limits, rules=rules, seed=seed)
         self.seed = seed
         self.now = 0.0
         self.players: list[Player] = []

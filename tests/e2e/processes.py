@@ -106,14 +106,14 @@ class ServerProcess:
 
 
 @contextmanager
-def ignoring(*signals: int) -> Iterator[None]:
-    """What is started meanwhile ignores these signals from its beginning."""
-    before = {number: signal.signal(number, signal.SIG_IGN) for number in signals}
+def inheriting(handler: signal.Handlers, *signals: int) -> Iterator[None]:
+    """What is started meanwhile ignores these signals (SIG_IGN) from its beginning, or does not (SIG_DFL)."""
+    before = {number: signal.signal(number, handler) for number in signals}
     try:
         yield
     finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
+        for number, own in before.items():
+            signal.signal(number, own)
 
 
 @contextmanager

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from tests.client_sdk.servers import real_server
-from tests.e2e.processes import ignoring
+from tests.e2e.processes import inheriting
 
 pytestmark = pytest.mark.e2e
 needs_linux = pytest.mark.skipif(sys.platform != "linux", reason="looks for processes in /proc")
@@ -93,7 +93,7 @@ def playing(request: pytest.FixtureRequest) -> Iterator[tuple["subprocess.Popen[
     """A load test in the midst of it: its process, and those that it has started, with their commands."""
     command = [sys.executable, "-u", "scripts/loadtest.py", "--clients", "4", "--processes", "2", "--seconds", "60"]
     with ExitStack() as stack:
-        with ignoring(*getattr(request, "param", ())):
+        with inheriting(signal.SIG_IGN, *getattr(request, "param", ())):
             process = stack.enter_context(subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True))
         try:
             assert process.stdout is not None

@@ -29,7 +29,7 @@ from tests.e2e.processes import (
     UPGRADE,
     ServerProcess,
     Strider,
-    ignoring,
+    inheriting,
     other,
     page,
     running,
@@ -225,7 +225,7 @@ def test_a_second_signal_ends_it_at_once() -> None:
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_ends_it_that_its_starter_had_it_ignore(number: signal.Signals) -> None:
     """A shell does so with SIGINT for what a script starts in the background."""
-    with ignoring(number), running("--port", "0", "--scene", "flat") as server:
+    with inheriting(signal.SIG_IGN, number), running("--port", "0", "--scene", "flat") as server:
         server.address()
         assert server.end(number) == 0
         assert server.log()[-1]["event"] == "stopped"
@@ -233,13 +233,13 @@ def test_a_signal_ends_it_that_its_starter_had_it_ignore(number: signal.Signals)
 
 @pytest.mark.skipif(os.name == "nt", reason="there is no such signal")
 def test_a_terminal_that_closes_ends_it_in_order_and_nohup_keeps_it() -> None:
-    with running("--port", "0", "--scene", "flat") as server:
+    with inheriting(signal.SIG_DFL, signal.SIGHUP), running("--port", "0", "--scene", "flat") as server:
         address = server.address()
         with joined(address) as (link, _):
             server.process.send_signal(signal.SIGHUP)
             assert isinstance(last_words(link), Bye)
         assert server.end() == 0
-    with ignoring(signal.SIGHUP), running("--port", "0", "--scene", "flat") as server:
+    with inheriting(signal.SIG_IGN, signal.SIGHUP), running("--port", "0", "--scene", "flat") as server:
         address = server.address()
         server.process.send_signal(signal.SIGHUP)
         tick = stats(address)["tick"]

@@ -16,16 +16,18 @@ import pytest
 
 from client_sdk import Loopback
 from client_sdk.bots import Follow, Wander
+from client_sdk.core import Core
 from server.game import Game
 from shared.scene import Scene, Template, load_scene
-from sovereign_netcode.playtest import Match, bot
+from sovereign_netcode.playtest import Match, bot, wander
 from tests.client_sdk.servers import ROOT, real_server
 from tests.readme.pages import programs
 from tests.readme.run_snippet import LOOPS
 
 ENGINES = ["pygame-ce", "pyglet", "arcade", "Panda3D", "ursina"]
 ON_A_SERVER = ["asyncio", "A bot"]
-ALONE = ["A game", "Without a socket", "Testing it", "Agents that learn"]
+WAITS = "Threads, timers and asyncio"
+ALONE = ["A game", "Without a socket", "Testing it", "Agents that learn", WAITS]
 A_FILE = "Your own game"
 
 
@@ -96,6 +98,17 @@ def test_the_smallest_game() -> None:
     scores = [game.get(entity, "score") for entity in game.entities("player")]
     assert len(scores) == 2
     assert scores[0] == scores[1] > 0
+    assert match.game.counters.rules_failed == 0
+
+
+def test_a_thread_that_comes_back_into_a_tick() -> None:
+    rules = alone(WAITS)["Bank"]()
+    match = Match(load_scene("flat"), 1, rules=rules)
+    ann = match.join(wander, core=Core("Ann"))
+    match.run_until(lambda: ann.core.state == "playing", 30)
+    rules.pool.shutdown()
+    match.run(1)
+    assert match.game.stage.get(ann.core.entity, "gold") == 3
     assert match.game.counters.rules_failed == 0
 
 

@@ -295,7 +295,7 @@ def test_a_flipped_bit_is_found_wherever_it_is(at: int) -> None:
     ("record", "why"),
     [
         ([[], [[PUT, 1, 0, 0, 1 << 63, *[0] * 8]], None], "too large"),
-        ([[1, 0, 0, 1 << 63], [[PUT, 1, *[0] * 11]], None], "too large"),
+        ([[1, 0, 0, 1 << 63], [[PUT, 1, *[0] * 11]], None], "must be a whole number from 0 to 255"),
         ([[], [[PUT, 0, *[0] * 11]], None], "a state is out of range"),
         ([[], [[PUT, 1, 99, *[0] * 10]], None], "a state is out of range"),
         ([[], [[PUT, 1, 0, 0, 1 << 60, *[0] * 8]], None], "a state is out of range"),

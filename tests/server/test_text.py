@@ -102,7 +102,7 @@ async def waits(token: str) -> str:
 waiting = Waits()
 
 
-@pytest.mark.parametrize(("name", "why"), [("waits", "async"), ("waiting", "async"), ("Waits", "must name a function")])
+@pytest.mark.parametrize(("name", "why"), [("waits", "async"), ("waiting", "async"), ("Waits", "is a class")])
 def test_a_check_that_can_never_answer_is_named_at_the_start(name: str, why: str) -> None:
     with pytest.raises(SettingsError, match=f"auth = '{__name__}:{name}': .*{why}"):
         access.authenticator(Settings(auth=f"{__name__}:{name}"))

@@ -1,0 +1,61 @@
+"""Values that rules give to clients (attributes, shared values, events): what they may be, and tables of them."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import msgpack
+
+from shared.checks import SceneError, text
+from shared.messages import NAME_MAX, pack_value, unpack_value
+
+ATTRIBUTES_MAX = 32
+"""The most attributes of an entity, and the most shared values of a game."""
+VALUE_BYTES_MAX = 256
+"""The longest value, in bytes as MessagePack."""
+
+
+def checked(name: str, value: Any) -> bytes:
+    """Packs a value after checking it and its name.
+
+    Raises:
+        SceneError: the name is no text of 1 to 32 characters, or the value is too long, or no MessagePack.
+    """
+    text(name, "name", NAME_MAX)
+    try:
+        payload = pack_value(value)
+    except ValueError as error:
+        raise SceneError(f"{name} = {error}") from error
+    if len(payload) > VALUE_BYTES_MAX:
+        raise SceneError(f"{name}: a value of {len(payload)} bytes; at most {VALUE_BYTES_MAX}")
+    return payload
+
+
+def packed(value: Any) -> bytes:
+    """Packs a value that has been checked. Values that are equal in Python (1, True and 1.0) differ here."""
+    return msgpack.packb(value)  # type: ignore[no-any-return]
+
+
+def copied(value: Any) -> Any:
+    """Returns a copy of a list or a table, so that a caller cannot change ours."""
+    return unpack_value(packed(value)) if isinstance(value, list | dict) else value
+
+
+def with_value(values: Mapping[str, Any], name: str, payload: bytes, owner: str) -> dict[str, Any]:
+    """Returns a new table in which a name has another value, or, for None, is gone.
+
+    Args:
+        values: the table before.
+        name: the name.
+        payload: its value, packed.
+        owner: whose values they are, for the error.
+
+    Raises:
+        SceneError: there are too many then.
+    """
+    value = unpack_value(payload)
+    after = {**values, name: value}
+    if value is None:
+        del after[name]
+    if len(after) > ATTRIBUTES_MAX:
+        raise SceneError(f"{owner}: more than {ATTRIBUTES_MAX} values")
+    return after

@@ -1,0 +1,55 @@
+"""Checks of whole states of entities: the kernel trusts its rows, and goes anywhere in memory for a wrong one."""
+
+from collections.abc import Iterable
+
+import numpy as np
+
+from shared.checks import SceneError, shown
+from shared.inputs import BUTTONS_MAX, MOVE_MAX
+from shared.layout import BUTTONS, CELL, COLUMNS, FLAGS, ID, MOVE_X, TEMPLATE, VX, Int64s, X
+from shared.units import BLOCK, RANGE_BLOCKS
+
+STATES = CELL
+"""Columns of an entity's state: id, template, flags, x, y, z, vx, vy, vz, move_x, move_y, buttons."""
+ID_MAX = (1 << 31) - 1
+PLACE_MAX, FAST = 2 * RANGE_BLOCKS * BLOCK, 1 << 30
+"""No position is further from 0 along an axis, in grid steps, and no velocity greater: more than any world gets to."""
+
+
+def checked_states(states: Iterable[tuple[int, ...]] | Int64s, templates: int) -> Int64s:
+    """States as an int64 matrix [n, 12].
+
+    Args:
+        states: rows of 12 whole numbers (`STATES`).
+        templates: the number of templates of the scene.
+
+    Raises:
+        SceneError: they are no such rows, a value is out of range, or two are about the same entity.
+    """
+    try:
+        found = np.asarray(states if isinstance(states, np.ndarray) else list(states))
+    except (TypeError, ValueError, OverflowError) as error:  # ragged, for example, or no list at all
+        raise SceneError(f"states = {shown(states)}: must be rows of {STATES} whole numbers") from error
+    if not found.size:
+        return np.zeros((0, STATES), np.int64)
+    if found.dtype.kind != "i" or found.ndim != 2 or found.shape[1] != STATES:
+        raise SceneError(f"states = {shown(states)}: must be rows of {STATES} whole numbers")
+    matrix = found.astype(np.int64, copy=False)
+    low, high = _LOW, _HIGH.copy()
+    high[TEMPLATE] = templates - 1
+    bad = np.argwhere((matrix < low) | (matrix > high))
+    if len(bad):
+        row, column = bad[0].tolist()
+        field, value = f"states[{row}].{COLUMNS[column]}", matrix[row, column]
+        raise SceneError(f"{field} = {value}: must be a whole number from {low[column]} to {high[column]}")
+    if len(np.unique(matrix[:, ID])) < len(matrix):
+        raise SceneError("states: two are of the same entity")
+    return matrix
+
+
+_LOW, _HIGH = np.zeros(STATES, np.int64), np.zeros(STATES, np.int64)
+for _columns, _low, _high in (
+    (ID, 1, ID_MAX), (FLAGS, 0, 255), (slice(X, VX), -PLACE_MAX, PLACE_MAX), (slice(VX, MOVE_X), -FAST, FAST),
+    (slice(MOVE_X, BUTTONS), -MOVE_MAX, MOVE_MAX), (BUTTONS, 0, BUTTONS_MAX),
+):  # fmt: skip
+    _LOW[_columns], _HIGH[_columns] = _low, _high

@@ -1,0 +1,47 @@
+"""The first join of a client without a prebuilt kernel: it plays at once, and is compiled while it does."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from shared import kernels
+from tests.e2e.processes import ROOT, running
+
+pytestmark = [
+    pytest.mark.e2e,
+    pytest.mark.slow,
+    pytest.mark.skipif(not kernels.numba_installed(), reason="Numba is not installed"),
+]
+
+PLAY_S = 900.0
+PROGRAM = f"""
+import sys, time
+from client_sdk import Client, Joined, Left
+seen, ticks = [], {{}}
+with Client.connect(sys.argv[1], name="Ann") as client:
+    end = time.monotonic() + {PLAY_S}
+    while time.monotonic() < end and len(seen) < 2 or ticks.get(seen[-1], 0) < 60:
+        for event in client.poll():
+            assert not isinstance(event, Left), event
+        client.set_input(1, 0)
+        client.update()
+        if client.playing:
+            if client.stats.kernel not in seen:
+                seen.append(client.stats.kernel)
+            ticks[seen[-1]] = ticks.get(seen[-1], 0) + 1
+        time.sleep(1 / 60)
+    print(seen, client.stats.reconnects, client.stats.divergences, "numba" in sys.modules)
+"""
+
+
+def test_a_client_plays_while_its_kernel_is_compiled(tmp_path: Path) -> None:
+    with running("--port", "0", "--scene", "flat") as server:
+        host, port = server.address()
+        environment = os.environ | {kernels.VARIABLE: kernels.NUMBA, "NUMBA_CACHE_DIR": str(tmp_path)}
+        command = (sys.executable, "-c", PROGRAM, f"ws://{host}:{port}")
+        done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, check=False)
+    assert done.stderr == ""
+    assert done.stdout == "['plain for now', 'numba'] 0 0 True\n"

@@ -1,0 +1,393 @@
+"""Rules that would silently do nothing are named; what changes a game does so within a tick, or is refused."""
+
+import asyncio
+import functools
+import random
+import threading
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+
+from server.game import Game
+from server.rules import HOOKS, Rules, RulesError, check_rules, load_rules, prepared
+from server.session import Player
+from server.stage import SOON_MAX
+from server.turn import OutOfTurnError
+from shared.checks import SceneError
+from shared.scene import Scene, load_scene
+from sovereign_netcode.playtest import Match
+from tests.client_sdk.test_wrong_values import Playing
+from tests.server.test_keeping import Stored
+from tests.server.test_store import until
+from tests.server.test_wrong_values import RUNNER, Played, marks
+from tests.tables import Table, order
+
+FLAT = load_scene("flat")
+
+
+def made(**methods: Any) -> Rules:
+    """Rules with some methods."""
+    rules: Rules = type("Mine", (Rules,), methods)()
+    return rules
+
+
+def everywhere(rules: Rules) -> list[Callable[[], Any]]:
+    """All the ways into a game."""
+    return [
+        lambda: Match(FLAT, 1, rules=rules),
+        lambda: Game(FLAT, rules=rules, compiled=False),
+        lambda: prepared(rules, FLAT),
+        lambda: check_rules(rules),
+    ]
+
+
+async def waits(self: Rules, *arguments: Any) -> None: ...
+
+
+async def yields_and_waits(self: Rules, *arguments: Any) -> Any:
+    yield 1
+
+
+def yields(self: Rules, *arguments: Any) -> Any:
+    yield 1
+
+
+@pytest.mark.parametrize("hook", HOOKS)
+@pytest.mark.parametrize(
+    ("method", "why"),
+    [
+        (waits, "must not be async"), (yields_and_waits, "must not be async"), (yields, "must not contain `yield`"),
+        (functools.partial(waits), "must not be async"), (None, "must be a function"), (5, "must be a function"),
+    ],
+)  # fmt: skip
+def test_a_hook_that_would_do_nothing_is_named(hook: str, method: Any, why: str) -> None:
+    for enter in everywhere(made(**{hook: method})):
+        with pytest.raises(RulesError, match=rf"^Mine\.{hook}.*{why}"):
+            enter()
+
+
+@pytest.mark.parametrize(
+    ("name", "meant"),
+    [
+        ("on_tik", "on_tick"), ("on_joined", "on_join"), ("on_leaves", "on_leave"), ("can_edits", "can_edit"),
+        ("onTick", "on_tick"), ("OnJoin", "on_join"), ("ontick", "on_tick"), ("on_Tick", "on_tick"),
+        ("canEdit", "can_edit"), ("Prepare", "prepare"), ("on__tick", "on_tick"), ("on_zzzz", ""), ("can_fly", ""),
+    ],
+)  # fmt: skip
+def test_a_misspelt_hook_is_named_everywhere(name: str, meant: str) -> None:
+    hint = rf" \(did you mean {meant}\?\)" if meant else ""
+    said = rf"^Mine\.{name} is no hook, and nothing calls it{hint}; there are prepare, on_"
+    for enter in everywhere(made(**{name: lambda self: None})):
+        with pytest.raises(RulesError, match=said):
+            enter()
+
+
+def test_names_that_only_look_like_hooks_are_left_alone() -> None:
+    check_rules(made(_on_tick=1, tick=2, once=3, join=4, canned=5, edit=6, one_tick=7, preparations=8))
+
+
+@pytest.mark.parametrize("returned", [None, "flat", 5, FLAT.to_table(), Scene])
+def test_prepare_must_return_a_scene(returned: Any) -> None:
+    rules = made(prepare=lambda self, scene: returned)
+    for enter in (lambda: Match(FLAT, 1, rules=rules), lambda: prepared(rules, FLAT)):
+        with pytest.raises(RulesError, match=r"^Mine\.prepare returned .*: it must return the scene to play in"):
+            enter()
+
+
+def test_what_prepare_raises_is_told_with_its_name() -> None:
+    def prepare(self: Rules, scene: Scene) -> Scene:
+        self.game.spawn("player", (0, 0, 0))
+        return scene
+
+    with pytest.raises(RulesError, match=r"^Mine\.prepare failed \(AttributeError: self.game is not there yet"):
+        prepared(made(prepare=prepare), FLAT)
+    with pytest.raises(SceneError, match="like = 'no such'"):
+        prepared(made(prepare=lambda self, scene: scene.with_template("a", like="no such")), FLAT)
+    with pytest.raises(AttributeError, match="'Mine' object has no attribute 'gane'"):
+        made().gane  # type: ignore[attr-defined]  # noqa: B018
+
+
+class TooEarly(Rules):
+    def __init__(self) -> None:
+        self.game.share("score", 0)
+
+
+class Silent(Rules):
+    async def on_tick(self) -> None:  # type: ignore[override]
+        """Nothing would run this."""
+
+
+@pytest.mark.parametrize(
+    ("name", "why"), [("TooEarly", "AttributeError: self.game is not there yet"), ("Silent", "Silent.on_tick: .*async")]
+)
+def test_rules_that_are_loaded_by_name_are_checked(name: str, why: str) -> None:
+    with pytest.raises(RulesError, match=rf"^game = '{__name__}:{name}': .*{why}"):
+        load_rules(f"{__name__}:{name}")
+
+
+def behind(decorated: Callable[..., Any]) -> Callable[..., Any]:
+    """Hides what a method is, as a decorator may."""
+
+    def wrapper(*arguments: Any) -> Any:
+        return decorated(*arguments)
+
+    return wrapper
+
+
+@pytest.mark.parametrize("method", [waits, yields, yields_and_waits])
+def test_a_hook_that_returns_something_to_be_run_has_failed(method: Any, caplog: pytest.LogCaptureFixture) -> None:
+    table = Table(rules=made(on_tick=behind(method)))
+    table.tick(3)
+    assert table.game.counters.rules_failed == 3
+    assert "which nothing runs: it must be a plain function" in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("answer", "allowed"), [(None, False), (0, False), (False, False), (True, True), ("yes", True)]
+)
+def test_an_edit_is_allowed_by_what_is_true(answer: Any, allowed: bool, caplog: pytest.LogCaptureFixture) -> None:
+    table = Table(rules=made(can_edit=lambda self, *_: answer))
+    link = table.join()
+    table.tick(64)
+    link.say(order(1, 0, 18, 16, 1, 5))
+    table.tick()
+    assert (table.game.world.blocks.get(18, 16, 1) == 5) is allowed
+    assert table.game.counters.rules_failed == (answer is None)
+    assert ("can_edit returned None: it must return True or False" in caplog.text) is (answer is None)
+
+
+# -- who may change a game, and when ---------------------------------------------------------------------------
+
+ACTS: dict[str, Callable[[Played], Any]] = {
+    "spawn": lambda t: t.stage.spawn("stone", (8, 8, 1)),
+    "remove": lambda t: t.stage.remove(RUNNER),
+    "place": lambda t: t.stage.place(RUNNER, (8, 8, 1)),
+    "throw": lambda t: t.stage.throw(RUNNER, (0, 0, 1)),
+    "change": lambda t: t.stage.change(RUNNER, "cube"),
+    "steer": lambda t: t.stage.steer(RUNNER, 1, 0),
+    "set_block": lambda t: t.stage.set_block(8, 8, 5, 1),
+    "set": lambda t: t.stage.set(RUNNER, "mood", "cross"),
+    "share": lambda t: t.stage.share("score", 2),
+    "send": lambda t: t.stage.send("boom"),
+    "random": lambda t: t.stage.random.random(),
+}
+
+
+def caught(act: Callable[[], Any]) -> Callable[[], str]:
+    """A function that does something and gives the error, if it is one of turns."""
+
+    def done() -> str:
+        try:
+            act()
+        except OutOfTurnError as error:
+            return str(error)
+        return ""
+
+    return done
+
+
+def in_a_thread(act: Callable[[], Any]) -> str:
+    """The error of doing something in another thread."""
+    said: list[str] = []
+    thread = threading.Thread(target=lambda: said.append(caught(act)()), name="worker")
+    thread.start()
+    thread.join()
+    return said[0]
+
+
+def in_a_callback(act: Callable[[], Any]) -> str:
+    """The error of doing something in a callback of an event loop."""
+
+    async def run() -> str:
+        said: asyncio.Future[str] = asyncio.get_running_loop().create_future()
+        asyncio.get_running_loop().call_later(0, lambda: said.set_result(caught(act)()))
+        return await said
+
+    return asyncio.run(run())
+
+
+@pytest.mark.parametrize("name", ACTS)
+@pytest.mark.parametrize(
+    ("elsewhere", "where"),
+    [(in_a_thread, "from thread 'worker'"), (in_a_callback, "from a callback of the event loop, between two ticks")],
+)
+def test_a_change_from_elsewhere_is_refused(name: str, elsewhere: Callable[[Any], str], where: str) -> None:
+    table = Played()
+    before = marks(table)
+    said = elsewhere(lambda: ACTS[name](table))
+    assert said.startswith(f"{name}: called {where}")
+    assert f"game.soon(game.{name}, ...)" in said
+    assert marks(table) == before
+    ACTS[name](table)  # in the thread that ticks, without an event loop, the program knows where it stands
+
+
+def test_the_thread_that_ticks_may_change_the_game_and_it_may_be_another_one_later() -> None:
+    table = Played()
+
+    def tick_and_share() -> None:
+        table.tick()
+        table.stage.share("score", 2)
+
+    assert in_a_thread(tick_and_share) == ""
+    assert "from thread 'MainThread'" in caught(lambda: table.stage.share("score", 3))()
+    table.tick()
+    table.stage.share("score", 3)
+    assert table.stage.shared == {"score": 3}
+
+
+class Awaits(Rules):
+    """Hooks act within a tick, whatever runs around it."""
+
+    def on_tick(self) -> None:
+        self.game.share("tick", self.game.tick)
+
+
+async def test_hooks_may_change_the_game_within_an_event_loop() -> None:
+    table = Table(rules=Awaits())
+    table.tick(3)
+    assert table.game.stage.shared == {"tick": 3}
+    assert table.game.counters.rules_failed == 0
+
+
+@pytest.mark.parametrize("name", ACTS)
+@pytest.mark.parametrize("elsewhere", [in_a_thread, in_a_callback, lambda act: act() and ""])
+def test_what_comes_by_soon_happens_in_the_next_tick(name: str, elsewhere: Callable[[Any], str]) -> None:
+    made_elsewhere, made_here = Played(), Played()
+    elsewhere(lambda: made_elsewhere.stage.soon(ACTS[name], made_elsewhere))
+    before = marks(made_elsewhere)
+    ACTS[name](made_here)
+    assert made_elsewhere.game.world.tick == made_here.game.world.tick
+    assert before[:6] == marks(Played())[:6]
+    for table in (made_elsewhere, made_here):
+        table.tick()
+    assert marks(made_elsewhere) == marks(made_here)
+    assert made_elsewhere.game.counters.rules_failed == 0
+
+
+def test_soon_keeps_the_order_takes_arguments_and_leaves_what_is_added_for_the_tick_after() -> None:
+    table = Table()
+    stage, said = table.game.stage, []
+
+    def note(*what: Any) -> None:
+        said.append((stage.tick, *what))
+        if what == (1,):
+            stage.soon(note, "later")
+
+    stage.soon(note, 1)
+    stage.soon(note, 2, "b")
+    stage.soon(functools.partial(note, 3))
+    assert said == []
+    table.tick(3)
+    assert said == [(1, 1), (1, 2, "b"), (1, 3), (2, "later")]
+
+
+class Ordered(Rules):
+    def __init__(self) -> None:
+        self.said: list[str] = []
+
+    def on_start(self) -> None:
+        self.said.append("start")
+
+    def on_join(self, player: Player) -> None:
+        self.said.append("join")
+
+    def on_tick(self) -> None:
+        self.said.append("tick")
+
+
+def test_soon_comes_after_the_start_and_ahead_of_the_other_hooks() -> None:
+    rules = Ordered()
+    table = Table(rules=rules)
+    table.game.stage.soon(rules.said.append, "soon")
+    table.join()
+    assert rules.said == ["start", "soon", "join", "tick"]
+
+
+def test_what_fails_soon_is_counted_and_stops_nobody(caplog: pytest.LogCaptureFixture) -> None:
+    table = Table()
+
+    def fails() -> None:
+        raise RuntimeError("on purpose")
+
+    table.game.stage.soon(fails)
+    table.game.stage.soon(functools.partial(fails))
+    table.game.stage.soon(table.game.stage.share, "score", 1)
+    table.tick()
+    assert (table.game.counters.rules_failed, table.game.stage.shared) == (2, {"score": 1})
+    assert "on purpose" in caplog.text
+
+
+@pytest.mark.parametrize("bad", [None, 5, "f", waits, yields, functools.partial(waits)])
+def test_what_cannot_be_called_soon_is_named_at_once(bad: Any) -> None:
+    table = Table()
+    with pytest.raises(RulesError, match=r"^soon: act"):
+        table.game.stage.soon(bad)
+    table.tick()
+    assert table.game.counters.rules_failed == 0
+
+
+def test_a_game_that_does_not_tick_takes_only_so_much() -> None:
+    table = Table()
+    for _ in range(SOON_MAX):
+        table.game.stage.soon(int)
+    with pytest.raises(OutOfTurnError, match="10000 functions wait already"):
+        table.game.stage.soon(int)
+    table.tick()
+    table.game.stage.soon(int)
+
+
+def test_many_threads_at_once_lose_nothing() -> None:
+    table = Table()
+    stage = table.game.stage
+    seen: list[tuple[int, int]] = []
+
+    def work(number: int) -> None:
+        for turn in range(200):
+            stage.soon(seen.append, (number, turn))
+
+    threads = [threading.Thread(target=work, args=(number,)) for number in range(4)]
+    for thread in threads:
+        thread.start()
+    while any(thread.is_alive() for thread in threads):
+        table.tick()
+    table.tick()
+    assert sorted(seen) == [(number, turn) for number in range(4) for turn in range(200)]
+    for number in range(4):
+        assert [turn for one, turn in seen if one == number] == list(range(200))
+
+
+def test_what_comes_by_soon_is_saved_as_all_else(tmp_path: Any) -> None:
+    table = Stored(tmp_path)
+    stage = table.game.stage
+    in_a_thread(lambda: stage.soon(stage.spawn, "stone", (8, 8, 1)))
+    table.tick()
+    until(lambda: table.store.durable_tick == 1)
+    hashed = table.game.world.state_hash()
+    assert len(table.game.world) == 1
+    table.stop()
+    again = Stored(tmp_path)
+    assert again.game.world.state_hash() == hashed
+    again.stop()
+
+
+def test_a_seeded_match_with_soon_is_the_same_again() -> None:
+    def play() -> bytes:
+        match = Match(FLAT, 3)
+        stage, dice = match.game.stage, random.Random(4)
+        for _ in range(20):
+            x, y = dice.uniform(8, 56), dice.uniform(8, 56)
+            stage.soon(lambda x=x, y=y: stage.spawn("player", (x + stage.random.random(), y, 8)))
+            match.run(0.1)
+        return match.game.world.state_hash()
+
+    assert play() == play()
+
+
+def test_a_loopback_in_an_event_loop_plays() -> None:
+    async def run() -> bool:
+        playing = Playing()
+        playing.play(10)
+        return playing.client.playing
+
+    assert asyncio.run(run())

@@ -1,0 +1,39 @@
+"""The input delay may change in the middle of play: the own figure walks on, and never back."""
+
+import dataclasses
+from itertools import pairwise
+
+import pytest
+
+from shared.inputs import Input
+from shared.scene import load_scene
+from sovereign_netcode.playtest import Match, Path
+
+CHANGES = ((3, 0, 2, 1, 3, 0), (1, 2, 3, 2, 1, 0), (3, 3, 0, 0, 3, 1))
+
+
+@pytest.mark.parametrize("every_s", [1.0, 0.03])
+@pytest.mark.parametrize("changes", CHANGES)
+@pytest.mark.parametrize(("rate", "delay_s"), [(32, 0.02), (20, 0.0), (60, 0.1), (128, 0.02)])
+def test_a_figure_that_walks_east_is_never_drawn_further_west(
+    rate: int, delay_s: float, changes: tuple[int, ...], every_s: float
+) -> None:
+    match = Match(dataclasses.replace(load_scene("flat"), tick_rate=rate), 1)
+    ann = match.join(lambda core, rng: Input(127, 0, 0), Path(delay_s))
+    match.run_until(lambda: ann.core.state == "playing", 20)
+    match.run(2)
+    drawn = []
+    for ticks in changes:
+        ann.core.set_input_delay(ticks)
+        for _ in range(round(240 * every_s)):
+            match.run(1 / 240)
+            me = ann.core.view(ann.local).me
+            assert me is not None
+            drawn.append(me.position[0])
+    steps = [after - before for before, after in pairwise(drawn)]
+    assert min(steps) >= 0
+    # The figure moves on by at most what the delay has become shorter by, and a frame.
+    assert max(steps) <= 3.0 * (3 + 1) / rate + 3.0 / 240
+    match.run(1)
+    ann.core.view(ann.local)
+    assert ann.core.stats.corrections == 0
