@@ -53,6 +53,7 @@ class Echo:
 
     def __init__(self, scene: str, size: int) -> None:
         self.scene = load_scene(scene)
+        self.world = World(self.scene)  # for the server's log, which names its kernel
         self.size = size
         self.faults = Faults()
         self.links: dict[int, tuple[Link, bool]] = {}

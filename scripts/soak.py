@@ -304,7 +304,7 @@ async def soak(minutes: float, clients: int, seed: int, directory: Path, console
 
 
 def wrongs(player: Honest | Walker) -> list[str]:
-    """What went wrong for a player."""
+    """Returns what went wrong for a player."""
     stuck_s = player.progress.stuck_s
     return player.unexplained + ([f"stuck for {stuck_s:.1f} s"] if stuck_s > STUCK_S_MAX else [])
 

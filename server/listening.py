@@ -51,7 +51,7 @@ def bracketed(host: str) -> str:
 
 
 def reachable(host: str) -> str:
-    """Where this machine itself reaches a server that listens on a host."""
+    """Returns the host by which this machine itself reaches a server that listens on a host."""
     return "127.0.0.1" if host in (EVERY_INTERFACE, "0.0.0.0") else host
 
 

@@ -107,7 +107,7 @@ class ServerProcess:
 
 @contextmanager
 def inheriting(handler: signal.Handlers, *signals: int) -> Iterator[None]:
-    """What is started meanwhile ignores these signals (SIG_IGN) from its beginning, or does not (SIG_DFL)."""
+    """Has the processes that are started in the block ignore these signals (SIG_IGN), or not (SIG_DFL)."""
     before = {number: signal.signal(number, handler) for number in signals}
     try:
         yield

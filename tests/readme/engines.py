@@ -48,7 +48,7 @@ class Thing:
 
 
 class Flat:
-    """What a stand-in for an engine in two dimensions has drawn since it cleared its window."""
+    """The circles that a stand-in for an engine in two dimensions has drawn since it cleared its window."""
 
     circles: ClassVar[list[Point]] = []
     size = (0, 0)
@@ -86,7 +86,7 @@ class Body(Thing):
 
     @classmethod
     def lit(cls) -> list[Point]:
-        """Where the bodies are as the camera sees them, which looks straight down."""
+        """Returns where the camera, which looks straight down, sees the bodies."""
         (x, y, z), seen = cls.camera.at, [body.at for body in cls.bodies if body is not cls.camera]
         assert all(z > above for _, _, above in seen), "the camera is above all"
         return [((east - x) / (z - above), (north - y) / (z - above)) for east, north, above in seen]
@@ -216,8 +216,10 @@ def ursina() -> Standing:
 
 
 def shown(engine: str) -> list[Point]:
-    """Where a real engine shows anything but its background and thin lines, in heights of its window, from the middle:
-    x to the right, y up."""
+    """Returns where a real engine shows anything but its background and thin lines.
+
+    Places are in heights of its window, from the middle: x to the right, y up.
+    """
     pixels = _pixels(engine)
     colours, counts = np.unique(pixels.reshape(-1, 3), axis=0, return_counts=True)
     lit = (abs(pixels.astype(int) - colours[counts.argmax()].astype(int)) > 12).any(axis=2)
@@ -231,7 +233,7 @@ def shown(engine: str) -> list[Point]:
 
 
 def _pixels(engine: str) -> npt.NDArray[np.uint8]:
-    """What the window shows, [row from the top, column, colour]."""
+    """Returns the picture in the window, [row from the top, column, colour]."""
     if engine == "pygame-ce":
         import pygame
 

@@ -1,4 +1,4 @@
-"""What the soak test sees of players who get nowhere although snapshots come."""
+"""Tests that the soak sees players who get nowhere although snapshots come."""
 
 import sys
 from collections.abc import Callable
@@ -68,7 +68,7 @@ def test_a_return_begins_the_time_anew() -> None:
 
 
 def watched(match: Match, core: Core, seconds: float) -> Walker:
-    """What a walker's looks at a core have found after so many seconds of a match."""
+    """Runs a match for so many seconds. Returns a walker that has looked at the core all the time."""
     walker = Walker(0, 0)
     for _ in range(round(seconds / LOOK_S)):
         match.run(LOOK_S)

@@ -30,7 +30,7 @@ def rig(scene: Path) -> Iterator[bench.Rig]:
 
 
 def said(program: str) -> tuple[Stderr, int]:
-    """What a program leaves, and its exit code."""
+    """Runs a program. Returns its stderr and its exit code."""
     errors = Stderr()
     process = subprocess.Popen([sys.executable, "-c", program], stderr=errors.pipe)
     errors.started()
@@ -103,7 +103,7 @@ def test_the_benchmark_names_what_is_missing(
 
 
 def test_a_benchmark_that_fails_says_so_in_a_line(tmp_path: Path) -> None:
-    """As after `scripts/demo` alone, which sets up neither picows nor matplotlib."""
+    """The environment is the one of `scripts/demo` alone, which has neither picows nor matplotlib."""
     without = (
         "import sys; sys.modules.update(picows=None, matplotlib=None); sys.path.insert(0, 'scripts');"
         "import importlib.util as u; real = u.find_spec;"

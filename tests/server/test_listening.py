@@ -1,4 +1,4 @@
-"""On which addresses a server listens, over real loopback sockets."""
+"""Tests of the addresses that a server listens on, over real loopback sockets."""
 
 import asyncio
 import errno
