@@ -67,11 +67,10 @@ class Play:
         self._step = self._stepped = 0.0
         self._bounds = bounds(world.scene.tick_rate)
         self._phases: Ring[float] = Ring(self._bounds.predicted)
-        self._out: list[Message] = []
         self._stats, self._events = stats, events
 
-    def restart(self, now: float, cause: str) -> None:
-        """Begins the prediction at the timeline's tick.
+    def restart(self, now: float, cause: str) -> list[Message]:
+        """Begins the prediction at the timeline's tick. Returns what to send: it withdraws inputs of later ticks.
 
         Args:
             cause: see `Resynchronised`.
@@ -81,10 +80,11 @@ class Play:
         # Bounded, whatever the server says of its time: all ticks since the confirmed one are replayed here.
         end = confirmed + self._bounds.unconfirmed
         tick = min(max(math.floor(self.timeline.tick(now)), confirmed), end)
+        messages: list[Message] = []
         if tick < self.newest and cause == RECONNECTED:
             tick = min(self.newest, end)
         elif tick < self.newest:
-            self._out.append(Restart(tick + 1))
+            messages.append(Restart(tick + 1))
             self._phases = Ring(self._bounds.predicted)
             self._settling = now
         if prediction.begun:
@@ -92,6 +92,7 @@ class Play:
             self._events.append(Resynchronised(tick, tick - self.newest, cause))
         self.newest = tick
         prediction.begin(max(tick - prediction.ahead, confirmed))
+        return messages
 
     def stepped(self, ticks: float, now: float) -> None:
         """Takes notice of a step of the server's time, by so many ticks; the next update follows it.
@@ -113,8 +114,8 @@ class Play:
         self._stepped += timeline.phase - before  # small steps in a row, of a server that stands still, come to a jump
         if online and abs(self._stepped) > jump_ticks(timeline.rate):
             self._stepped = 0.0
-            self.restart(now, BEHIND if ticks < 0 else AHEAD)
-        return self._outgoing()
+            return self.restart(now, BEHIND if ticks < 0 else AHEAD)
+        return []
 
     def answered(self, sent: float) -> None:
         """A ping sent at `sent` has been answered, so the server knows what went before it."""
@@ -142,8 +143,7 @@ class Play:
             return []
         # Steered only now: a tick that was due, and for which the program woke up, is not put off by a moment.
         if self.timeline.steer(self._lead, clock, now) or self._out_of_bounds(now):
-            self.restart(now, PATH)
-            messages += self._outgoing()
+            messages += self.restart(now, PATH)
         if alarm:
             messages.insert(0, Resync())
         return messages
@@ -202,11 +202,6 @@ class Play:
             )
             for first in range(since, newest, ROWS_MAX)
         ]
-
-    def _outgoing(self) -> list[Message]:
-        """What a restart has to send."""
-        out, self._out = self._out, []
-        return out
 
     def _out_of_bounds(self, now: float) -> bool:
         """Puts the timeline where it began if it is so far off that no input counts. Returns whether it was."""
