@@ -30,7 +30,7 @@ MODULES = (
     "server/counters.py", "server/delivery.py", "server/door.py", "server/game.py", "server/gateway.py",
     "server/interest.py", "server/orders.py", "server/pacing.py", "server/replication.py", "server/roster.py",
     "server/session.py", "server/sight.py",
-    "shared/edits.py", "shared/inputs.py", "shared/messages.py", "shared/ring.py", "shared/snapshot.py",
+    "shared/inputs.py", "shared/messages.py", "shared/ring.py", "shared/snapshot.py",
     "sovereign_netcode/playtest/match.py",
 )  # fmt: skip
 """Modules that a tick of a server and of a client runs. Other programs cannot derive from the classes of a compiled
