@@ -1,4 +1,4 @@
-"""Builds the kernel for every target: `_kernel_build.py OUT [--objects-only]`. `scripts/kernels` runs it.
+"""Builds the kernel for every target: `_kernel_build.py OUT [--objects TARGET ...]`. `scripts/kernels` runs it.
 
 LLVM makes an object file for each target from one IR (`_kernel_ir`). LLD, from the package `ziglang`, links it to a
 library. Both are pinned. The bytes of the result depend only on the sources and on the versions that the manifest
@@ -15,6 +15,7 @@ import platform
 import subprocess
 import sys
 import tempfile
+from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -87,11 +88,12 @@ TARGETS = {
 }
 
 
-def build(out: Path, *, link: bool = True) -> dict[str, Any]:
-    """Builds all targets into a folder, with a manifest. Returns the manifest.
+def build(out: Path, targets: Sequence[str] = tuple(TARGETS), *, link: bool = True) -> dict[str, Any]:
+    """Builds targets into a folder, with a manifest. Returns the manifest.
 
     Args:
         out: the folder.
+        targets: their names.
         link: whether to link libraries; otherwise only the manifest is written, with the object files' checksums.
     """
     import llvmlite.binding as llvm
@@ -108,7 +110,8 @@ def build(out: Path, *, link: bool = True) -> dict[str, Any]:
     code_crc = freshness.code_crc(texts)
     python = _kernel_python.module({**exports.functions(), "built_from": exports.NUMBER})
     files: dict[str, dict[str, Any]] = {}
-    for name, target in TARGETS.items():
+    for name in targets:
+        target = TARGETS[name]
         print(f"{name} ...", flush=True)
         machine = _kernel_ir.Machine(target.triple, target.cpu, target.features)
         more, visible = (python, (_kernel_python.INIT,)) if target.python else ("", ())
@@ -171,9 +174,11 @@ def _sha256(data: bytes) -> str:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("out", type=Path, help="an existing folder for the results")
-    parser.add_argument("--objects-only", action="store_true", help="do not link; write only the manifest")
+    parser.add_argument(
+        "--objects", nargs="+", choices=TARGETS, metavar="TARGET", help="do not link; write only the manifest of these"
+    )
     args = parser.parse_args()
-    build(args.out, link=not args.objects_only)
+    build(args.out, args.objects or tuple(TARGETS), link=not args.objects)
 
 
 if __name__ == "__main__":

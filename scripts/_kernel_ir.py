@@ -3,7 +3,7 @@
     i32 NAME(i64* words)
 
 All arguments are in one block of int64 words. A number or a truth value takes one word. An array takes two: its address
-and its length. A world is the address of the table of its arrays (`exports.table`). The module exports nothing else,
+and its length. A world is the address of the table of its arrays (`shared.kernels`). The module exports nothing else,
 and needs nothing from outside.
 """
 

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
-from shared import kernel, kernels
+from shared import kernel, numba_kernel
 from shared.blocks import Blocks
 from shared.layout import Arrays
 from shared.units import BLOCK, SEGMENT
@@ -134,5 +134,5 @@ def dense_hits(world: World, boxes: Boxes) -> Flags:
     """Returns for each box whether a block overlaps it, [n], by the product's own look-up."""
     out = np.zeros(len(boxes), np.bool_)
     arrays = Arrays(*map(np.asarray, world.arrays))
-    _dense(kernels.jitted(kernel).blocks_in, arrays, boxes, out)
+    _dense(numba_kernel.jitted(kernel).blocks_in, arrays, boxes, out)
     return out

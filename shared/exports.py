@@ -3,6 +3,8 @@
 Both the prebuilt libraries (`scripts/kernels`) and the entry points that Numba compiles are made from this table.
 """
 
+from types import ModuleType
+
 from shared.layout import Arrays
 
 WORLD, NUMBER, TRUTH = "w", "n", "?"
@@ -43,6 +45,11 @@ FIELDS = {name: {"solid": "u", "heads": "i"}.get(name, "q") for name in Arrays._
 def functions() -> dict[str, str]:
     """The argument kinds of all functions, by name."""
     return {name: kinds for of_source in EXPORTS.values() for name, kinds in of_source.items()}
+
+
+def of(source: ModuleType) -> dict[str, str]:
+    """Returns the functions of one source, with the kinds of their arguments."""
+    return EXPORTS[source.__name__.rpartition(".")[2]]
 
 
 def words_of(kinds: str) -> int:

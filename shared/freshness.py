@@ -8,6 +8,7 @@ import tokenize
 import zlib
 from collections.abc import Iterable, Iterator
 from pathlib import Path
+from types import ModuleType
 
 CRC_MASK = (1 << 31) - 1
 """A library gives its checksum as a signed 32-bit number that is not negative."""
@@ -31,6 +32,11 @@ def sources(paths: Iterable[Path]) -> list[str]:
         OSError: one cannot be read.
     """
     return [path.read_text("utf-8").replace("sovereign_netcode.", "") for path in paths]
+
+
+def constants(source: ModuleType) -> list[tuple[str, int]]:
+    """Returns the whole numbers that a module defines or imports: a compiler builds them into its functions."""
+    return sorted((name, value) for name, value in vars(source).items() if isinstance(value, int))
 
 
 def text_crc(texts: Iterable[str]) -> int:

@@ -13,13 +13,11 @@ for a `Kernel` here and everything that works on this world takes the world's.
 import contextlib
 import functools
 import hashlib
-import importlib
 import importlib.util
 import json
 import os
 import platform
 import sys
-import zlib
 from collections.abc import Callable, Iterator
 from importlib.machinery import EXTENSION_SUFFIXES, ExtensionFileLoader
 from pathlib import Path
@@ -28,9 +26,7 @@ from typing import Any
 
 import numpy as np
 
-from shared import bulk, exports, freshness, kernel
-from shared.jit import COMPILED, OPTIONS
-from shared.layout import Arrays
+from shared import bulk, exports, freshness, kernel, numba_kernel
 
 VARIABLE = "SOVEREIGN_KERNEL"
 PREBUILT, NUMBA, PLAIN = FORMS = ("prebuilt", "numba", "plain")
@@ -138,7 +134,9 @@ def numba_installed() -> bool:
 
 def constants_crc() -> int:
     """A checksum of what is built into the functions though it stands in other files: constants, and the exports."""
-    return freshness.crc([repr([_constants(source) for source in SOURCES]), repr((exports.EXPORTS, exports.FIELDS))])
+    return freshness.crc(
+        [repr([freshness.constants(source) for source in SOURCES]), repr((exports.EXPORTS, exports.FIELDS))]
+    )
 
 
 @functools.cache
@@ -192,7 +190,7 @@ def _view(array: np.ndarray[Any, Any]) -> memoryview:
 
 
 def _plain() -> Kernel:
-    functions = {name: getattr(source, name) for source in SOURCES for name in _exports(source)}
+    functions = {name: getattr(source, name) for source in SOURCES for name in exports.of(source)}
     return Kernel(form=PLAIN, compiled=False, lent=_view, bound=lambda arrays: arrays, **functions)
 
 
@@ -204,7 +202,7 @@ def kernel_of(library: ModuleType, form: str = PREBUILT) -> Kernel:
 
 def _table(arrays: Any) -> memoryview:
     """Address and length of each array."""
-    words = [word for array in map(np.asarray, arrays) for word in (array.ctypes.data, array.size)]
+    words = [word for each in map(np.asarray, arrays) for word in (each.__array_interface__["data"][0], each.size)]
     return memoryview(np.array(words, np.int64))  # type: ignore[arg-type]
 
 
@@ -241,10 +239,10 @@ def _library() -> ModuleType:
 
 
 def _manifest() -> dict[str, Any]:
-    """What `scripts/kernels` tells of the libraries; empty where a frozen program has left it out."""
+    """The manifest of `scripts/kernels`; empty where it is damaged, or left out as by a frozen program."""
     try:
         return json.loads((LIBRARIES / MANIFEST).read_text("utf-8"))  # type: ignore[no-any-return]
-    except OSError:
+    except (OSError, ValueError):
         return {}
 
 
@@ -259,65 +257,7 @@ def _made_from_the_sources(code_crc: int, known: dict[str, Any]) -> bool:
 
 
 def _numba() -> Kernel:
-    """The sources a second time, under other names, with their functions compiled for the arguments they get.
-
-    Raises:
-        ImportError: Numba is not installed.
-    """
-    from numba import types
-
-    def array(kind: str) -> Any:
-        return types.Array(getattr(types, exports.item(kind)[0]), 1, "C")
-
-    named: Any = types.NamedTuple
-    world = named([array(kind) for kind in exports.FIELDS.values()], Arrays)
-    kinds = {exports.WORLD: world, exports.NUMBER: types.int64, exports.TRUTH: types.boolean}
-    functions: dict[str, Any] = {}
-    for source in SOURCES:
-        compiled = jitted(source)
-        for name, arguments in _exports(source).items():
-            of_arguments = tuple(
-                types.Bytes(types.uint8, 1, "C", readonly=True) if kind == "b" else kinds.get(kind) or array(kind)
-                for kind in arguments
-            )
-            function = getattr(compiled, name)
-            function.compile(of_arguments)
-            # Called by this, Numba does not look at each array of `Arrays`: 2 us, more than a client's whole step.
-            functions[name] = function.overloads[of_arguments].entry_point
+    functions = numba_kernel.functions(SOURCES)
     return Kernel(
         form=NUMBA, compiled=True, lent=lambda array: array.reshape(-1), bound=lambda arrays: arrays, **functions
     )
-
-
-@functools.cache
-def jitted(source: ModuleType) -> ModuleType:
-    """A source under another name, in which its functions are Numba's: compiled when they are first called.
-
-    Raises:
-        ImportError: Numba is not installed.
-    """
-    config: Any = importlib.import_module("numba.core.config")
-    name = source.__name__ + COMPILED
-    assert source.__file__ is not None
-    spec = importlib.util.spec_from_file_location(name, source.__file__)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[name] = module
-    place = config.CACHE_DIR
-    # Numba's cache on disk looks at the source alone.
-    kept = f"numba-{zlib.crc32(repr((_constants(source), OPTIONS)).encode()):08x}"
-    config.CACHE_DIR = str(Path(place or Path(source.__file__).parent / "__pycache__") / kept)
-    try:
-        spec.loader.exec_module(module)
-    finally:
-        config.CACHE_DIR = place
-    return module
-
-
-def _exports(source: ModuleType) -> dict[str, str]:
-    return exports.EXPORTS[source.__name__.rpartition(".")[2]]
-
-
-def _constants(source: ModuleType) -> list[tuple[str, int]]:
-    return sorted((name, value) for name, value in vars(source).items() if isinstance(value, int))

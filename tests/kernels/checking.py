@@ -5,6 +5,7 @@ process, so no linker is needed. A function that meets an index out of bounds ra
 of `_kernel_build.BUILDING` for the process.
 """
 
+import contextlib
 import ctypes
 import importlib.machinery
 import sys
@@ -13,6 +14,7 @@ from types import ModuleType
 from typing import Any
 
 import llvmlite.binding as llvm
+import numpy as np
 
 from shared import exports, kernels
 
@@ -47,3 +49,8 @@ def loaded() -> tuple[ModuleType, Any]:
 MODULE, ENGINE = loaded()
 FORM = kernels.get(True).form
 kernels._kernels[FORM] = kernels.kernel_of(MODULE, FORM)
+
+few, many = np.zeros(12, np.int64), np.zeros(24, np.int64)
+with contextlib.suppress(SystemError):
+    kernels.get(True).alike(few, 2, many, 2, 1, 1, few)  # two states, where one has room
+    raise AssertionError("indices are not checked")

@@ -1,14 +1,13 @@
 // Makes the calls of a tape (tape.py) again with a kernel in WebAssembly, and compares every byte after every call.
 //
-//     node replay.mjs KERNEL.wasm TAPE NAME:KINDS ...        the exported functions, in the order of the tape
+//     node replay.mjs KERNEL.wasm TAPE ARRAYS NAME:KINDS ...    the arrays of a world; the functions, in the tape's order
 //
 // Prints the number of calls; or which call differs, and exits with code 1.
 
 import { readFileSync, openSync, readSync, closeSync } from "node:fs";
 
-const [wasm, path, ...signatures] = process.argv.slice(2);
+const [wasm, path, arraysOfAWorld, ...signatures] = process.argv.slice(2);
 const functions = signatures.map((text) => text.split(":"));
-const WORLD_ARRAYS = 17;
 const PAGE = 65536;
 
 const memory = new WebAssembly.Memory({ initial: 64 });
@@ -83,7 +82,7 @@ function call() {
       block.push(u32(), u32());
     } else if (kind === "w") {
       const table = [];
-      for (let i = 0; i < WORLD_ARRAYS; i++) table.push(...array());
+      for (let i = 0; i < Number(arraysOfAWorld); i++) table.push(...array());
       const key = table.join();
       if (!worlds.has(key)) {
         worlds.set(key, allocate(4 * table.length));

@@ -86,7 +86,10 @@ def test_comments_do_nothing(copy: Path) -> None:
     edit(copy, "kernel.py", "    least = heap[0]\n", "\n    # The least is on top.\n    least = heap[0]  # always\n")
     edit(copy, "bulk.py", '"""The four bytes from', '"""Reads the four bytes\n\n    from')
     assert chosen(copy) == [PREBUILT, "", PREBUILT]
-    (copy / "shared" / "prebuilt" / kernels.MANIFEST).unlink()
+    manifest = copy / "shared" / "prebuilt" / kernels.MANIFEST
+    manifest.write_text("{", "utf-8")
+    assert chosen(copy) == [PREBUILT, "", PREBUILT]
+    manifest.unlink()
     assert chosen(copy) == [PREBUILT, "", PREBUILT]
 
 

@@ -57,7 +57,14 @@ def replayed(path: Path) -> str:
     assert NODE is not None
     wasm = kernels.LIBRARIES / "kernel.wasm"
     signatures = (f"{name}:{kinds}" for name, kinds in exports.functions().items())
-    command = (NODE, str(Path(__file__).with_name("replay.mjs")), str(wasm), str(path), *signatures)
+    command = (
+        NODE,
+        str(Path(__file__).with_name("replay.mjs")),
+        str(wasm),
+        str(path),
+        str(len(exports.FIELDS)),
+        *signatures,
+    )
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.stderr == ""
     return done.stdout.strip()

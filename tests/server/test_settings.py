@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from server.kinds import SettingsError, checked
 from server.limits import Limits
 from server.settings import GROUPS, KINDS, SECTIONS, Settings, load, parse
+from shared import kernels
 
 
 def config(tmp_path: Path, text: str) -> str:
@@ -31,6 +32,16 @@ def test_defaults() -> None:
     assert isinstance(defaults, str)
     assert all(name in defaults for name in KINDS)
     assert sum(map(len, SECTIONS.values())) == len(KINDS), "a name means one thing, wherever it stands"
+
+
+def test_the_settings_tell_which_kernel_runs(monkeypatch: pytest.MonkeyPatch) -> None:
+    printed = parse(["--print-config"], {})
+    assert f'kernel = "auto"  # default; runs: {kernels.describe("auto")}\n' in str(printed)
+    printed = parse(["--print-config"], {"SOVEREIGN_KERNEL": "plain"})
+    assert 'kernel = "plain"  # SOVEREIGN_KERNEL; runs: plain' in str(printed)
+    monkeypatch.setattr(kernels, "trouble", lambda: "no prebuilt kernel for here")
+    with pytest.raises(SettingsError, match=r"^kernel = 'prebuilt' \(from --kernel\): no prebuilt kernel for here$"):
+        settings(["--kernel", "prebuilt"])
 
 
 def test_each_source_wins_over_the_one_before(tmp_path: Path) -> None:

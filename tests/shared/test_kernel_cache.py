@@ -12,9 +12,9 @@ from shared import kernels
 ROOT = Path(__file__).parent.parent.parent
 READ = """
 import numpy as np
-from shared import bulk, kernels, layout
+from shared import bulk, layout, numba_kernel
 turns = np.zeros(8, np.int64)
-assert kernels.jitted(bulk).read_turns(bytes((1, 0, 0, 0, layout.TOLD)), b"\\1\\2\\3", turns)
+assert numba_kernel.jitted(bulk).read_turns(bytes((1, 0, 0, 0, layout.TOLD)), b"\\1\\2\\3", turns)
 print(turns[2:5].tolist())
 """
 

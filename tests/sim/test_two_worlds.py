@@ -50,10 +50,9 @@ def test_two_processes_compiled_and_plain_agree_at_every_tick(scene: str) -> Non
 
 @pytest.mark.slow
 @pytest.mark.skipif(not kernels.numba_installed(), reason="Numba is not installed")
-@pytest.mark.parametrize("scene", chains.SCENES)
-def test_two_processes_of_which_numba_compiles_one_agree_at_every_tick(scene: str) -> None:
-    other = other_chain(scene, kernels.NUMBA)
-    assert f"{kernels.NUMBA} {chains.chain(scene, TICKS, compiled=True)}" == other
+def test_two_processes_of_which_numba_compiles_one_agree_at_every_tick() -> None:
+    other = other_chain("hills", kernels.NUMBA)
+    assert f"{kernels.NUMBA} {chains.chain('hills', TICKS, compiled=True)}" == other
 
 
 def other_chain(scene: str, form: str) -> str:

@@ -1,0 +1,72 @@
+"""The kernel sources compiled by Numba: for platforms without a prebuilt kernel, and for whoever edits the sources."""
+
+import functools
+import importlib
+import importlib.util
+import sys
+import zlib
+from collections.abc import Iterable
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+from shared import exports, freshness
+from shared.jit import COMPILED, OPTIONS
+from shared.layout import Arrays
+
+
+def functions(sources: Iterable[ModuleType]) -> dict[str, Any]:
+    """Compiles all functions of `shared.exports`, or loads them from Numba's cache on disk. Returns them by name.
+
+    Raises:
+        ImportError: Numba is not installed.
+    """
+    from numba import types
+
+    def array(kind: str) -> Any:
+        return types.Array(getattr(types, exports.item(kind)[0]), 1, "C")
+
+    named: Any = types.NamedTuple
+    world = named([array(kind) for kind in exports.FIELDS.values()], Arrays)
+    kinds = {
+        exports.WORLD: world,
+        exports.NUMBER: types.int64,
+        exports.TRUTH: types.boolean,
+        "b": types.Bytes(types.uint8, 1, "C", readonly=True),
+    }
+    found: dict[str, Any] = {}
+    for source in sources:
+        compiled = jitted(source)
+        for name, arguments in exports.of(source).items():
+            types_of_arguments = tuple(kinds.get(kind) or array(kind) for kind in arguments)
+            function = getattr(compiled, name)
+            function.compile(types_of_arguments)
+            # By the entry point, Numba does not inspect each array of `Arrays`: 2 us, more than a client's whole step.
+            found[name] = function.overloads[types_of_arguments].entry_point
+    return found
+
+
+@functools.cache
+def jitted(source: ModuleType) -> ModuleType:
+    """Loads a source under another name, in which its functions are Numba's. They are compiled when first called.
+
+    Raises:
+        ImportError: Numba is not installed.
+    """
+    config: Any = importlib.import_module("numba.core.config")
+    name = source.__name__ + COMPILED
+    assert source.__file__ is not None
+    spec = importlib.util.spec_from_file_location(name, source.__file__)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[name] = module
+    place = config.CACHE_DIR
+    # Numba's cache on disk knows the source alone, not the constants that it imports.
+    kept = f"numba-{zlib.crc32(repr((freshness.constants(source), OPTIONS)).encode()):08x}"
+    config.CACHE_DIR = str(Path(place or Path(source.__file__).parent / "__pycache__") / kept)
+    try:
+        spec.loader.exec_module(module)
+    finally:
+        config.CACHE_DIR = place
+    return module
