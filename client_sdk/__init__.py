@@ -2,8 +2,8 @@
 
     from client_sdk import Client, Joined, Left
 
-`Client` is for a game's own loop, `AsyncClient` for asyncio, `Loopback` for a server within the program. What they tell
-of are the events (`client_sdk.events`); what there is to draw is a `View` of `Figure`s.
+`Client` is for a game's own loop, `AsyncClient` for asyncio, `Loopback` for a server within the program. They return
+events (`client_sdk.events`), and a `View` of `Figure`s, one per entity to draw.
 """
 
 from client_sdk.client import Client

@@ -1,4 +1,4 @@
-"""What both kinds of client have in common: the player's side of a core."""
+"""The part that `Client` and `AsyncClient` have in common: the player's side of a core."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -13,7 +13,7 @@ class BaseClient:
     """A player on a server.
 
     Args:
-        core: the client's state; read it for whatever is not offered here.
+        core: the client's state machine; read it for what this class does not offer.
     """
 
     def __init__(self, core: LinkedCore) -> None:
@@ -21,51 +21,58 @@ class BaseClient:
 
     @property
     def joining(self) -> bool:
-        """Whether the world is still being fetched: there is nothing to draw yet."""
+        """Whether the client still waits for the world, so that there is nothing to draw yet."""
         return self.core.state == "joining"
 
     @property
     def playing(self) -> bool:
-        """Whether inputs count and there is a world to draw."""
+        """Whether inputs count and there is a world to draw.
+
+        A `Client` becomes `playing` in `update`, so a program has to call `update` as well as `poll` each frame: with
+        `poll` alone the client stays `joining`. An `AsyncClient` does both by itself.
+        """
         return self.core.state == "playing"
 
     @property
     def away(self) -> bool:
-        """Whether the connection is lost and the client tries to come back: `Disconnected`, then `Resumed`."""
+        """Whether the connection is lost and the client tries to reconnect: after `Disconnected`, before `Resumed`."""
         return self.core.state == "away"
 
     @property
     def closed(self) -> bool:
-        """Whether it is over; `Left` says why."""
+        """Whether the connection is over for good; the event `Left` says why."""
         return self.core.state == "closed"
 
     @property
     def entity(self) -> int:
-        """The own entity; 0 before the server has given one."""
+        """The number of the own entity; 0 before the server has sent it."""
         return self.core.entity
 
     @property
     def shared(self) -> Mapping[str, Any]:
-        """The values that the game shares with all clients."""
+        """The values that the rules of the game share with all clients, by name."""
         return self.core.shared
 
     @property
     def stats(self) -> Stats:
-        """Counters since the start, and figures of the moment."""
+        """Counters since the start, and current measurements such as the round trip."""
         return self.core.stats
 
     def overlay(self) -> str:
-        """The figures that matter as a few lines of text, to draw over the picture (`stats.figures`: in pairs)."""
+        """Returns the most useful statistics as a few lines of text, to draw over the view.
+
+        `stats.figures()` returns them as pairs of name and value.
+        """
         return self.core.stats.text()
 
     @property
     def link(self) -> Path | None:
-        """A worse connection than there is, to feel one while developing: `client.link = "wifi"`.
+        """The simulated link on top of the real connection, to try a bad network: `client.link = "wifi"`.
 
-        Any preset of `client_sdk.links`, or a `Path` of one's own; None: none. May change at any time.
+        It may be set at any time, to the name of a preset of `client_sdk.links`, to a `Path`, or to None for no link.
 
         Raises:
-            ValueError: there is no preset of that name.
+            ValueError: no preset has that name.
         """
         return self.core.link
 
@@ -74,9 +81,14 @@ class BaseClient:
         self.core.link = link
 
     def set_input(self, x: float, y: float, *, jump: bool = False) -> None:
-        """Sets the player's input from now on: a direction (east, north) of length 0 to 1, and whether to jump.
+        """Sets the player's input from now on. May be called at any time, also several times per tick.
 
-        Call it as often as you like. A jump that is set and taken back between two ticks counts in the next tick.
+        A jump that is set and taken back between two ticks counts in the next tick.
+
+        Args:
+            x: east part of the direction. The length of (x, y) is the share of full speed; above 1 counts as 1.
+            y: north part of the direction.
+            jump: whether to jump as soon as the entity can.
 
         Raises:
             ValueError: the direction is not finite.
@@ -84,12 +96,15 @@ class BaseClient:
         self.core.set_input(make_input(x, y, jump=jump))
 
     def set_input_delay(self, ticks: int) -> None:
-        """Shows the effect of inputs so many ticks (0 to 3) after `set_input`; may change at any time.
+        """Sets the input delay: the effect of an input is shown `ticks` ticks later. May be called at any time.
 
-        The more, the fewer and smaller the corrections caused by others on a slow connection, and the slower the
-        controls feel: 2 ticks at 32 a second are 63 ms.
+        A longer delay means fewer and smaller corrections caused by others on a slow connection, and slower controls:
+        2 ticks at 32 ticks per second are 63 ms.
+
+        Args:
+            ticks: 0 to 3.
 
         Raises:
-            ValueError: not 0 to 3.
+            ValueError: `ticks` is not 0 to 3.
         """
         self.core.set_input_delay(ticks)

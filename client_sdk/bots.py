@@ -1,7 +1,7 @@
-"""Players without a player: policies, which look at a world once per tick and wish.
+"""Bots: players whose inputs a policy chooses, a function that gets the world once per tick.
 
-A policy knows nothing of networks, so the same one plays over the wire (in a client's predicted world) and inside a
-server. Each is seeded by the random source it is given.
+A policy knows nothing of networks. So one policy can play over a connection (in a client's predicted world) and inside
+a server. All its chance comes from the random source that it is given, so a seed repeats its play.
 """
 
 from collections.abc import Callable, Mapping
@@ -16,48 +16,53 @@ from shared.world import World
 
 
 class Random(Protocol):
-    """What a policy needs of a `random.Random`."""
+    """The part of `random.Random` that a policy uses."""
 
     def random(self) -> float:
-        """A number from 0 up to 1."""
+        """Returns a number from 0 up to, but not including, 1."""
         ...
 
 
 class Policy(Protocol):
-    """Decides what one player wishes."""
+    """A function that chooses the inputs of one player."""
 
     def __call__(self, world: World, me: int) -> Input:
-        """The wish for the tick that comes, given the world before it; `me` is an entity in it."""
+        """Returns the input for the next tick.
+
+        Args:
+            world: the world at the end of the tick before.
+            me: number of the player's entity, which is in the world.
+        """
         ...
 
 
 @runtime_checkable
 class Builder(Policy, Protocol):
-    """A policy that also changes blocks."""
+    """A policy that also places and removes blocks."""
 
     def edit(self, world: World, me: int) -> Edit | None:
-        """What to change with the tick that comes, if anything; asked once per tick, after the wish."""
+        """Returns the edit for the next tick, or None. Called once per tick, after the input was chosen."""
         ...
 
 
 @runtime_checkable
 class Learner(Policy, Protocol):
-    """A policy that wants to know what the game's rules say of the entities in sight."""
+    """A policy that uses the attributes of the entities that its player sees."""
 
     def learn(self, attributes: Mapping[int, Mapping[str, Any]]) -> None:
-        """Attributes by entity, ahead of each wish. The table changes as news come in."""
+        """Receives the attributes by entity, before each input. The mapping changes when snapshots arrive."""
         ...
 
 
 class Bot:
-    """A policy at the wheel of a client: `AsyncClient.connect(..., before_update=Bot(Wander(Random(1))))`."""
+    """A policy that controls a client: `AsyncClient.connect(..., before_update=Bot(Wander(Random(1))))`."""
 
     def __init__(self, policy: Policy) -> None:
         self._policy = policy
         self._tick = -1
 
     def __call__(self, core: Core) -> None:
-        """Sets the input for the tick that comes, and changes blocks with it, once per tick."""
+        """Sets the input of the next tick, and sends the policy's edit, once per tick."""
         if core.prediction is None:
             return
         world = core.prediction.predicted
@@ -73,7 +78,7 @@ class Bot:
 
 
 class Stand:
-    """Does nothing."""
+    """Stands still."""
 
     def __init__(self, random: Random) -> None:
         pass
@@ -83,7 +88,7 @@ class Stand:
 
 
 class Wander:
-    """Strolls: a heading for half a second to two, sometimes a pause, now and then a jump."""
+    """Walks in a random direction for 0.5 to 2 s, then chooses another. One in five is a pause, one in five a jump."""
 
     def __init__(self, random: Random) -> None:
         self._random = random
@@ -99,7 +104,7 @@ class Wander:
 
 
 class RunAndJump:
-    """Runs at full speed, jumps whenever it can, and turns where it gets no further."""
+    """Runs at full speed and jumps whenever it can. Turns every 2 to 6 s, and soon after something blocked it."""
 
     def __init__(self, random: Random) -> None:
         self._random = random
@@ -116,7 +121,7 @@ class RunAndJump:
 
 
 class Follow:
-    """Runs after another player up to arm's length, jumps where it gets no further, and picks a new one at times."""
+    """Runs after another player up to 1 block from it, and jumps when blocked. Chooses another one every 3 to 7 s."""
 
     def __init__(self, random: Random) -> None:
         self._random = random
@@ -138,7 +143,7 @@ class Follow:
         return make_input((to_x - x) / way, (to_y - y) / way, jump=vx == 0 or vy == 0)
 
     def _pick(self, world: World, me: int) -> int:
-        """One of the four nearest of its own kind; 0 if there is nobody."""
+        """Returns one of the four nearest entities of the own template; 0 if there is none."""
         states = world.states()
         mine = states[states[:, ID] == me][0]
         alike = states[(states[:, ID] != me) & (states[:, TEMPLATE] == mine[TEMPLATE])]
@@ -150,9 +155,9 @@ class Follow:
 
 
 class DigAndPlace:
-    """Wanders, and twice a second or so turns a block near itself over: digs it out, or places one where there is none.
+    """Wanders, and about twice per second removes a block near itself, or places one where there is air.
 
-    The lowest layer of the scene stays, so that nobody digs a hole through the world.
+    It leaves the lowest layer of the scene alone, so that the world keeps its floor.
     """
 
     def __init__(self, random: Random) -> None:
@@ -164,7 +169,7 @@ class DigAndPlace:
         return self._wander(world, me)
 
     def edit(self, world: World, me: int) -> Edit | None:
-        """See `Builder`."""
+        """Returns an edit about twice per second, otherwise None."""
         if world.tick < self._next:
             return None
         self._next = world.tick + _ticks(world, 0.2 + 0.6 * self._random.random())
@@ -175,7 +180,7 @@ class DigAndPlace:
         return Edit(x, y, z, 0 if kind else 1 + int(self._random.random() * 4))
 
     def _pick(self, low: int) -> int:
-        """One of the whole numbers from `low` to 2."""
+        """Returns a random whole number from `low` to 2."""
         return low + int(self._random.random() * (3 - low))
 
 
@@ -189,7 +194,7 @@ POLICIES: dict[str, Callable[[Random], Policy]] = {
 
 
 def _heading(random: Random, *, jump: bool) -> Input:
-    """Any direction, at full speed."""
+    """Returns an input for a random direction at full speed."""
     while True:
         x, y = 2 * random.random() - 1, 2 * random.random() - 1
         length = (x * x + y * y) ** 0.5

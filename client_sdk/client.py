@@ -1,4 +1,4 @@
-"""What a game developer holds: one object in the game's own loop, without a thread and without an event loop.
+"""The client for a game's own loop: one object, without a thread and without an event loop.
 
 with Client.connect("ws://localhost:8765", name="Ann") as client:
     while not client.closed:
@@ -26,31 +26,34 @@ from shared.checks import duration, finite
 from shared.scene import Scene
 
 PATIENCE_S = 30.0
-"""A server that is started anew is back by then."""
+"""Time for which a client tries to reconnect, in seconds: enough for a server to restart."""
 
 
 class Transport(Protocol):
-    """What carries a client's messages. None of these block, but for `close`."""
+    """The code that moves a client's messages. Only `close` may block."""
 
     def poll(self, now: float) -> None:
-        """Hands what has arrived to the core, and sends."""
+        """Hands the messages that have arrived to the core, then sends the core's messages."""
 
     def send(self, now: float) -> None:
-        """Sends what the core wants sent."""
+        """Sends the messages that wait in the core."""
 
     def close(self, timeout: float) -> None:
-        """Sends, and ends within so many seconds."""
+        """Sends the messages that wait, and closes the connection within `timeout` seconds."""
 
 
 class Client(BaseClient):
     """A player on a server.
 
-    Call `poll`, `set_input`, `update` and `view` once per frame, at any frame rate. Times are float seconds of
-    `time.monotonic()`, unless every call is given another clock's; left out, it is now.
+    Call `poll`, `set_input`, `update` and `view` once per frame, at any frame rate. `playing` becomes true only if both
+    `poll` and `update` are called: `poll` receives the world, `update` measures the server's time and starts the play.
+
+    `now` is a time in float seconds; left out, it is `time.monotonic()`. A program may use another clock, if it passes
+    `now` to every call.
 
     Args:
-        core: the client's state; read it for whatever is not offered here.
-        transport: what carries its messages.
+        core: the client's state machine; read it for what this class does not offer.
+        transport: moves the client's messages.
     """
 
     def __init__(self, core: LinkedCore, transport: Transport) -> None:
@@ -70,21 +73,24 @@ class Client(BaseClient):
         tls: ssl.SSLContext | None = None,
         link: str | Path | None = None,
     ) -> "Client":
-        """Connects to a server, and returns once it has answered; joining goes on in `poll` and `update`.
+        """Connects to a server. Returns as soon as the server has answered; `poll` and `update` then join the game.
 
         Args:
-            url: where the server is, like ws://localhost:8765.
-            name: shown to others, up to 32 characters.
-            scene: the scene this program was built for; another one on the server ends in `Left`. None: take its.
-            token: proves who this is, where the server asks for one.
-            patience_s: after a lost connection, it tries to come back for so long; 0: not at all.
-            timeout: the longest that this may block, in seconds.
-            tls: whom to trust for wss://; None: whom the system trusts.
-            link: see `link`.
+            url: address of the server, like ws://localhost:8765.
+            name: the player's name, shown to others, up to 32 characters.
+            scene: the scene that this program was built for. If the server plays another one, the client gets `Left`.
+                None: the client accepts the server's scene.
+            token: proves the client's identity, if the server asks for it.
+            patience_s: the client tries to reconnect for this long after a lost connection, in seconds; 0: it does not
+                reconnect.
+            timeout: the longest time that this call may block, in seconds.
+            tls: certificates to trust for wss://; None: those that the system trusts.
+            link: a simulated link: the name of a preset, or a `Path`; None: none. `Client.link` changes it later.
 
         Raises:
-            ValueError: there is no such link; or the name or the token is no text that UTF-8 can hold.
-            ConnectError: there is no connection; the text says why and what to do.
+            ValueError: an argument is not valid: no preset has the name in `link`, or UTF-8 cannot hold the name or the
+                token, or a duration is negative, for example.
+            ConnectError: there is no connection; the text says why, and what to do.
         """
         COMPILER.begin()
         core = LinkedCore(name, scene, token=token, patience_s=patience_s)
@@ -92,46 +98,60 @@ class Client(BaseClient):
         return cls(core, PollingTransport(Connection(url, core), duration(timeout, "timeout"), checked_tls(tls)))
 
     def poll(self, now: float | None = None) -> list[Event]:
-        """What has happened since the last call, in order: `Joined`, `Corrected`, `Left`, ... Never blocks."""
+        """Reads what has arrived. Returns the events since the last call, oldest first. Never blocks."""
         self._transport.poll(_time(now))
         return self.core.events()
 
     def edit(self, x: int, y: int, z: int, kind: int) -> int:
-        """Places (`kind` 1 to 255) or removes (0) the block (x, y, z) with the next tick, at once in the own picture.
+        """Places or removes one block with the next tick. The client predicts the change and shows it at once.
 
-        The server's word comes as an `Answered` event with the number that is returned here; where it says no (out of
-        reach, somebody is in the way, too many), the picture goes back by itself.
+        The server may refuse it: the block is out of reach, an entity is in the way, or there were too many edits. The
+        client then takes the change back by itself.
+
+        Args:
+            x: east, in blocks.
+            y: north, in blocks.
+            z: up, in blocks.
+            kind: the block to place, 1 to 255; 0 removes the block.
+
+        Returns:
+            The number of the edit. The event `Answered` with this number brings the result.
 
         Raises:
             RuntimeError: the client has not joined.
-            TypeError: something is not a whole number.
-            ValueError: it is out of range.
+            TypeError: an argument is not a whole number.
+            ValueError: an argument is out of range.
         """
         return self.core.edit(x, y, z, kind)
 
     def command(self, name: str, data: Any = None) -> int:
-        """Asks the game's rules for something: what `name` and `data` mean is theirs.
+        """Sends a request to the rules of the game, which define what `name` and `data` mean.
 
-        Their word comes as an `Answered` event with the number that is returned here.
+        Args:
+            name: name of the command, up to 32 characters.
+            data: any value that MessagePack can hold, up to 1,024 bytes when packed.
+
+        Returns:
+            The number of the command. The event `Answered` with this number brings the result.
 
         Raises:
             RuntimeError: the client has not joined.
-            ValueError: the name or the data are too long (32 characters, 1,024 bytes), or no MessagePack.
+            ValueError: the name or the data are too long, or MessagePack cannot hold the data.
         """
         return self.core.command(name, data)
 
     def update(self, now: float | None = None) -> None:
-        """Predicts up to now and sends the inputs of the ticks that have come."""
+        """Predicts every tick that is due, and sends its input. Starts the play once the world has arrived."""
         now = _time(now)
         self.core.update(now)
         self._transport.send(now)
 
     def view(self, now: float | None = None) -> View:
-        """What to draw now; positions in blocks."""
+        """Returns what to draw now; positions in blocks, velocities in blocks/s."""
         return self.core.view(_time(now))
 
     def close(self, timeout: float = 1.0) -> None:
-        """Says goodbye, and waits for the server to do so for at most `timeout` seconds. Again: does nothing."""
+        """Leaves the game, and waits at most `timeout` seconds until the server closes. A second call does nothing."""
         self.core.close()
         self._transport.close(timeout)
 
@@ -145,5 +165,5 @@ class Client(BaseClient):
 
 
 def _time(now: float | None) -> float:
-    """The time of a call: the one that was handed in, or else that of the clock."""
+    """Returns the time of a call in seconds: `now`, or `time.monotonic()` if it was left out."""
     return time.monotonic() if now is None else finite(now, "now")

@@ -1,4 +1,4 @@
-"""What happens to a client, as values: `poll()` gives them in order, a `match` statement tells them apart."""
+"""The events of a client. `poll()` returns them in order; a `match` statement tells them apart."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -9,7 +9,10 @@ from shared.scene import Scene
 
 @dataclass(frozen=True)
 class Joined:
-    """The player is in: inputs count from here on. No event comes before it, but for `SegmentLoaded` and `Left`."""
+    """The player has joined: inputs count from `tick` on. Only `SegmentLoaded` and `Left` may come before it.
+
+    `entity` is the number of the own entity, and `scene` the one that the server plays.
+    """
 
     entity: int
     scene: Scene
@@ -18,9 +21,9 @@ class Joined:
 
 @dataclass(frozen=True)
 class Disconnected:
-    """The connection is lost; the client tries to come back, the next time in `wait_s` seconds. Told once per attempt.
+    """The connection is lost; the client tries to reconnect in `wait_s` seconds. One event per attempt.
 
-    Meanwhile the own entity goes on in the picture for some 3 s, then it stands.
+    The view shows the own entity moving for about 3 s more; then it stands still.
     """
 
     reason: str
@@ -29,9 +32,10 @@ class Disconnected:
 
 @dataclass(frozen=True)
 class Resumed:
-    """The client is back after `away_s` seconds, with the entity and everything that was ordered meanwhile.
+    """The client has reconnected after `away_s` seconds and goes on with the same entity at `tick`.
 
-    Where the server did not keep the entity for so long, there is a new `Joined` instead.
+    Commands and edits that were requested meanwhile are sent now. If the server did not keep the entity for that long,
+    the event is a new `Joined` instead.
     """
 
     tick: int
@@ -40,7 +44,10 @@ class Resumed:
 
 @dataclass(frozen=True)
 class Left:
-    """It is over. `wait_s`: come back in so many seconds; negative: do not."""
+    """The connection is over for good; `code` is the close code, and `reason` says why.
+
+    `wait_s` is the time after which the server asks to connect again, in seconds; negative if it does not ask.
+    """
 
     code: int
     reason: str
@@ -49,10 +56,10 @@ class Left:
 
 @dataclass(frozen=True)
 class Corrected:
-    """The server's world differed from the prediction of the own entity.
+    """The server's state of the own entity differed from the predicted one.
 
-    `fields` names what differed at `tick`; `blocks` is how far the position was off then, `ticks` how many were
-    replayed, and `cause` the best explanation.
+    `fields` names the parts of the state that differed at `tick`. `blocks` is the distance between both positions at
+    that tick, in blocks. `ticks` is the number of ticks that were replayed. `cause` is the most likely reason.
     """
 
     tick: int
@@ -64,7 +71,10 @@ class Corrected:
 
 @dataclass(frozen=True)
 class Answered:
-    """The server's answer to a command: `verdict` is "done", or why not (and then what was predicted is undone)."""
+    """The result of an edit or a command, named by the `number` that `edit` or `command` returned.
+
+    `verdict` is "done", or says why it was refused. The client then takes back a predicted edit.
+    """
 
     number: int
     done: bool
@@ -73,9 +83,9 @@ class Answered:
 
 @dataclass(frozen=True)
 class Happened:
-    """The game's rules tell something: what `name` and `data` mean is theirs.
+    """A message that the rules of the game sent at `tick`; the rules define what `name` and `data` mean.
 
-    It comes once the world is known here as it was at the end of `tick`: an entity that it names is there.
+    It comes after the snapshot of the end of `tick`, so an entity that it names is known to the client.
     """
 
     tick: int
@@ -85,11 +95,11 @@ class Happened:
 
 @dataclass(frozen=True)
 class EventsDropped:
-    """Here `count` events are missing: more waited than are kept.
+    """At this place, `count` events are missing, because too many waited.
 
-    They are the game's (`Happened`). They waited at the server for a slow or lost connection, or here because the
-    program did not ask for 10,000 of them. Only then are other events among them, and `Joined`, `Disconnected`,
-    `Resumed` and `Left` never.
+    The server drops game events (`Happened`) if more than 1,024 wait for a slow or lost connection. The client drops
+    events if the program leaves more than 10,000 of them; then other events may be among them. `Joined`,
+    `Disconnected`, `Resumed` and `Left` are never dropped.
     """
 
     count: int
@@ -97,9 +107,9 @@ class EventsDropped:
 
 @dataclass(frozen=True)
 class Diverged:
-    """The two sides computed different worlds from the same inputs, or a copy is damaged: an alarm.
+    """An alarm: client and server computed different results from the same inputs, or a copy is damaged.
 
-    It must never happen; the client has asked for everything anew.
+    This must never happen. `what` names the difference. The client has asked the server for the whole world again.
     """
 
     tick: int
@@ -108,14 +118,15 @@ class Diverged:
 
 @dataclass(frozen=True)
 class Resynchronised:
-    """Prediction has begun anew at `tick`, `ticks_skipped` further than it was.
+    """Prediction has started again at `tick`, `ticks_skipped` ticks after the tick where it was.
 
-    For skipped ticks no input was sent; where the number is negative, inputs sent for ticks that have not come yet are
-    withdrawn and sent anew. `cause` is one of:
+    No input was sent for the skipped ticks. If `ticks_skipped` is negative, the client has withdrawn inputs for later
+    ticks and sends these again. `cause` is one of:
 
     - "program paused": the program did not call `update` for too long;
-    - "server behind": the server's time is behind what it was: the server stood still (or this computer's clock leapt);
-    - "server ahead": the server's time is ahead of what it was: this program's clock stood still;
+    - "server silent": no snapshot came for more than 4 s, so prediction had stopped;
+    - "server behind": the server's time went back, because the server stood still (or this computer's clock jumped);
+    - "server ahead": the server's time went forward, because this program's clock stood still;
     - "path changed": inputs take much more or less time to the server than before;
     - "reconnected": the connection was lost, and play goes on.
     """
@@ -127,7 +138,7 @@ class Resynchronised:
 
 @dataclass(frozen=True)
 class SegmentLoaded:
-    """The blocks of a segment are there."""
+    """The blocks of a segment have arrived."""
 
     segment: Cell
 

@@ -1,4 +1,7 @@
-"""What to draw: the own entity (and templates shown so) as predicted, all others a moment ago, corrections smoothed."""
+"""The view: the own entity as predicted, all others a little in the past, corrections smoothed.
+
+Other entities are drawn as predicted, too, if their template is shown so (`shown = "predicted"` in the scene).
+"""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -20,9 +23,9 @@ from shared.units import BLOCK, SPEED
 
 @dataclass(frozen=True)
 class Figure:
-    """One entity as it is to be drawn: position in blocks, velocity in blocks/s, `template` by its name.
+    """One entity to draw: its number, position in blocks, velocity in blocks/s, and the name of its template.
 
-    `attributes` is what the game's rules say of it ("name", for one).
+    `attributes` are the named values that the rules of the game gave to the entity, for example "name".
     """
 
     entity: int
@@ -34,10 +37,11 @@ class Figure:
 
 @dataclass(frozen=True)
 class View:
-    """What to draw at one moment. `me` is the own entity at `tick`, `others` are the rest, ascending by id.
+    """Everything to draw at one moment.
 
-    `seen` is the server's tick at which the others are drawn: commands take it along, so that the server can judge a
-    shot by what its shooter saw (`game.rewound`).
+    `me` is the own entity at `tick`; None before there is one. `others` are all other entities, ascending by number.
+    `seen` is the view tick: the server time at which the others are drawn, in ticks. Commands carry it, so that the
+    server can judge a shot by what the player saw (`game.rewound`).
     """
 
     tick: float
@@ -47,16 +51,18 @@ class View:
 
     @property
     def figures(self) -> list[Figure]:
-        """All in sight, the own one last."""
+        """All entities of the view, the own one last."""
         return self.others if self.me is None else [*self.others, self.me]
 
 
 NOTHING = View(0.0, None, [])
+"""The view before the client has joined."""
 NONE_SAID: Mapping[str, Any] = MappingProxyType({})
+"""Attributes of an entity that has none."""
 
 
 class Picture:
-    """Puts predicted, interpolated and smoothed positions together."""
+    """Makes views from predicted, interpolated and smoothed positions."""
 
     def __init__(self, scene: Scene, prediction: Prediction) -> None:
         self.interpolation = Interpolation(scene.tick_rate)
@@ -64,16 +70,16 @@ class Picture:
         self._templates = [template.name for template in scene.templates]
         self._predicted = {i for i, template in enumerate(scene.templates) if template.shown == "predicted"}
         self._smoothing: dict[int, Smoothing] = {}
-        self._delay = 0.0  # the input delay as it is drawn, in ticks
-        self._viewed = -math.inf  # the own tick of the latest view
+        self._delay = 0.0  # the input delay of the latest view, in ticks
+        self._viewed = -math.inf  # the timeline's tick of the latest view
 
     def advance(self, server_tick: float, now: float) -> float:
-        """Adapts the delay of the others; the tick at which they are drawn."""
+        """Adapts the interpolation delay of the others. Returns the tick at which they are drawn."""
         self.interpolation.advance(server_tick, now)
         return self.interpolation.shown(server_tick)
 
     def smooth(self, done: Reconciled, now: float) -> None:
-        """A replay has moved things: they are shown to go there gradually (what the rules acted on jumps)."""
+        """Starts to fade out the jumps that a replay made. Entities that the rules acted on jump at once."""
         for entity in done.placed:
             self._smoothing.pop(entity, None)
         if not done.replayed:
@@ -86,10 +92,11 @@ class Picture:
                 self._smoothing.setdefault(entity, Smoothing()).add(offset, now)
 
     def view(self, timeline: Timeline, clock: ServerClock, now: float) -> View:
-        """The picture at `now`."""
+        """Returns the view at `now`."""
         prediction = self._prediction
         tick, server_tick = timeline.tick(now), clock.tick(now)
-        # A longer input delay lets the figure stand for as many ticks: it is never drawn further back than it was.
+        # The drawn delay grows no faster than time passes: after a longer input delay is set, the own entity stands
+        # for as many ticks, and is never drawn further back than before.
         self._delay = min(prediction.ahead, self._delay + max(tick - self._viewed, 0.0))
         self._viewed = tick
         states, places = self.interpolation.sample(server_tick)
@@ -103,7 +110,10 @@ class Picture:
         return View(tick, self._ahead(prediction.entity, tick, now), others, self.interpolation.shown(server_tick))
 
     def _ahead(self, entity: int, tick: float, now: float) -> Figure | None:
-        """An entity between two predicted ticks, one tick behind the newest, with what smoothing adds."""
+        """Returns a predicted entity to draw, one tick before `tick` and with smoothing; None if it is not predicted.
+
+        One tick back, the position lies between two predicted states.
+        """
         prediction = self._prediction
         if entity not in prediction.predicted:
             return None
@@ -114,7 +124,7 @@ class Picture:
         return self._figure(after, place.tolist())
 
     def _figure(self, state: Sequence[int], place: list[float]) -> Figure:
-        """A state with the position to draw it at."""
+        """Returns the entity view of a state, drawn at `place` (in blocks)."""
         x, y, z = place
         vx, vy, vz = (part / SPEED for part in state[VX : VX + 3])
         said = self._prediction.attributes.get(state[ID], NONE_SAID)

@@ -1,4 +1,4 @@
-"""What the network does to a player, in numbers: to watch while playing, and to draw over the picture."""
+"""Statistics of a client's connection and prediction, to read while playing and to draw over the view."""
 
 from collections import deque
 from dataclasses import dataclass, field
@@ -8,17 +8,19 @@ from typing import NamedTuple
 from client_sdk.events import Corrected
 
 CORRECTIONS_KEPT = 1000
+"""Number of the newest corrections whose size is kept."""
 RATE_S = 1.0
+"""Time between two measurements of the rates, in seconds."""
 ROUND_TRIPS = 3
-"""The pongs that the round trip is taken from; the middle one of them, so that a single late one is not shown."""
+"""Number of pongs whose median is the round trip, so that a single late pong is not shown."""
 LATE_S = 5.0
-"""The time that `late_share_lately` is about, in seconds."""
+"""The time that `late_share_lately` covers, in seconds."""
 CORRECTIONS_S = 60.0
-"""The time that `corrections_lately` is about, in seconds."""
+"""The time that `corrections_lately` covers, in seconds."""
 
 
 class _Mark(NamedTuple):
-    """The counters at a time."""
+    """The counters at the time `at`, in seconds."""
 
     at: float
     bytes_up: int
@@ -30,61 +32,65 @@ class _Mark(NamedTuple):
 
 @dataclass
 class Stats:
-    """Counters since the start, and figures of the moment. Lengths in blocks, times in seconds."""
+    """Counters since the start, and current measurements. Lengths in blocks, times in seconds."""
 
     rtt_s: float = 0.0
-    """The round trip of the last three seconds: of the last three pings, the one in the middle."""
+    """Round trip in seconds: the median of the last three pongs, which come once per second."""
     lead_ticks: float = 0.0
-    """How far ahead of the server the own tick is."""
+    """Lead of the client's timeline over the server time, in ticks."""
     lead_s: float = 0.0
-    """The same in seconds; beyond half the round trip it is what the network costs in latency."""
+    """Lead of the client's timeline over the server time, in seconds; what exceeds half the round trip covers jitter
+    and loss."""
     snapshot_age_s: float = 0.0
-    """How long ago the server's world was as it is known here."""
+    """Age of the confirmed world: the server time minus the tick of the newest snapshot, in seconds."""
     bytes_up_per_s: float = 0.0
-    """Of the last second, as are those down; messages only, without the headers around them."""
+    """Rate of sent bytes in the last second; messages only, without the headers of WebSocket and TCP."""
     bytes_down_per_s: float = 0.0
+    """Rate of received bytes in the last second; messages only, without the headers of WebSocket and TCP."""
     bytes_up: int = 0
     bytes_down: int = 0
     inputs_sent: int = 0
     inputs_used: int = 0
-    """Ticks for which the server used the input that was sent for them."""
+    """Number of ticks for which the server used the input that was sent for them."""
     inputs_late: int = 0
-    """Came after their tick."""
+    """Number of inputs that arrived after their deadline."""
     inputs_refused: int = 0
-    """Came much too early, or twice."""
+    """Number of inputs that the server refused, because they arrived much too early or twice."""
     inputs_substituted: int = 0
-    """Ticks for which there was none: the one before was repeated,"""
+    """Number of ticks for which the server had no input: it repeated the latest one, or used none."""
     inputs_neutralised: int = 0
-    """or, after ten of these, none taken."""
+    """Number of ticks in which the server used no input, because it had already repeated the latest one for 0.3125 s;
+    also counted in `inputs_substituted`."""
     snapshots: int = 0
     snapshots_skipped: int = 0
-    """Ticks without a snapshot, of which the next one told."""
+    """Number of ticks without a snapshot of their own; the next snapshot covered them."""
     corrections: int = 0
     corrections_by_cause: dict[str, int] = field(default_factory=dict)
     correction_blocks: list[float] = field(default_factory=list)
-    """How far off the latest ones were."""
+    """Sizes of the newest corrections in blocks, at most 1,000, oldest first."""
     repredictions: int = 0
-    """Replays that left the own entity where it was."""
+    """Number of replays for which only other entities differed."""
     replayed_ticks: int = 0
     resyncs: int = 0
-    """Prediction began anew, after a silence."""
+    """Number of times that prediction started again at another tick (`Resynchronised`)."""
     reconnects: int = 0
     divergences: int = 0
-    """Alarms; must be 0."""
+    """Number of divergences (`Diverged`); must be 0."""
     kernel: str = ""
-    """What computes the physics: `prebuilt`, `numba` or `plain` (`shared.kernels`); empty before there is a world."""
+    """Form of the kernel that computes the physics: `prebuilt`, `numba` or `plain` (`shared.kernels`), or `plain for
+    now` while Numba compiles; empty before there is a world."""
     _marks: deque[_Mark] = field(default_factory=deque, repr=False)
-    """One for each second, as far back as anything looks."""
+    """Counters at one time per second, for the last `CORRECTIONS_S` seconds, oldest first."""
     _round_trips: deque[float] = field(default_factory=lambda: deque(maxlen=ROUND_TRIPS), repr=False)
 
     @property
     def late_share(self) -> float:
-        """The share of late ones in all inputs since the start, 0 to 1."""
+        """The share of late inputs in all inputs since the start, 0 to 1."""
         return self.inputs_late / max(self.inputs_sent, 1)
 
     @property
     def late_share_lately(self) -> float:
-        """The share of late ones in the inputs of the last 5 s, 0 to 1."""
+        """The share of late inputs in the inputs of the last 5 s, 0 to 1."""
         since = self._since(LATE_S)
         late, sent = self.inputs_late, self.inputs_sent
         if since is not None:
@@ -107,12 +113,12 @@ class Stats:
         del self.correction_blocks[:-CORRECTIONS_KEPT]
 
     def pinged(self, round_trip_s: float) -> None:
-        """Takes a round trip."""
+        """Adds a measured round trip, in seconds."""
         self._round_trips.append(round_trip_s)
         self.rtt_s = median_low(self._round_trips)
 
     def measure(self, now: float) -> None:
-        """Takes the rates and a mark once a second; call it as often as you like."""
+        """Measures the rates and keeps the counters, at most once per second. May be called more often."""
         marks = self._marks
         if marks and now - marks[-1].at < RATE_S:
             return
@@ -126,17 +132,17 @@ class Stats:
             marks.popleft()
 
     def _since(self, seconds: float) -> _Mark | None:
-        """The newest mark that is at least so many seconds older than the last one; None: all is newer."""
+        """Returns the newest mark that is at least `seconds` older than the last mark; None if there is none."""
         if not self._marks:
             return None
         end = self._marks[-1].at - seconds
         return next((mark for mark in reversed(self._marks) if mark.at <= end), None)
 
     def figures(self) -> list[tuple[str, str]]:
-        """Names and values, as a game would show them: how it goes now, then corrections and alarms.
+        """Returns pairs of name and value as a game would show them: current measurements, corrections, alarms.
 
-        Late inputs are those of the last 5 s, corrections those of the last minute. Reconnects and divergences, which
-        are shown only if there are any, count since the start.
+        Late inputs are of the last 5 s, and corrections of the last minute. Reconnects and divergences count since the
+        start, and are left out if there are none.
         """
         corrections = self.corrections_lately
         figures = [
@@ -158,5 +164,5 @@ class Stats:
         return figures
 
     def text(self) -> str:
-        """The figures as lines of equal length."""
+        """Returns the pairs of `figures` as lines of equal length."""
         return "\n".join(f"{name:<16}{value:>10}" for name, value in self.figures())

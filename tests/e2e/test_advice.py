@@ -137,7 +137,7 @@ def left(game: Game, token: str = "", change: Callable[[Client], None] | None = 
 def test_a_token_that_does_not_do(token: str, wanted: str) -> None:
     found = left(Game(load_scene("flat"), authenticate=Tokens(KEY, lambda: NOW)), token)
     assert found.code == messages.UNAUTHORISED
-    assert found.reason == f"{wanted}; connect with token=..., a valid one; whoever runs the server issues them"
+    assert found.reason == f"{wanted}; connect with token=... and a valid token; the operator of the server issues them"
 
 
 def test_a_check_of_ones_own_has_its_say() -> None:
