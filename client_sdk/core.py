@@ -1,12 +1,14 @@
-"""A client without its socket: bytes and times in, bytes, events and a picture out.
+"""A client without its socket: messages and times in, messages, events and a view out.
 
-    joining   hello and pings are out; the welcome, the terrain around the player and the server's time come in
-    playing   every tick: step the predicted world with the wish, send the wish; every snapshot: reconcile (`play`)
-    away      the connection is lost: prediction goes on for a while; once there is another one, the world is fetched
-              anew beside it, what was not acknowledged is sent again, and the new world takes the place of the old
-    closed    it is over
+    joining   Hello and pings are sent; the welcome, the terrain around the player and the server's time arrive
+    playing   in each tick: step the predicted world with the input, and send the input; after each snapshot: reconcile
+              (`client_sdk.play`)
+    away      the connection is lost; prediction goes on, at most 4 s beyond the newest snapshot. Over a new connection,
+              the client sends unanswered commands again, fetches the world into a second replica, and then replaces
+              the old one
+    closed    the connection is over for good
 
-`now` is always float seconds of any one monotonic clock.
+`now` is always a time in float seconds; all calls use one monotonic clock.
 """
 
 import math
@@ -41,27 +43,29 @@ from shared.messages import ProtocolError, decode_from_server, encode
 from shared.scene import Scene
 
 INPUT_DELAY_MAX = 3
+"""Longest input delay, in ticks."""
 COME_AGAIN = (messages.TOO_SLOW, messages.GOING_AWAY, messages.NO_HELLO)
-"""The connection was at fault, not the player."""
+"""Close codes after which a client reconnects although the server did not ask for it: the connection was at fault."""
 NAME_MAX = 1 << 16
-"""The longest name that is taken; what goes beyond `messages.NAME_MAX` characters is not sent."""
+"""Longest name that a program may pass, in characters; only the first `messages.NAME_MAX` characters are sent."""
 READ_BYTES = 64 * 1024
+"""Number of bytes that a transport reads at once from a connection without a simulated link."""
 
 
 class Core:
     """The client as a state machine.
 
     Args:
-        name: shown to others.
-        scene: the scene this program was built for, checked by the server; None: the server's is taken.
-        token: proves who this is, where the server asks for it.
-        patience_s: for so long it tries to come back after a lost connection; 0: that is the end.
-        compiled: run a compiled kernel, or the plain one; None: the one that `shared.kernels` chooses, but the plain
-            one while that has to be compiled: no call of a core waits for a compiler.
-        neighbours: predict blocking others, too (see `Prediction`).
+        name: the player's name, shown to others.
+        scene: the scene that this program was built for, compared by the server; None: the server's scene is accepted.
+        token: proves the client's identity, if the server asks for it.
+        patience_s: the client tries to reconnect for this long after a lost connection, in seconds; 0: it does not.
+        compiled: True: use a compiled kernel; False: use the plain one; None: use the one that `shared.kernels`
+            chooses, and the plain one as long as Numba compiles it, because no call of a core waits for a compiler.
+        neighbours: whether the predicted world has other entities, so that blocking each other is predicted.
 
     Raises:
-        ValueError: the name or the token is no text, is too long, or UTF-8 cannot hold it.
+        ValueError: the name or the token is not a text, is too long, or UTF-8 cannot hold it.
     """
 
     def __init__(
@@ -80,12 +84,12 @@ class Core:
         self.scene = scene
         self.state = "joining"
         self.close_request: tuple[int, str] | None = None
-        """The code and reason with which the connection should be closed now, if any."""
+        """Close code and reason with which the transport has to close the connection now; None: it must not."""
         self.stats = Stats()
         self.comeback = Comeback(duration(patience_s, "patience_s", endless=True))
         self.controls = Controls()
         self.shared: dict[str, Any] = {}
-        """The values that the game shares with all clients."""
+        """The values that the rules of the game share with all clients, by name."""
         self._token = text(token, "token", messages.TOKEN_MAX, shortest=0)
         self._resume = b""
         self._compiled = compiled
@@ -94,54 +98,55 @@ class Core:
         self._delay = 0
         self._open = False
         self._filled: Replica | None = None
-        """What the server's messages go into: after a return not yet what is played in."""
+        """The replica that receives the server's messages; after a reconnect, `_play` uses the old one until this one
+        is complete."""
         self._play: Play | None = None
         self._orders = Orders()
         self._out: list[bytes] = []
         self._events = PendingEvents()
         self._held = PendingEvents()
-        """What the game has told before the player is in, or back in."""
+        """Game events that arrived before `Joined` or `Resumed`, and follow it."""
         self._told = 0
-        """Events of the game for this player that have come, or are known to be lost."""
+        """Number of game events for this player that have arrived, or are known to be lost."""
         self._pings: deque[float] = deque(maxlen=16)
 
     @property
     def prediction(self) -> Prediction | None:
-        """The world as it is known and as it is predicted; None before there is a welcome."""
+        """The confirmed and the predicted world; None before the welcome."""
         world = self._world
         return world.prediction if world else None
 
     @property
     def entity(self) -> int:
-        """The own entity; 0 before there is a welcome."""
+        """The number of the own entity; 0 before the welcome."""
         world = self._world
         return world.prediction.entity if world else 0
 
     @property
     def clock(self) -> ServerClock:
-        """The server's time."""
+        """The estimate of the server time."""
         world = self._world
         return world.clock if world else ServerClock()
 
     @property
     def timeline(self) -> Timeline | None:
-        """The own time; None before it has `Joined`."""
+        """The client's own time in ticks; None before the client has joined."""
         return self._play.timeline if self._play else None
 
     @property
     def _world(self) -> Replica | None:
-        """What is played in, or is going to be."""
+        """The replica that the client plays in; before the play, the one that is being filled."""
         return self._play.world if self._play else self._filled
 
     @property
     def appetite(self) -> int:
-        """So many bytes should be read of the connection at once."""
+        """The number of bytes that the transport should read at once; 0: it should not read now."""
         return READ_BYTES
 
     # -- what comes in -------------------------------------------------------------------------------------
 
     def open(self, now: float) -> None:
-        """The connection is there: says hello."""
+        """Takes a new connection, and sends Hello."""
         if self.state == "closed":
             return
         self._open = True
@@ -150,7 +155,7 @@ class Core:
         self._send(messages.Hello(messages.VERSION, digests, self.name[: messages.NAME_MAX], self._token, self._resume))
 
     def receive(self, data: bytes, now: float) -> None:
-        """One message of the server. One that is malformed closes the connection."""
+        """Takes one message of the server. A malformed message closes the connection."""
         if self.state == "closed" or not self._open:
             return
         self.stats.bytes_down += len(data)
@@ -160,39 +165,40 @@ class Core:
             self._fail(messages.MALFORMED, f"the server sent something malformed: {error}")
 
     def lost(self, code: int, reason: str, now: float) -> None:
-        """The connection is gone, or could not be made."""
+        """Takes the loss of the connection, or the failure of an attempt to connect."""
         if self.state in ("playing", "away"):
-            if self._open or self.comeback.retry_at == math.inf:  # else a `Bye` has told already
+            if self._open or self.comeback.retry_at == math.inf:  # otherwise a `Bye` has already announced it
                 self._cut_off(Left(code, reason, 0.0), now)
         else:
             self._end(Left(code, reason))
 
     def command(self, name: str, data: Any = None) -> int:
-        """Asks the game's rules for something, with the next tick; the number by which it is `Answered`.
+        """Sends a command to the rules of the game, for the next tick. Returns its number, which `Answered` repeats.
 
         Raises:
             RuntimeError: the client has not joined.
-            ValueError: the name or the data are too long (32 characters, 1,024 bytes), or no MessagePack.
+            ValueError: the name or the data are too long (32 characters, 1,024 bytes), or MessagePack cannot hold the
+                data.
         """
         play = self._joined("command")
         return self._order(self._orders.command(play.world.prediction.next_order, play.seen, name, data))
 
     def edit(self, x: SupportsIndex, y: SupportsIndex, z: SupportsIndex, kind: SupportsIndex) -> int:
-        """Places (kind 1 to 255) or removes (0) a block with the next tick; the number by which it is `Answered`.
+        """Places (kind 1 to 255) or removes (0) a block with the next tick. Returns the number of the edit.
 
         Raises:
             RuntimeError: the client has not joined.
-            TypeError: something is not a whole number.
-            EditError: it is out of range (a `ValueError`).
+            TypeError: an argument is not a whole number.
+            EditError: an argument is out of range (a `ValueError`).
         """
         play, edit = self._joined("edit"), edits.checked(x, y, z, kind)
-        payload = edits.pack(edit)  # first: what cannot be sent is not predicted
+        payload = edits.pack(edit)  # before the prediction: an edit that cannot be sent must not be predicted
         number = self._orders.number()
         tick = play.world.prediction.edit(number, edit)
         return self._order(messages.Command(number, tick, play.seen, edits.NAME, payload))
 
     def close(self) -> None:
-        """Says goodbye."""
+        """Leaves the game: sends Bye and asks the transport to close the connection."""
         if self.state != "closed":
             if self._open:
                 self._send(messages.Bye(messages.GOING_AWAY, "", -1.0))
@@ -201,22 +207,22 @@ class Core:
 
     @property
     def wish(self) -> Input:
-        """The input that was set last."""
+        """The input that was set most recently."""
         return self.controls.held
 
     def set_input(self, wish: Input) -> None:
-        """Sets the player's input from the next tick on. A button that is down for a moment counts in that tick.
+        """Sets the player's input from the next tick on. A short press between two ticks counts in the next tick.
 
         Raises:
-            ValueError: it is no `Input`.
+            ValueError: `wish` is not an `Input`.
         """
         self.controls.set(clamp(checked_input(wish, "wish")))
 
     def set_input_delay(self, ticks: int) -> None:
-        """Shows the effect of inputs so many ticks (0 to 3) later than they are sent: fewer and shorter replays.
+        """Sets the input delay: inputs take effect `ticks` ticks (0 to 3) later. More delay means fewer replays.
 
         Raises:
-            ValueError: not 0 to 3.
+            ValueError: `ticks` is not 0 to 3.
         """
         ticks = self._delay = whole(ticks, "ticks", 0, INPUT_DELAY_MAX)
         if self.prediction is not None:
@@ -225,7 +231,7 @@ class Core:
     # -- time ----------------------------------------------------------------------------------------------
 
     def update(self, now: float) -> None:
-        """Sends pings that are due, and predicts every tick whose time has come."""
+        """Starts the play once the world is complete, predicts every tick that is due, and sends pings that are due."""
         if self._plain_for_now and kernels.ready():
             self._speed_up()
         if self._play and self.state != "closed":
@@ -243,16 +249,16 @@ class Core:
             self.controls.forget()
 
     def next_update(self, now: float) -> float:
-        """The local time at which `update` has something to do."""
+        """Returns the local time at which `update` has something to do; `inf`: not before a message arrives."""
         due = self._told_clock.next_ping if self._open else self.comeback.retry_at
         if self._play:
             due = min(due, self._play.next_tick(now))
-        return max(due, now)  # inf: only once something has come in
+        return max(due, now)  # inf: nothing to do until a message arrives
 
     # -- what goes out -------------------------------------------------------------------------------------
 
     def outgoing(self) -> list[bytes]:
-        """The messages to send since the last call."""
+        """Returns the messages to send, and forgets them."""
         if not self._out:
             return []
         out, self._out = self._out, []
@@ -260,18 +266,18 @@ class Core:
         return out
 
     def events(self) -> list[Event]:
-        """What has happened since the last call."""
+        """Returns the events since the last call, oldest first."""
         return self._events.take() if self._events else []
 
     def view(self, now: float) -> View:
-        """What to draw now: the own entity predicted, the others as they were a moment ago."""
+        """Returns what to draw now: the own entity as predicted, the others a little in the past."""
         return self._play.view(now) if self._play else NOTHING
 
     # -- inside --------------------------------------------------------------------------------------------
 
     @property
     def _told_clock(self) -> ServerClock:
-        """That of the server whose messages come now; after a return not yet the one that is played by."""
+        """The clock that belongs to the current connection; after a reconnect, `_play` may still use the old one."""
         return self._filled.clock if self._filled else self.clock
 
     def _take(self, message: messages.Message, now: float) -> None:
@@ -279,7 +285,7 @@ class Core:
             case messages.Snapshot():
                 self._snapshot(message, now)
             case messages.Pong():
-                if message.sent in self._pings:  # anything else is no answer to a ping of ours
+                if message.sent in self._pings:  # otherwise it does not answer a ping of this client
                     self._pings.remove(message.sent)
                     self.stats.pinged(max(now - message.sent, 0.0))
                     self._stepped(self._told_clock.answered(message.sent, message.tick, now), now)
@@ -318,7 +324,7 @@ class Core:
         world = Replica(welcome, self.clock, now, neighbours=self._neighbours, compiled=compiled)
         self.stats.kernel = "plain for now" if self._plain_for_now else world.known.world.kernel.form
         if self.scene is not None and world.scene.digests != self.scene.digests:
-            raise ProtocolError("Welcome.scene: not the scene that was asked for")
+            raise ProtocolError("Welcome.scene: not the scene that the client requested")
         self.scene, self._resume = world.scene, welcome.resume
         self.comeback.spread = welcome.entity
         if self._play and welcome.entity == self.entity:
@@ -331,7 +337,7 @@ class Core:
         self._filled = world
 
     def _speed_up(self) -> None:
-        """Goes on with the chosen kernel, which is there now."""
+        """Replaces the plain kernel by the chosen one, which is ready now."""
         self._plain_for_now = False
         kernel = kernels.get()
         if self._filled is not None:
@@ -359,16 +365,16 @@ class Core:
         self._stepped(world.clock.seen(snapshot.tick, now), now)
 
     def _stepped(self, ticks: float, now: float) -> None:
-        """Follows a step of the time by which the server's messages go; 0: there was none."""
+        """Follows a step of the server's time, by `ticks`; 0: there was none."""
         if not ticks:
             return
-        self._pings.clear()  # their answers are about the time before
+        self._pings.clear()  # answers to earlier pings describe the time before the step
         play = self._play
         if play and play.world.clock is self._told_clock:
             play.stepped(ticks, now)
 
     def _begin(self, world: Replica, now: float) -> None:
-        """As much is known of the world as it takes to play in it: for the first time, or again."""
+        """Starts the play in a complete replica, for the first time or after a reconnect."""
         old = self._play
         same = old is not None and world.take_over(old.world)
         if old is None or old.world.clock is not world.clock:
@@ -388,7 +394,7 @@ class Core:
             self._send(inputs)
 
     def _tell(self, event: Event) -> None:
-        """Hands out what the game tells, behind the `Joined` or `Resumed` that is still to come after a welcome."""
+        """Files a game event. After a welcome, it waits until `Joined` or `Resumed` has been filed."""
         (self._held if self._filled and self.state != "playing" else self._events).append(event)
 
     def _release(self) -> None:
@@ -396,7 +402,7 @@ class Core:
             self._events.append(event)
 
     def _cut_off(self, left: Left, now: float) -> None:
-        """The connection is gone, and there may be another one."""
+        """Starts to reconnect after a lost connection, or ends if the client may not reconnect."""
         self._open, self._filled = False, None
         self._out.clear()
         wait = max(left.wait_s, 0.0)
@@ -412,7 +418,7 @@ class Core:
         return self._play
 
     def _order(self, command: messages.Command) -> int:
-        """Sends it, now or with the next connection; its number."""
+        """Sends a command now, or over the next connection. Returns its number."""
         message = self._orders.file(command)
         if self._open:
             self._out.append(message)

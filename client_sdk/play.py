@@ -1,11 +1,11 @@
-"""One player's ticks, from the first to the last: each has a wish, which is sent and predicted, and later a fate.
+"""The input loop of one player: files, sends and predicts one input per tick, and learns how it fared at the server.
 
-    update   compares the newest snapshot with what was predicted; predicts every tick whose time has come; steers
-    learn    how the inputs fared at the server: what decides how far ahead of it to live
-    view     what to draw
+    update   compares the newest snapshot with the prediction; predicts every tick that is due; steers the timeline
+    learn    takes input statuses and arrival margins from a snapshot; they decide the lead over the server
+    view     returns what to draw
 
-`newest` is the newest tick that has an input. After a lost connection the play goes on in another copy of the world
-(`world`), unless the server's time is another one, too: then there is nothing to go on with, and another play begins.
+`newest` is the newest tick that has an input. After a lost connection, the input loop goes on in a new replica
+(`world`) if the server's time is still the one that it knew. Otherwise nothing of it is valid, and a new `Play` begins.
 """
 
 import math
@@ -37,19 +37,23 @@ from shared.messages import (
 from shared.ring import Ring
 
 ROWS_MAX = 16
-"""Most inputs in one message."""
+"""Limit of the inputs in one message."""
 LEAD_S_MAX = AHEAD_S
-"""A timeline that is certainly further ahead than this, in seconds, starts anew: the server refuses what it sends."""
+"""Longest possible lead in seconds. A timeline that is certainly further ahead starts again, because the server refuses
+its inputs."""
 PAUSED, SILENT, BEHIND, AHEAD = "program paused", "server silent", "server behind", "server ahead"
 PATH, RECONNECTED = "path changed", "reconnected"
-"""Causes of `Resynchronised`."""
+"""Causes of `Resynchronised`, explained there."""
 
 
 class Play:
-    """Begins once `world` is complete; `restart` has to follow.
+    """The input loop of one player. Call `restart` after creating it.
 
     Args:
-        stats, events: are told what happens.
+        world: a complete replica.
+        stats: counters to update.
+        events: receives the events.
+        now: local time in seconds.
     """
 
     def __init__(self, world: Replica, stats: Stats, events: PendingEvents, now: float) -> None:
@@ -58,7 +62,7 @@ class Play:
         self.timeline = Timeline(world.clock.rate, self._lead.start(world.clock, now), now)
         self.newest = -1
         self.seen = 0.0
-        """The tick of the last view of others; of the last update, where nothing is drawn."""
+        """View tick of the latest view, in ticks; of the latest update if the program draws no views."""
         self._draws = False
         self._late = False
         self._silent = False
@@ -70,14 +74,18 @@ class Play:
         self._stats, self._events = stats, events
 
     def restart(self, now: float, cause: str) -> list[Message]:
-        """Begins the prediction at the timeline's tick. Returns what to send: it withdraws inputs of later ticks.
+        """Starts the prediction again at the timeline's tick.
 
         Args:
-            cause: see `Resynchronised`.
+            now: local time in seconds.
+            cause: the cause for `Resynchronised`.
+
+        Returns:
+            The messages to send. A `Restart` withdraws inputs that were sent for later ticks.
         """
         prediction = self.world.prediction
         confirmed = prediction.confirmed.tick
-        # Bounded, whatever the server says of its time: all ticks since the confirmed one are replayed here.
+        # Bounded, even if the server reports a wrong time: all ticks after the confirmed one are replayed here.
         end = confirmed + self._bounds.unconfirmed
         tick = min(max(math.floor(self.timeline.tick(now)), confirmed), end)
         messages: list[Message] = []
@@ -95,37 +103,43 @@ class Play:
         return messages
 
     def stepped(self, ticks: float, now: float) -> None:
-        """Takes notice of a step of the server's time, by so many ticks; the next update follows it.
+        """Notes that the server's time has stepped by `ticks`; the next update follows the step.
 
-        Until a ping sent after the step is answered, margins are about inputs from before it, and teach nothing.
+        Until a ping sent after the step is answered, arrival margins belong to inputs from before it and are ignored.
         """
         self._step += ticks
         self._settling = now
         self.world.picture.interpolation.shift(ticks)
 
     def follow(self, now: float, *, online: bool) -> list[Message]:
-        """Follows the steps of the server's time since the last call. Returns what to send, ahead of any ping."""
+        """Follows the steps of the server's time since the last call. Returns the messages to send before any ping."""
         ticks, self._step = self._step, 0.0
         if not ticks:
             return []
         timeline = self.timeline
         before, timeline.phase = timeline.phase, self._lead.step(self.world.clock) + timeline.own
         self._settling = now
-        self._stepped += timeline.phase - before  # small steps in a row, of a server that stands still, come to a jump
+        self._stepped += timeline.phase - before  # a server that stands still causes many small steps: they add up
         if online and abs(self._stepped) > jump_ticks(timeline.rate):
             self._stepped = 0.0
             return self.restart(now, BEHIND if ticks < 0 else AHEAD)
         return []
 
     def answered(self, sent: float) -> None:
-        """A ping sent at `sent` has been answered, so the server knows what went before it."""
+        """Notes that a ping sent at `sent` was answered, so the server has received everything sent before it."""
         if self._settling is not None and sent > self._settling:
             self._settling, self._settled = None, True
 
     def update(self, now: float, controls: Controls, *, online: bool) -> list[Message]:
-        """Predicts every tick whose time has come, with the input of `controls`; what to send.
+        """Reconciles, then predicts every tick that is due.
 
-        Without a connection (not `online`), nothing new can be known, and nothing is sent.
+        Args:
+            now: local time in seconds.
+            controls: source of the inputs.
+            online: whether there is a connection; without one, nothing is reconciled and nothing is sent.
+
+        Returns:
+            The messages to send.
         """
         world, stats = self.world, self._stats
         clock = world.clock
@@ -141,7 +155,7 @@ class Play:
         stats.snapshot_age_s = max(server_tick - world.prediction.confirmed.tick, 0.0) / clock.rate
         if not online:
             return []
-        # Steered only now: a tick that was due, and for which the program woke up, is not put off by a moment.
+        # Steering comes last, so that it cannot postpone a tick that is due and for which the program woke up.
         if self.timeline.steer(self._lead, clock, now) or self._out_of_bounds(now):
             messages += self.restart(now, PATH)
         if alarm:
@@ -149,33 +163,37 @@ class Play:
         return messages
 
     def next_tick(self, now: float) -> float:
-        """The local time at which there is one to predict; inf: not before something has come in."""
+        """Returns the local time at which the next tick is due; `inf`: not before a snapshot arrives."""
         limits = self._bounds
         end, to = self.world.prediction.confirmed.tick + limits.unconfirmed, math.floor(self.timeline.tick(now))
         waits = self.newest >= end or (to - self.newest > limits.update and to > end)
         return math.inf if waits else self.timeline.when(self.newest + 1)
 
     def view(self, now: float) -> View:
-        """What to draw now."""
+        """Returns what to draw now."""
         view = self.world.picture.view(self.timeline, self.world.clock, now)
         self._draws, self.seen = True, view.seen
         return view
 
     def learn(self, snapshot: Snapshot, now: float) -> None:
-        """How the inputs fared: feeds the lead, and tells whether any of these ticks lacked its own."""
+        """Learns from a snapshot how the inputs fared at the server.
+
+        Arrival margins go to the lead controller. Input statuses are counted, and a missing input sets `_late`, which
+        becomes the cause of a correction.
+        """
         stats, phases, margins, fates = self._stats, self._phases, snapshot.margins, snapshot.fates
         one = self._bounds.margin_one
         for tick, (margin,) in enumerate(iter_unpack("<h", margins), snapshot.newest + 1 - len(margins) // 2):
             phase = phases.get(tick)
             if phase is None:
-                continue  # a tick that was left out
-            if margin == MARGIN_REFUSED:  # it came at least so early
+                continue  # no input was sent for this tick
+            if margin == MARGIN_REFUSED:  # the input was too early, by at least `ahead` ticks
                 stats.inputs_refused += 1
                 margin = math.floor(self._bounds.ahead * one)
             stats.inputs_late += margin < 0
             if self._settling is None:
                 self._lead.observe(tick, margin / one, phase, now)
-        if self._settling is not None or self._settled:  # the server may have used inputs that are withdrawn
+        if self._settling is not None or self._settled:  # the server may have used inputs that were withdrawn
             self._late, self._settled = True, False
         used = fates.count(USED)
         stats.inputs_used += used
@@ -183,7 +201,7 @@ class Play:
             return
         neutralised = fates.count(NEUTRALISED)
         missing = fates.count(REPEATED) + neutralised
-        if IDLE in fates:  # the very first ones came late: until then nothing stood in for them
+        if IDLE in fates:  # the very first inputs were late, and the server had no earlier one to repeat
             ticks = enumerate(fates, snapshot.first)
             missing += sum(fate == IDLE and phases.get(tick) is not None for tick, fate in ticks)
         stats.inputs_substituted += missing
@@ -191,7 +209,7 @@ class Play:
         self._late |= missing > 0
 
     def unheard(self) -> list[Message]:
-        """The inputs that the server may still want, after a lost connection."""
+        """Returns the inputs to send again after a reconnect: those that the server may not have received yet."""
         prediction, newest = self.world.prediction, self.newest
         since = max(self.world.heard, prediction.confirmed.tick, newest - self._bounds.ahead)
         return [
@@ -204,7 +222,10 @@ class Play:
         ]
 
     def _out_of_bounds(self, now: float) -> bool:
-        """Puts the timeline where it began if it is so far off that no input counts. Returns whether it was."""
+        """Sets the timeline to a new start if it is so far off that no input can count. Returns whether it was.
+
+        It is too far off if its phase is behind the confirmed tick, or more than `LEAD_S_MAX` ahead of the server.
+        """
         clock, timeline = self.world.clock, self.timeline
         reached = self.world.prediction.confirmed.tick - timeline.rate * now
         if reached <= timeline.phase <= clock.phase + (LEAD_S_MAX + clock.rtt_s / 2) * timeline.rate:
@@ -214,8 +235,11 @@ class Play:
         return True
 
     def _reconcile(self, now: float) -> bool:
-        """Compares the prediction with the newest snapshot, once per update, however many have come; whether the
-        copy of the world has to be fetched anew."""
+        """Compares the prediction with the newest snapshot, once per update even if several have arrived.
+
+        Returns:
+            Whether the confirmed world is wrong and has to be fetched again.
+        """
         world, stats = self.world, self._stats
         done = world.prediction.reconcile(self._late)
         self._late = False
@@ -236,7 +260,11 @@ class Play:
         return True
 
     def _predict(self, now: float, controls: Controls) -> list[Message]:
-        """Files an input for every tick up to now, and predicts up to there but for the input delay; what to send."""
+        """Files an input for every tick up to now, and predicts up to that tick minus the input delay.
+
+        Returns:
+            The messages to send.
+        """
         prediction, timeline, stats = self.world.prediction, self.timeline, self._stats
         confirmed, to = prediction.confirmed.tick, math.floor(timeline.tick(now))
         end = confirmed + self._bounds.unconfirmed
@@ -248,7 +276,7 @@ class Play:
         inputs: list[Message] = []
         self._silent = to > end
         to = min(to, end)
-        first = self.newest + 1  # an input for the past is sent, too: its margin says how much earlier it should be
+        first = self.newest + 1  # late inputs are sent, too: their margins show how much more lead is needed
         self.newest = max(to, first - 1)
         if to >= first:
             clock, phase = self.world.clock, timeline.phase
@@ -258,7 +286,7 @@ class Play:
                 wish = controls.take()
                 prediction.file(tick, wish)
                 rows += row(wish)
-                # How late the program itself was with it is no need of the path.
+                # Delays of a slow program are left out of the phase, because the path did not cause them.
                 self._phases.put(tick, phase - (timeline.tick(now) - tick) if timeline.own else phase)
             stats.inputs_sent += to + 1 - first
             stats.lead_ticks = phase - clock.phase

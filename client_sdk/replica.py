@@ -1,4 +1,11 @@
-"""What a client knows of a server: the world around the player, from the welcome on, and the server's time."""
+"""The replica: everything that a client knows of one server since the welcome.
+
+Theory of operation. A replica joins the confirmed world, which snapshots and terrain write; the prediction on top of
+it; the picture, which makes views of both; and the clock, which estimates the server's time. After a lost connection,
+the client keeps playing in the old replica while the messages of the new connection fill a second one. Once the second
+is complete (`complete`), it takes over the inputs and edits of the first (`take_over`). Both share one clock if the new
+welcome agrees with it within `CLOCK_S` seconds: then the client's timeline goes on.
+"""
 
 from client_sdk.clock import ServerClock
 from client_sdk.confirmed import Confirmed
@@ -11,16 +18,19 @@ from shared.messages import ProtocolError, Snapshot, Terrain, Welcome
 from shared.scene import Scene
 
 CLOCK_S = 1.0
-"""A server whose time is this far from what it was believed to be is not the same one any more, or was away."""
+"""Largest difference in seconds between the known server time and the one in a welcome. Beyond it, the server was
+restarted or stood still, and the client starts a new clock."""
 
 
 class Replica:
-    """Is filled by messages; after a return beside the one that is still played in.
+    """A copy of the server's world, which messages fill, with its prediction, its picture and its clock.
 
     Args:
-        clock: that of the server known before, which may be the same one.
-        neighbours: see `Prediction`.
-        compiled: see `World`.
+        welcome: the message that the connection began with.
+        clock: the clock of the connection before; it stays in use if the welcome agrees with it.
+        now: local time in seconds.
+        neighbours: whether the predicted world has other entities, so that blocking each other is predicted.
+        compiled: True for a compiled kernel, False for the plain one, None for the chosen one.
 
     Raises:
         ProtocolError: the welcome is malformed.
@@ -38,27 +48,30 @@ class Replica:
             self.clock = ServerClock()
             self.clock.rate = float(self.scene.tick_rate)
         self.heard = -1
-        """The newest tick that the server has an input for."""
+        """Newest tick for which the server has received an input; -1 before the first snapshot."""
         self.wrong = ""
-        """What is not as the server has it, if anything."""
+        """Text that names a difference from the server's world, for `Diverged`; empty if there is none."""
         self._pieces: tuple[Cell, bytearray] = ((0, 0, 0), bytearray())
 
     def use(self, kernel: Kernel) -> None:
-        """Goes on with another kernel."""
+        """Replaces the kernel of both worlds."""
         self.prediction.confirmed.use(kernel)
         self.prediction.predicted.use(kernel)
 
     @property
     def complete(self) -> bool:
-        """Whether enough is known to play: the time, the own entity and the ground around it."""
+        """Whether enough is known to play: the server's time, the own entity and the terrain around it."""
         known = self.known
         return self.clock.ready and known.entity in known.world and known.grounded()
 
     def terrain(self, terrain: Terrain) -> Cell | None:
-        """A piece of a segment; the segment, if it was the last. Edits that came in between are made up for.
+        """Takes a piece of a segment's terrain. Edits that arrived between the pieces are applied to it.
+
+        Returns:
+            The segment if it is complete now, otherwise None.
 
         Raises:
-            ProtocolError: a piece is missing, or these are no blocks.
+            ProtocolError: a piece is missing, or the pieces do not contain valid blocks.
         """
         segment = (terrain.x, terrain.y, terrain.z)
         if terrain.offset == 0:
@@ -77,10 +90,10 @@ class Replica:
         return segment
 
     def skipped(self, snapshot: Snapshot) -> int:
-        """The ticks between the snapshot before and this one.
+        """Returns the number of ticks between the snapshot before and this one.
 
         Raises:
-            ProtocolError: it is not newer.
+            ProtocolError: this one is not newer.
         """
         world = self.known.world
         if snapshot.tick <= world.tick:
@@ -88,10 +101,10 @@ class Replica:
         return snapshot.tick - world.tick - 1 if len(world) else 0
 
     def apply(self, snapshot: Snapshot) -> None:
-        """The confirmed world becomes that of the snapshot.
+        """Writes a snapshot into the confirmed world, and adds the states to the interpolation history.
 
         Raises:
-            ProtocolError: a part of it is malformed.
+            ProtocolError: a part of the snapshot is malformed.
         """
         self.heard = max(self.heard, snapshot.newest)
         self.wrong = self.known.apply(snapshot) or self.wrong
@@ -99,8 +112,12 @@ class Replica:
         self.picture.interpolation.push(snapshot.tick, self.known.states, placed or frozenset())
 
     def take_over(self, old: "Replica") -> bool:
-        """Takes the place of an earlier copy; whether the own entity is the same, so that what it does goes on."""
-        self.wrong = self.wrong or old.wrong  # an alarm is not lost with the connection
+        """Takes the place of an earlier replica, and its inputs and edits if the own entity is the same.
+
+        Returns:
+            Whether the own entity is the same.
+        """
+        self.wrong = self.wrong or old.wrong  # an alarm must survive the reconnect
         same = self.prediction.entity == old.prediction.entity
         if same:
             self.prediction.adopt(old.prediction)
@@ -108,14 +125,14 @@ class Replica:
 
 
 def check_scene(table: object) -> Scene:
-    """The scene in a welcome.
+    """Returns the scene of a welcome.
 
     Raises:
-        ProtocolError: it is not a scene.
+        ProtocolError: `table` is not a valid scene.
     """
     try:
         scene = Scene.from_table(table)  # type: ignore[arg-type]
-        assert scene.digests  # computed here, where a table that cannot be is refused
+        assert scene.digests  # computes the digests now, so that an impossible table is refused here
         return scene
     except (ValueError, TypeError, RecursionError) as error:
         raise ProtocolError(f"Welcome.scene: {error}") from error

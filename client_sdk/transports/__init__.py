@@ -1,1 +1,1 @@
-"""What carries a client's bytes: thin adapters around one `connection.Connection`."""
+"""Transports: thin adapters that move the bytes of a `connection.Connection` between a client and a server."""

@@ -1,10 +1,10 @@
-"""The same client under asyncio: no task per connection, one timer, and one call per chunk of bytes.
+"""The client for asyncio: no task per connection, one timer, and one call per chunk of bytes.
 
     client = await AsyncClient.connect("ws://localhost:8765", name="Ann")
     async for event in client:
         ...
 
-Time is `time.monotonic()`: an event loop's own may be as coarse as a millisecond.
+Time is `time.monotonic()`: an event loop's own clock may be as coarse as a millisecond.
 """
 
 import asyncio
@@ -37,20 +37,24 @@ from shared.checks import duration
 from shared.scene import Scene
 
 TIMEOUT_S = 5.0
+"""Time that a handshake may take, in seconds."""
 WAIT_S_MIN = 0.001
-"""Timers are that coarse: an update is never asked for earlier."""
+"""Shortest time to the next update, in seconds: timers are no finer."""
 WAIT_S_MAX = 1.0
-"""And never later: a connection wants to be looked at (`Connection.look`)."""
+"""Longest time to the next update, in seconds: `Connection.look` has to be called about once per second."""
 
 
 class AsyncClient(BaseClient):
-    """A player on a server, which lives in an event loop: it predicts and sends by itself.
+    """A player on a server, for an event loop: the client predicts and sends by itself.
 
-    Use `connect`. `async for event in client` gives what happens and ends after `Left`. Too many events that wait are
-    dropped, see `EventsDropped`.
+    Create it with `AsyncClient.connect`. `async for event in client` returns its events and ends after `Left`. If more
+    than 10,000 events wait, the oldest are dropped, and `EventsDropped` counts them.
 
     Args:
-        before_update: called with the core before each tick is predicted, so that it can set the input.
+        core: the client's state machine.
+        url: address of the server.
+        before_update: called with the core before each update while the client plays, so that it can set the input.
+        tls: certificates to trust for wss://; None: those that the system trusts.
     """
 
     def __init__(
@@ -89,10 +93,24 @@ class AsyncClient(BaseClient):
         link: str | Path | None = None,
         before_update: Callable[[Core], None] | None = None,
     ) -> "AsyncClient":
-        """As `Client.connect`; does not block.
+        """Connects to a server. Returns as soon as the server has answered; the client then joins by itself.
+
+        Args:
+            url: address of the server, like ws://localhost:8765.
+            name: the player's name, shown to others, up to 32 characters.
+            scene: the scene that this program was built for. If the server plays another one, the client gets `Left`.
+                None: the client accepts the server's scene.
+            token: proves the client's identity, if the server asks for it.
+            patience_s: the client tries to reconnect for this long after a lost connection, in seconds; 0: it does not
+                reconnect.
+            timeout: the longest time to wait for the server's answer, in seconds.
+            tls: certificates to trust for wss://; None: those that the system trusts.
+            link: a simulated link: the name of a preset, or a `Path`; None: none.
+            before_update: called with the core before each update while the client plays, so that it can set the input.
 
         Raises:
-            ConnectError: there is no connection; the text says why and what to do.
+            ValueError: an argument is not valid.
+            ConnectError: there is no connection; the text says why, and what to do.
         """
         COMPILER.begin()
         core = LinkedCore(name, scene, token=token, patience_s=patience_s)
@@ -111,33 +129,50 @@ class AsyncClient(BaseClient):
         return client
 
     def edit(self, x: int, y: int, z: int, kind: int) -> int:
-        """Places (`kind` 1 to 255) or removes (0) a block, as `Client.edit`; the number by which it is `Answered`.
+        """Places or removes one block with the next tick. The client predicts the change and shows it at once.
+
+        Args:
+            x: east, in blocks.
+            y: north, in blocks.
+            z: up, in blocks.
+            kind: the block to place, 1 to 255; 0 removes the block.
+
+        Returns:
+            The number of the edit. The event `Answered` with this number brings the result.
 
         Raises:
             RuntimeError: the client has not joined.
-            TypeError: something is not a whole number.
+            TypeError: an argument is not a whole number.
+            ValueError: an argument is out of range.
         """
         number = self.core.edit(x, y, z, kind)
         self._pump(time.monotonic())
         return number
 
     def command(self, name: str, data: Any = None) -> int:
-        """Asks the game's rules for something, as `Client.command`; the number by which it is `Answered`.
+        """Sends a request to the rules of the game, which define what `name` and `data` mean.
+
+        Args:
+            name: name of the command, up to 32 characters.
+            data: any value that MessagePack can hold, up to 1,024 bytes when packed.
+
+        Returns:
+            The number of the command. The event `Answered` with this number brings the result.
 
         Raises:
             RuntimeError: the client has not joined.
-            ValueError: the name or the data are too long, or no MessagePack.
+            ValueError: the name or the data are too long, or MessagePack cannot hold the data.
         """
         number = self.core.command(name, data)
         self._pump(time.monotonic())
         return number
 
     def view(self) -> View:
-        """What to draw now; positions in blocks."""
+        """Returns what to draw now; positions in blocks, velocities in blocks/s."""
         return self.core.view(time.monotonic())
 
     async def close(self, timeout: float = 1.0) -> None:
-        """Says goodbye, and waits for the server to do so for at most `timeout` seconds. Again: does nothing."""
+        """Leaves the game, and waits at most `timeout` seconds until the server closes. A second call does nothing."""
         self.core.close()
         if self._redialing is not None:
             self._redialing.cancel()
@@ -165,12 +200,12 @@ class AsyncClient(BaseClient):
     ) -> None:
         await self.close()
 
-    # -- what the stream and the timer call ------------------------------------------------------------------
+    # -- called by the stream and the timer ------------------------------------------------------------------
 
     def _made(self, transport: asyncio.Transport) -> None:
         self._transport = transport
         transport.set_write_buffer_limits(UNSENT_MAX)
-        if self.core.appetite < READ_BYTES:  # what does not fit on a slow line stays with the server
+        if self.core.appetite < READ_BYTES:  # with a slow simulated link, unread bytes wait at the server
             transport.get_extra_info("socket").setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 0)
         self._pump(time.monotonic())
 
@@ -183,7 +218,7 @@ class AsyncClient(BaseClient):
             self._schedule(now)
 
     def _read_on(self) -> None:
-        """Reads while the core has an appetite."""
+        """Pauses reading while the core's `appetite` is 0, and resumes it afterwards."""
         transport, hungry = self._transport, self.core.appetite > 0
         if transport is None or hungry == transport.is_reading():
             return
@@ -193,7 +228,7 @@ class AsyncClient(BaseClient):
             transport.pause_reading()
 
     async def _dial(self, timeout: float) -> None:
-        """Connects, and waits until the server has answered."""
+        """Connects, and waits at most `timeout` seconds until the server has answered."""
         connection, uri = self._connection, self._connection.uri
         async with asyncio.timeout(timeout):
             await self._loop.create_connection(
@@ -202,12 +237,12 @@ class AsyncClient(BaseClient):
             await self._answered
 
     async def _redial(self) -> None:
-        """Connects again; where that fails, the core says when to try next."""
+        """Reconnects once. After a failure, the core decides when to try again."""
         connection = self._connection = Connection(self._connection.url, self.core)
         self._answered, self._gone = self._loop.create_future(), self._loop.create_future()
         try:
             await self._dial(TIMEOUT_S)
-        except OSError as error:  # a ConnectError, an SSLError and a TimeoutError are such
+        except OSError as error:  # includes ConnectError, SSLError and TimeoutError
             if connection.refused is None:
                 connection.broke(f"no connection ({str(error) or 'no answer in time'})", time.monotonic())
             self._drop()
@@ -237,7 +272,7 @@ class AsyncClient(BaseClient):
         try:
             if self._before_update is not None and core.state == "playing":
                 self._before_update(core)
-        finally:  # an error in there is the loop's to tell; the player goes on
+        finally:  # asyncio reports an exception of `before_update`; the client goes on
             self._advance(now)
 
     def _advance(self, now: float) -> None:
@@ -259,7 +294,7 @@ class AsyncClient(BaseClient):
             self._set_timer(self._due - now, self._update)
 
     def _pump(self, now: float) -> None:
-        """Writes what there is to write, hands events on, and acts on a change of state."""
+        """Writes what waits, passes events on, and acts on a change of state."""
         connection, core = self._connection, self.core
         data = connection.data_to_send(now)
         if self._transport is not None and data:
@@ -294,7 +329,7 @@ class AsyncClient(BaseClient):
 
 
 class _Stream(asyncio.Protocol):
-    """asyncio's side of one connection of a client; what comes of an earlier one is not heard."""
+    """The asyncio protocol of one connection of a client. It ignores calls after the client has reconnected."""
 
     def __init__(self, client: AsyncClient, connection: Connection) -> None:
         self._client, self._connection = client, connection
@@ -304,7 +339,7 @@ class _Stream(asyncio.Protocol):
         return self._client._connection is self._connection
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        self._client._made(cast("asyncio.Transport", transport))  # uvloop's are no subclass of it
+        self._client._made(cast("asyncio.Transport", transport))  # a transport of uvloop is not a subclass of it
 
     def data_received(self, data: bytes) -> None:
         if self._current:

@@ -1,12 +1,13 @@
-"""A core and a WebSocket put together: bytes of the stream in, bytes of the stream out, no socket.
+"""A core joined to a WebSocket: bytes of the TCP or TLS stream in, bytes of the stream out, no socket.
 
-    connecting   the handshake's request is out
+    connecting   the request of the handshake is sent
     open         the core sends and receives
-    ending       a close frame is out or in, or the stream broke off; the core knows, the stream may last a little
-    done         the stream is to be closed
+    ending       a close frame was sent or received, or the stream broke off; the core is notified, and the stream may
+                 stay open for a little longer
+    done         the transport has to close the stream
 
-websockets does the framing (its Sans-I/O `ClientProtocol`); this is all that both adapters have in common, so that
-they are left with a socket each. Nothing is compressed: no extension is offered.
+The library websockets does the framing (its Sans-I/O `ClientProtocol`). This module has all that the transports have
+in common, so that each of them adds only a socket. Nothing is compressed: the client offers no extension.
 """
 
 import math
@@ -25,23 +26,26 @@ from shared.checks import shown
 from shared.messages import MESSAGE_MAX, REASON_MAX, TEXT, TOO_SLOW
 
 UNSENT_MAX = 64 * 1024
-"""Bytes that may wait for a server that does not read, some 90 s of 32 inputs each; more end the connection."""
+"""Limit of the bytes that wait for a server that does not read: about 90 s of 32 inputs per second. Beyond it, the
+client gives the connection up."""
 SILENCE_S = 10.0
-"""A server that is not heard for so long is gone, or the way to it is: TCP alone may take 15 minutes to say so."""
+"""Time without any bytes from the server after which the connection counts as lost, in seconds. TCP alone may take 15
+minutes to report a server that is gone."""
 LOOK_S = 1.0
-"""No more than this counts between two looks: a program that was busy or asleep has heard nothing, which is no sign."""
+"""Longest time between two calls of `Connection.look` that counts as silence, in seconds: a program that was busy or
+asleep could not receive anything."""
 CLOSE_S = 2.0
-"""A server that does not finish closing by then is left without its goodbye."""
+"""Time that a server gets to finish the closing handshake, in seconds; then the client closes the stream anyway."""
 REFUSALS = (403, 429, 503)
-"""HTTP statuses with which a server refuses a client, in words."""
+"""HTTP statuses with which a server refuses a client and sends the reason as text."""
 REASON_BYTES_MAX = 123
-"""A close frame has room for no more."""
+"""Room for the reason in a close frame, in bytes (RFC 6455)."""
 
 
 class ConnectError(ConnectionError):
-    """There is no connection; the text says why, and what to do about it.
+    """The client could not connect; the text says why, and what to do.
 
-    `wait_s`: the server asks to try again in so many seconds; negative: it does not.
+    `wait_s` is the time after which the server asks to try again, in seconds; negative if it does not ask.
     """
 
     def __init__(self, text: str, wait_s: float = -1.0) -> None:
@@ -53,10 +57,11 @@ class Connection:
     """One WebSocket connection of a core.
 
     Args:
-        url: where the server is, like ws://host:8765.
+        url: address of the server, like ws://host:8765.
+        core: the state machine whose messages are sent and received.
 
     Raises:
-        ConnectError: that is not the address of a server.
+        ConnectError: `url` is not the address of a server.
     """
 
     def __init__(self, url: str, core: Core) -> None:
@@ -64,10 +69,10 @@ class Connection:
         self.uri = _parse(url)
         self.core = core
         self.refused: ConnectError | None = None
-        """Why there will be no connection; None: there is one, or there may be one."""
+        """The error with which the handshake failed; None while it may still succeed, and after it has succeeded."""
         self._protocol = ClientProtocol(self.uri, max_size=MESSAGE_MAX)
         self._protocol.send_request(self._protocol.connect())
-        self._began = b""  # how the answer begins
+        self._began = b""  # the first bytes of the server's answer, at most two
         self._fragments = bytearray()
         self._ending_since: float | None = None
         self._looked = math.inf
@@ -75,23 +80,23 @@ class Connection:
 
     @property
     def opened(self) -> bool:
-        """Whether the handshake has succeeded (however long ago)."""
+        """Whether the handshake has succeeded; stays true when the connection ends."""
         return self._protocol.handshake_exc is None and self._protocol.state.value >= OPEN.value
 
     def done(self, now: float) -> bool:
-        """Whether the stream is to be closed."""
+        """Whether the transport has to close the stream now."""
         if self._ending_since is None:
             return False
         return self._protocol.state is CLOSED or now - self._ending_since > CLOSE_S
 
     def receive(self, data: bytes | bytearray | memoryview, now: float) -> None:
-        """What has come from the stream. Call `data_to_send` after it."""
+        """Takes bytes that have arrived on the stream. Call `data_to_send` afterwards."""
         protocol = self._protocol
         self._silent_s = 0.0
         if protocol.reader.eof:
             return
         self._began = self._began or bytes(data[:2])
-        protocol.receive_data(data)  # type: ignore[arg-type]  # it appends, so a view does as well
+        protocol.receive_data(data)  # type: ignore[arg-type]  # it copies the bytes, so a memoryview works, too
         for event in protocol.events_received():
             if isinstance(event, Frame):
                 self._take(event, now)
@@ -100,29 +105,37 @@ class Connection:
         self._check(now)
 
     def look(self, now: float) -> None:
-        """Gives the connection up where the server has been silent for long. Call it every second or more often, when
-        all that has come has been taken in."""
+        """Gives the connection up if the server was silent for more than `SILENCE_S` seconds.
+
+        Call it at least once per second, after all bytes that have arrived were passed to `receive`.
+        """
         self._silent_s += min(max(now - self._looked, 0.0), LOOK_S)
         self._looked = now
         if self.core.appetite == 0 or not self.opened or self._ending_since is not None:
             self._silent_s = 0.0
         elif self._silent_s > SILENCE_S:
-            self.broke(f"nothing heard for {SILENCE_S:g} s", now)
+            self.broke(f"nothing received for {SILENCE_S:g} s", now)
 
     def receive_eof(self, now: float) -> None:
-        """The stream has come to its end."""
+        """Takes the end of the stream: the server has closed it."""
         self._protocol.receive_eof()
         self._check(now)
 
     def broke(self, reason: str, now: float, code: int = CloseCode.ABNORMAL_CLOSURE) -> None:
-        """The stream is unusable: nothing more will be read from it or written to it."""
+        """Ends the connection because the stream is unusable; nothing more is read from it or written to it.
+
+        Args:
+            reason: the cause, for the player.
+            now: time in seconds.
+            code: close code that the core gets.
+        """
         self._protocol.receive_eof()
         self.refused = self.refused or (None if self.opened else self._refusal(reason))
         self.core.lost(code, reason, now)
         self._check(now)
 
     def data_to_send(self, now: float) -> bytes:
-        """What to write to the stream."""
+        """Returns the bytes to write to the stream."""
         protocol = self._protocol
         if protocol.state is OPEN:
             for message in self.core.outgoing():
@@ -149,13 +162,13 @@ class Connection:
             self.core.lost(TEXT, f"{self.url} is not a Sovereign Netcode server: it sends text", now)
 
     def _refusal(self, reason: str = "") -> ConnectError | None:
-        """Why there was no answer, or none of HTTP; None: there was one."""
+        """Returns the error for a handshake without an HTTP answer; None if there was such an answer."""
         if not self.uri.secure and self._began in (b"", TLS_ALERT):
             reason = f"{reason or 'no answer, the connection was closed'}; if the server speaks TLS, use wss://"
         return ConnectError(f"{self.url}: {reason}") if reason else None
 
     def _check(self, now: float) -> None:
-        """Tells the core, at once, that it is over; and why there is no connection, if it never began."""
+        """Notifies the core once when the connection ends, and sets `refused` if the handshake failed."""
         protocol = self._protocol
         if protocol.handshake_exc is not None and self.refused is None:
             self.refused = self._refusal() or _refusal(self.url, protocol.handshake_exc)
@@ -175,12 +188,12 @@ class Connection:
 
 
 def stalled(connection: Connection, now: float) -> None:
-    """The server has stopped reading: gives the connection up rather than let what is unsent pile up."""
+    """Gives up a connection whose server has stopped reading, so that unsent bytes do not pile up."""
     connection.broke(f"the server has stopped reading ({UNSENT_MAX >> 10} KiB wait for it)", now, TOO_SLOW)
 
 
 def unreachable(connection: Connection, error: OSError) -> ConnectError:
-    """An error for a stream that could not be opened."""
+    """Returns the error for a stream that could not be opened."""
     uri = connection.uri
     if isinstance(error, ConnectionRefusedError):
         why = f"no server there (connection refused); start one with: sovereign-server --port {uri.port}"
@@ -192,19 +205,19 @@ def unreachable(connection: Connection, error: OSError) -> ConnectError:
 
 
 def insecure(connection: Connection, error: ssl.SSLError) -> ConnectError:
-    """An error for a stream over which no TLS could be spoken."""
+    """Returns the error for a TLS handshake that failed."""
     why = getattr(error, "verify_message", "")
     return ConnectError(untrusted(connection.url, error.reason or str(error), why))
 
 
 def checked_tls(tls: object) -> ssl.SSLContext | None:
-    """The trust that a program has given, or None for the system's.
+    """Returns the argument `tls` of a program, which is an `ssl.SSLContext`, or None for the system's certificates.
 
     Raises:
         ValueError: it is something else.
     """
     if tls is not None and not isinstance(tls, ssl.SSLContext):
-        raise ValueError(f"tls = {shown(tls)}: must be an ssl.SSLContext, or None to trust whom the system trusts")
+        raise ValueError(f"tls = {shown(tls)}: must be an ssl.SSLContext, or None for the system's certificates")
     return tls
 
 
@@ -214,7 +227,7 @@ def _parse(url: object) -> WebSocketURI:
         raise ConnectError(f"url = {shown(url)}: must be a text; {hint}")
     try:
         uri = parse_uri(url)
-        urlsplit(url).port  # noqa: B018  # raises for a port that is none
+        urlsplit(url).port  # noqa: B018  # raises ValueError for an invalid port
     except InvalidURI as error:
         raise ConnectError(f"{url!r}: {error.msg}; {hint}") from error
     except ValueError as error:
@@ -223,7 +236,7 @@ def _parse(url: object) -> WebSocketURI:
 
 
 def _refusal(url: str, error: Exception) -> ConnectError:
-    """Why a handshake has failed: what a server of ours says, or that there is none."""
+    """Returns the error for a failed handshake: the reason that our server sent, or that it is another server."""
     answer = str(error)
     if isinstance(error, InvalidStatus):
         response = error.response

@@ -1,11 +1,11 @@
-"""A server within the program: single player, and tests of one's own game. No socket, no thread.
+"""A server within the program, for single player and for tests of a game. No socket, no thread.
 
     client = Loopback(Game(scene, rules=rules)).join("Ann")
 
-Theory of operation. Time is what the clients' calls say: whoever polls lets the game do the ticks that have come, each
-at its own time, so a program that hands in its own `now` plays as fast as it can and the same again every time. All
-clients of one game have to go by one clock. Where nobody has called for `LEAP_S`, the program stood still and so did
-the world: players come back to it as after a lost connection.
+Theory of operation. Time is the `now` of the clients' calls. Each call runs the ticks of the game that are due, each at
+its own deadline. So a program that passes its own `now` plays as fast as it can, and every run gives the same result.
+All clients of one game have to use one clock. If no call came for `LEAP_S` seconds, the program stood still, and so did
+the world: the missed ticks are dropped, and the players reconnect as after a lost connection.
 """
 
 import math
@@ -18,33 +18,34 @@ from shared.checks import SceneError, shown
 from shared.scene import Scene
 
 LEAP_S = 2.0
+"""Time without a call after which the program counts as having stood still, in seconds."""
 GONE = 1006
-"""What WebSockets call a connection that broke off."""
+"""Close code of a WebSocket that broke off (RFC 6455)."""
 
 
 class Host(Protocol):
-    """What a game has to offer; `server.game.Game` does."""
+    """The interface of a game that a loopback runs; `server.game.Game` has it."""
 
     scene: Scene
 
     def open(self, link: Any, now: float) -> Any:
-        """A connection is there; the session that it is known by."""
+        """Takes a new connection. Returns its session."""
 
     def receive(self, session: Any, data: bytes, now: float) -> None:
-        """One message of a client."""
+        """Takes one message of a client."""
 
     def lost(self, session: Any, now: float) -> None:
-        """The connection is gone."""
+        """Takes the loss of a connection."""
 
     def tick(self, deadline: float, now: float) -> None:
-        """One tick, due at `deadline`."""
+        """Runs one tick, which is due at `deadline`."""
 
 
 class Loopback:
-    """A game and its time.
+    """A game with its clock and its clients.
 
     Args:
-        game: is played from the first poll of a client on, and by nobody else.
+        game: the game to run, from the first poll of a client on; nothing else may call its `tick`.
     """
 
     def __init__(self, game: Host) -> None:
@@ -56,15 +57,15 @@ class Loopback:
         self._ticks = 0
 
     def join(self, name: str = "", *, token: str = "", link: str | Path | None = None) -> Client:
-        """A further player, who is in after some polls and updates: half a second of them.
+        """Adds a player and returns its client, which joins within about half a second of polls and updates.
 
         Args:
-            name: shown to others, up to 32 characters.
-            token: for a game that asks for one.
-            link: see `Client.link`.
+            name: the player's name, shown to others, up to 32 characters.
+            token: proves the client's identity, if the game asks for it.
+            link: a simulated link: the name of a preset, or a `Path`; None: none.
 
         Raises:
-            ValueError: there is no such link; or the name or the token is no text that UTF-8 can hold.
+            ValueError: no preset has the name in `link`; or UTF-8 cannot hold the name or the token.
         """
         core = LinkedCore(name, token=token, patience_s=PATIENCE_S)
         core.link = link
@@ -73,7 +74,7 @@ class Loopback:
         return Client(core, seat)
 
     def advance(self, now: float) -> None:
-        """Does the ticks that have come."""
+        """Runs the ticks that are due."""
         tick_s = 1.0 / self.game.scene.tick_rate
         if now > self._began + self._ticks * tick_s + LEAP_S:
             for seat in self._seats:
@@ -89,7 +90,7 @@ class Loopback:
 
 
 class _Wire:
-    """The way to a client, as the game sees it."""
+    """The connection to a client, as the game sees it."""
 
     def __init__(self, core: LinkedCore) -> None:
         self._core = core
@@ -107,7 +108,7 @@ class _Wire:
 
 
 class _Seat:
-    """One client's transport."""
+    """The transport of one client."""
 
     def __init__(self, loopback: Loopback, core: LinkedCore) -> None:
         self._loopback, self._game, self._core = loopback, loopback.game, core
@@ -119,7 +120,8 @@ class _Seat:
     def poll(self, now: float) -> None:
         self._advance(now)
         core = self._core
-        # Only once to join: that this was refused is heard later, where there is a `link`.
+        # A joining client opens one connection only: with a `link`, a refusal arrives later, and the state is still
+        # "joining" until then.
         if self._session is None and (
             not self._opened if core.state == "joining" else core.state == "away" and now >= core.comeback.retry_at
         ):
@@ -145,7 +147,7 @@ class _Seat:
         self._loopback._leave(self)
 
     def leap(self, now: float) -> None:
-        """The program stood still: as if the connection had been lost, for whoever has joined."""
+        """Ends the connection of a client that plays, because the program stood still; the client reconnects."""
         if self._session is not None and self._core.state == "playing":
             self._end(now)
             self._core.lost(GONE, "the program stood still", now)

@@ -1,4 +1,4 @@
-"""One non-blocking socket, looked at when the game says so: no thread, no event loop."""
+"""The transport of `Client`: one non-blocking socket, which the game's loop polls. No thread, no event loop."""
 
 import contextlib
 import errno
@@ -13,18 +13,22 @@ from client_sdk.core import READ_BYTES
 from client_sdk.transports.connection import UNSENT_MAX, Connection, insecure, stalled, unreachable
 
 READS_MAX = 32
-"""Reads per poll, 2 MiB: a game that was away for long does not hang in one poll."""
+"""Limit of the reads per poll, together 2 MiB, so that one poll stays short after a long pause of the game."""
 UNDER_WAY = (0, errno.EINPROGRESS, errno.EWOULDBLOCK)
-"""What a non-blocking connect says that goes on; the last is Windows'."""
+"""Results of a non-blocking connect that has begun or succeeded; Windows returns EWOULDBLOCK."""
 NOT_NOW = (BlockingIOError, InterruptedError, ssl.SSLWantReadError, ssl.SSLWantWriteError)
+"""Exceptions of a non-blocking socket that cannot read or write at the moment."""
 
 
 class PollingTransport:
-    """A connection over one non-blocking TCP socket (TLS for wss://), and another one after it is lost.
+    """A connection over one non-blocking TCP socket (TLS for wss://), and over new ones when it reconnects.
+
+    The constructor blocks until the handshake is done.
 
     Args:
-        timeout: seconds that the handshake may take altogether; until then this blocks.
-        tls: whom to trust for wss://; None: whom the system trusts.
+        connection: the WebSocket whose bytes are moved.
+        timeout: longest time of a handshake with its TCP connect, in seconds.
+        tls: certificates to trust for wss://; None: those that the system trusts.
 
     Raises:
         ConnectError: there is no connection; the text says why.
@@ -49,7 +53,7 @@ class PollingTransport:
             raise
 
     def poll(self, now: float) -> None:
-        """Takes in what has arrived, and writes what there is to write; never blocks."""
+        """Reads what has arrived, writes what waits, and reconnects if it is time to; never blocks."""
         core = self._connection.core
         if self._socket is None and core.state == "away":
             if self._dialing is not None:
@@ -65,7 +69,7 @@ class PollingTransport:
         self.send(now)
 
     def send(self, now: float) -> None:
-        """Writes what there is to write, as far as it goes; never blocks."""
+        """Writes what waits, as far as the socket takes it; never blocks."""
         sock = self._socket
         if sock is None:
             return
@@ -79,7 +83,7 @@ class PollingTransport:
             self._drop()
 
     def close(self, timeout: float) -> None:
-        """Writes what there is to write and waits at most so many seconds for the server to close as well."""
+        """Writes what waits, then waits at most `timeout` seconds until the server closes the connection, too."""
         deadline = time.monotonic() + timeout
         try:
             while self._socket is not None and self._wait(deadline):
@@ -88,7 +92,7 @@ class PollingTransport:
             self._drop()
 
     def _dial(self, now: float) -> None:
-        """Begins to connect anew, to the address that was found the first time."""
+        """Begins to reconnect, to the IP address of the first connection."""
         self._connection = Connection(self._connection.url, self._connection.core)
         self._connection.core.comeback.trying()
         self._dial_until = now + self._timeout
@@ -102,12 +106,12 @@ class PollingTransport:
             self._give_up(error.strerror or str(error), now)
 
     def _dial_on(self, sock: socket.socket, now: float) -> None:
-        """Looks how far that has come."""
+        """Continues a reconnect: checks the TCP connect, then the TLS handshake, and gives up when time is over."""
         try:
             if isinstance(sock, ssl.SSLSocket):
                 sock.do_handshake()
             else:
-                if not any(select.select([], [sock], [sock], 0)):  # Windows tells of a failure apart
+                if not any(select.select([], [sock], [sock], 0)):  # Windows reports a failure in the third list
                     if now > self._dial_until:
                         raise TimeoutError("no answer in time")
                     return
@@ -142,7 +146,7 @@ class PollingTransport:
                 raise unreachable(connection, TimeoutError())
 
     def _wait(self, deadline: float) -> bool:
-        """Waits until there is something to read or write; False once it is too late."""
+        """Waits at most 0.1 s until the socket can read or write. Returns False after the deadline."""
         sock, left = self._socket, deadline - time.monotonic()
         if sock is None or left <= 0:
             return False
@@ -154,7 +158,7 @@ class PollingTransport:
         for _ in range(READS_MAX):
             room = core.appetite
             if room < READ_BYTES:
-                sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, room)  # so that the rest stays with the server
+                sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, room)  # the rest waits at the server
                 if not room:
                     return
             try:
@@ -190,7 +194,11 @@ class PollingTransport:
 
 
 def _connected(connection: Connection, timeout: float, tls: ssl.SSLContext | None) -> socket.socket:
-    """A stream to the server: TCP, in TLS if the address says so."""
+    """Returns a connected socket: TCP, with TLS for wss://.
+
+    Raises:
+        ConnectError: the connection or the TLS handshake failed.
+    """
     uri = connection.uri
     with contextlib.ExitStack() as undo:
         try:

@@ -246,7 +246,7 @@ def test_a_way_that_has_become_silent_ends(run: Run, monkeypatch: pytest.MonkeyP
         client = await AsyncClient.connect(address)
         (left,) = [event async for event in client]
         assert isinstance(left, Left)
-        assert left.reason == "nothing heard for 0.3 s"
+        assert left.reason == "nothing received for 0.3 s"
 
     with silent_server() as address:
         run(scene())

@@ -166,7 +166,7 @@ def test_a_server_that_is_silent_for_long_is_left() -> None:
         pair.connection.look(later + k * LOOK_S)
     assert not pair.core.events()
     pair.connection.look(later + SILENCE_S + LOOK_S)
-    assert pair.left() == Left(CloseCode.ABNORMAL_CLOSURE, "nothing heard for 10 s")
+    assert pair.left() == Left(CloseCode.ABNORMAL_CLOSURE, "nothing received for 10 s")
     assert pair.connection.done(later)
 
 

@@ -227,5 +227,5 @@ def test_a_way_that_has_become_silent_ends(monkeypatch: pytest.MonkeyPatch) -> N
         client = Client.connect(address)
         (left,) = play(client, lambda: client.closed)
     assert isinstance(left, Left)
-    assert left.reason == "nothing heard for 0.3 s"
+    assert left.reason == "nothing received for 0.3 s"
     assert client._transport._socket is None  # type: ignore[attr-defined]
