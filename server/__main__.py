@@ -1,4 +1,4 @@
-"""`python -m server`: see `--help`."""
+"""The entry point of `python -m server`, which does what the command `sovereign-server` does."""
 
 import sys
 

@@ -1,4 +1,4 @@
-"""From settings to what decides on players, and to what speaks TLS for the server."""
+"""The authenticator and the TLS context that the settings of a server name."""
 
 import importlib
 import os
@@ -13,10 +13,10 @@ from server.settings import Settings
 
 
 def authenticator(settings: Settings) -> Authenticator | None:
-    """What decides on players, as the settings say; None: whoever comes may play.
+    """Returns the authenticator that the setting `auth` names; None: anyone may play.
 
     Raises:
-        SettingsError: there is no key, or no such object.
+        SettingsError: there is no key for tokens, or `auth` names nothing that can be called.
     """
     if settings.auth == "none":
         return None
@@ -25,10 +25,10 @@ def authenticator(settings: Settings) -> Authenticator | None:
     module, _, name = settings.auth.partition(":")
     try:
         found: Any = getattr(importlib.import_module(module), name)
-    except (ImportError, AttributeError, TypeError, ValueError) as error:  # the latter two: no name of a module
+    except (ImportError, AttributeError, TypeError, ValueError) as error:  # the last two: not the name of a module
         raise SettingsError(f"auth = {settings.auth!r}: cannot be used ({error})") from error
     if isinstance(found, type):
-        raise SettingsError(f"auth = {settings.auth!r}: is a class; name a function, or an object that can be called")
+        raise SettingsError(f"auth = {settings.auth!r}: is a class; name a function or another callable object")
     try:
         checked_function(found, f"auth = {settings.auth!r}")
     except RulesError as error:
@@ -38,10 +38,10 @@ def authenticator(settings: Settings) -> Authenticator | None:
 
 
 def tls_context(settings: Settings) -> ssl.SSLContext | None:
-    """What speaks TLS for the server; None: nothing does.
+    """Returns the TLS context with the certificate of the settings; None: the server does not use TLS.
 
     Raises:
-        SettingsError: a file cannot be used.
+        SettingsError: the certificate or its key cannot be used.
     """
     if settings.tls_cert is None or settings.tls_key is None:
         return None

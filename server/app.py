@@ -1,4 +1,4 @@
-"""The composition root: settings to a running process, and its end."""
+"""The composition root: makes a server from settings, runs it until a signal, and shuts it down."""
 
 import asyncio
 import contextlib
@@ -40,16 +40,21 @@ from shared.checks import SceneError
 from shared.scene import Scene, load_scene
 
 READY_S = 1.0
-"""Ready is who has begun a tick within so long."""
+"""Seconds. The server is ready if a tick began within this time."""
 COMMANDS = {"token": tokens.main, "check": check.main}
+"""Functions of the other commands of `sovereign-server`, by name."""
 STOP_S = 1.5
-"""The end waits no longer than this for peers to finish closing; with what the disk may take, it is less than 5 s."""
+"""Seconds that the shutdown waits for peers to finish closing. With the wait for the disk it takes less than 5 s."""
 
 logger = structlog.stdlib.get_logger("server")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Runs until a signal, or one of the other commands; returns the exit code."""
+    """Runs a server until a signal, or runs another command. Returns the exit code.
+
+    Args:
+        arguments: the command line without the program's name; None: that of this process.
+    """
     for number in signals():
         signal.signal(number, leave)  # until the event loop takes over
     arguments = sys.argv[1:] if arguments is None else arguments
@@ -67,27 +72,28 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def command(name: str) -> Callable[[Sequence[str]], int]:
-    """One of the other commands.
+    """Returns the function of a command other than the server itself; it takes arguments and returns the exit code.
 
     Raises:
-        SettingsError: there is none of that name.
+        SettingsError: there is no such command.
     """
     if name not in COMMANDS:
         there = " and ".join(COMMANDS)
         raise SettingsError(
-            f"{name!r}: no such command{nearest(name, COMMANDS)}; there are {there}, or just flags (--help)"
+            f"{name!r}: no such command{nearest(name, COMMANDS)}; the commands are {there}; "
+            "to start a server, give only flags (--help)"
         )
     return COMMANDS[name]
 
 
 def run(settings: Settings) -> int:
-    """Serves one world; returns the exit code.
+    """Serves one world until a signal. Returns the exit code.
 
     Raises:
-        RulesError: the game cannot be used.
-        SceneError: nor can the scene.
-        SettingsError: nor can the address, or one of the files.
-        StoreError: nor can what was saved.
+        RulesError: the rules cannot be used.
+        SceneError: the scene cannot be used.
+        SettingsError: the address or one of the files cannot be used.
+        StoreError: the saved world cannot be used.
     """
     log.set_up(settings.log_level, settings.log_format, sys.stderr)
     authenticate = authenticator(settings)
@@ -123,7 +129,7 @@ def run(settings: Settings) -> int:
 
 
 class Server:
-    """The parts and their lives: start, run, stop."""
+    """All parts of a running server, with their start and their end."""
 
     def __init__(self, settings: Settings, game: Game, store: Store | None = None) -> None:
         self.settings = settings
@@ -151,7 +157,7 @@ class Server:
         self._stop: asyncio.Future[tuple[str, int]] | None = None
 
     async def serve(self) -> int:
-        """Listens, ticks until told to stop, says goodbye."""
+        """Listens and ticks until a signal or a failure, then closes all connections. Returns the exit code."""
         loop = asyncio.get_running_loop()
         loop.set_exception_handler(self._loop_failed)
         self._stop = loop.create_future()
@@ -178,17 +184,17 @@ class Server:
         return code
 
     async def _drain(self) -> None:
-        """Tells everyone to come back later, and waits until all have gone, but not for long."""
+        """Sends every client the order to reconnect later, and waits at most `STOP_S` until all have closed."""
         self.draining = True
         if self.ticker is not None:
             self.ticker.stop()
         self.game.shut_down("the server is going down", self.settings.restart_s)
         with contextlib.suppress(TimeoutError):
             await asyncio.wait_for(self.gateway.drained(), STOP_S)
-        self.gateway.stop_listening()  # only now: until the end `/readyz` says what is going on
+        self.gateway.stop_listening()  # last, so that `/readyz` answers "draining" until the end
 
     def unready(self) -> str:
-        """Why no player should be sent here; empty if there is no reason."""
+        """Returns the reason why this server should get no new players; empty if it is ready."""
         if self.draining:
             return "draining"
         if self.ticker is None:
@@ -199,7 +205,7 @@ class Server:
         return f"the last tick began {age:.1f} s ago" if age > READY_S else ""
 
     def stats(self) -> dict[str, Any]:
-        """What `/stats` shows."""
+        """Returns the figures of `/stats`."""
         figures = {} if self.ticker is None else self.ticker.stats()
         return {
             **self.game.stats(),
@@ -225,10 +231,10 @@ class Server:
         host, port = self.settings.host, self.settings.port
         try:
             return await self.gateway.listen(host, port, tls)
-        except (OSError, UnicodeError) as error:  # UnicodeError: a host that is no host name at all
+        except (OSError, UnicodeError) as error:  # UnicodeError: the host is not even a host name
             reason = f"cannot listen ({getattr(error, 'strerror', None) or error})"
             if getattr(error, "errno", None) == errno.EADDRINUSE:
-                reason = "in use by another program, so end that one or choose another --port (0: any that is free)"
+                reason = "in use by another program; end that one or choose another --port (0: any free one)"
             raise SettingsError(f"host = {host!r}, port = {port}: {reason}") from error
 
     def _end(self, reason: str, code: int) -> None:
@@ -239,7 +245,7 @@ class Server:
         self._end("too many ticks in a row have failed", 1)
 
     def _loop_failed(self, loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
-        """An exception that reached the event loop, or trouble of its own, such as no file descriptor left."""
+        """Counts and logs a failure in the event loop: an exception of ours, or that no file descriptor is free."""
         error = context.get("exception")
         self.faults.total += 1
         logger.error(context["message"], error=repr(error), exc_info=None if isinstance(error, OSError) else error)
@@ -247,10 +253,10 @@ class Server:
 
 @contextlib.contextmanager
 def saved(scene: Scene, settings: Settings) -> Iterator[Store]:
-    """A store with the world of the directory `settings.data`, where all of it is saved in the end.
+    """Opens the store in the directory `settings.data`. Its world is saved completely at the end of the context.
 
     Raises:
-        StoreError: what is there cannot be used.
+        StoreError: the directory or the world in it cannot be used.
     """
     assert settings.data is not None
     power = settings.durability == "power"
@@ -266,13 +272,17 @@ def saved(scene: Scene, settings: Settings) -> Iterator[Store]:
 
 @contextlib.contextmanager
 def recorded(scene: Scene, path: str, world: RecordedWorld | None = None) -> Iterator[RecordedWorld]:
-    """A world (by default a new one) whose changes go into a new file, which is ended properly in the end.
+    """Records the changes of a world into a new file. The recording ends with the context.
+
+    Args:
+        path: of the file.
+        world: the world to record; None: a new one with the terrain of the scene.
 
     Raises:
         SettingsError: the file exists or cannot be written.
     """
     try:
-        file = Path(path).open("xb")  # noqa: SIM115 - closing may fail on a full disk, which has been told by then
+        file = Path(path).open("xb")  # noqa: SIM115 - closing may fail on a full disk, which has been logged by then
     except FileExistsError:
         raise SettingsError(f"record = {path!r}: exists already, and a recording is never overwritten") from None
     except OSError as error:

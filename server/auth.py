@@ -1,36 +1,41 @@
-"""Who a client is: what the game asks, whatever answers it. `server.tokens` answers from signed tokens."""
+"""The interface by which the game authenticates clients. `server.tokens` implements it with signed tokens."""
 
 from typing import Protocol
 
 from shared.checks import text
 
 SUBJECT_MAX = 64
-"""The longest subject, in characters."""
+"""Maximum length of a subject, in characters."""
 
 
 class AuthError(ValueError):
-    """The client may not come in; the text says why, and is sent to it."""
+    """A client that is refused. The message is the reason and is sent to the client."""
 
 
 def checked_subject(subject: object) -> str:
-    """The result of an `Authenticator`, or the subject of a token: a text of at most `SUBJECT_MAX` characters.
+    """Checks a subject, the name by which an `Authenticator` identifies a client, and returns it.
 
     Raises:
-        SceneError: it is none, is too long, or UTF-8 cannot hold it.
+        SceneError: it is not a text of at most `SUBJECT_MAX` characters, or UTF-8 cannot encode it.
     """
     return text(subject, "subject", SUBJECT_MAX, shortest=0)
 
 
 class Authenticator(Protocol):
-    """Checks what a client shows. Write your own and name it by `--auth package.module:name`.
+    """A function that checks the token of a client. Name your own by `--auth package.module:name`.
 
-    It is called in the event loop, once per client: it must not wait for anything.
+    The game calls it once per client, in the event loop: it must not wait.
     """
 
     def __call__(self, token: str) -> str:
-        """Who the client is: a text of 1 to `SUBJECT_MAX` characters, or empty for nobody in particular.
+        """Returns the subject that identifies the client: at most `SUBJECT_MAX` characters; empty: anonymous.
+
+        A player who reconnects must have the subject that it had before.
+
+        Args:
+            token: the token from the client's hello; empty if it sent none.
 
         Raises:
-            AuthError: the client may not come in.
+            AuthError: the client is refused.
         """
         ...

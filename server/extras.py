@@ -1,14 +1,18 @@
-"""Advice on a library that an optional part needs and that is not installed."""
+"""The advice to install a library that an optional part of the project needs."""
 
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
+"""The folder that holds the package `server`."""
 
 
 def install(extra: str, root: Path = ROOT) -> str:
-    """The command that installs what an extra of `pyproject.toml` names. The project is on no package index.
+    """Returns the pip command that installs the libraries of an extra of `pyproject.toml`.
+
+    The command names a path, because the project is on no package index.
 
     Args:
+        extra: name of the extra.
         root: the folder that holds the package `server`.
     """
     if (root / "pyproject.toml").is_file():

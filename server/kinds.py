@@ -1,4 +1,7 @@
-"""What a setting may be, and how its value is checked; every mistake names the setting, the value and its origin."""
+"""Options: the type, range and help text of each setting, and the check of its value.
+
+Every error names the setting, the value and the origin of the value.
+"""
 
 import argparse
 import difflib
@@ -10,33 +13,38 @@ from typing import Any, NamedTuple, NoReturn
 from shared.checks import utf8
 
 PLAIN = "without spaces around it, in UTF-8"
-"""What a text must be that is a name, an address or a path."""
+"""Requirement for a text that is a name, an address or a path; part of an error message."""
 
 
 class SettingsError(ValueError):
-    """A setting that cannot be used; the message names the setting, the value and where it came from."""
+    """A setting that cannot be used. The message names the setting, the value and its origin."""
 
 
 class Kind(NamedTuple):
-    """What a setting may be: the type it has in TOML, bounds or choices, and its help."""
+    """An option: the type, range and help text of one setting."""
 
     type: type[Any]
-    """str, int, float, bool, or tuple for a list of texts."""
+    """Type of the value: str, int, float, bool, or tuple for a list of texts."""
     help: str
+    """Text for `--help`."""
     metavar: str | None = None
+    """Name of the value in `--help`, such as PORT."""
     low: float = 0
+    """Smallest allowed number."""
     high: float = 0
+    """Largest allowed number."""
     choices: tuple[str, ...] = ()
+    """Allowed texts. Empty: any text."""
 
 
 class Parser(argparse.ArgumentParser):
-    """One line for a mistake, not the usage and then a line."""
+    """A command-line parser that raises `SettingsError` instead of printing the usage and ending the program."""
 
     def flags(self, arguments: Sequence[str]) -> dict[str, Any]:
-        """What the flags say, by name.
+        """Parses a command line. Returns the values of the flags by name.
 
         Raises:
-            SettingsError: they cannot be used.
+            SettingsError: a flag does not exist, or its value cannot be used.
             SystemExit: after `--help`.
         """
         found, rest = self.parse_known_args(arguments)
@@ -46,35 +54,43 @@ class Parser(argparse.ArgumentParser):
         return vars(found)
 
     def error(self, message: str) -> NoReturn:
-        """Instead of the end of the program."""
+        """Raises `SettingsError`; argparse calls this for every mistake in the command line."""
         raise SettingsError(f"{message}; --help lists all flags")
 
 
 def nearest(name: str, known: Iterable[str], prefix: str = "") -> str:
-    """A word on which of these may have been meant, to go behind a mistake; empty if none is similar.
+    """Returns a hint such as " (did you mean port?)" to append to an error; empty if no known name is similar.
 
     Args:
-        prefix: what all begin with, and what does not make them similar.
+        name: the unknown name.
+        known: all known names.
+        prefix: common beginning of the names, which is ignored in the comparison.
     """
     found = difflib.get_close_matches(name.removeprefix(prefix), [each.removeprefix(prefix) for each in known], 1)
     return f" (did you mean {prefix}{found[0]}?)" if found else ""
 
 
 def setting(default: Any, kind: Kind) -> Any:
-    """A dataclass field that an operator can set."""
+    """Returns a dataclass field that an operator can set."""
     return field(default=default, metadata={"kind": kind})
 
 
 def kinds_of(owner: Any) -> dict[str, Kind]:
-    """The settings among the fields of a dataclass, by name."""
+    """Returns the options of those fields of a dataclass that are settings, by name."""
     return {f.name: f.metadata["kind"] for f in fields(owner) if "kind" in f.metadata}
 
 
 def checked(name: str, kind: Kind, value: object, origin: str) -> Any:
-    """The value of one setting. From a file it has a type already; anything else is text.
+    """Checks the value of one setting and returns it with the option's type.
+
+    Args:
+        name: name of the setting, for the error.
+        kind: its option.
+        value: the value: text from a flag or a variable, a typed value from a file.
+        origin: where the value comes from. A value is not converted if this begins with "file ".
 
     Raises:
-        SettingsError: it cannot be used.
+        SettingsError: the value has another type, is out of range, or is not one of the choices.
     """
     if isinstance(value, str) and not origin.startswith("file "):
         value = _typed(kind.type, value)
@@ -98,7 +114,7 @@ def checked(name: str, kind: Kind, value: object, origin: str) -> Any:
 
 
 def to_toml(value: str | int | float | bool | tuple[str, ...]) -> str:
-    """A value as it stands in a TOML file."""
+    """Returns a value in the notation of a TOML file."""
     if isinstance(value, str):
         escaped = "".join(f"\\u{ord(c):04x}" if ord(c) < 32 or ord(c) == 127 or c in '"\\' else c for c in value)
         return f'"{escaped}"'
@@ -108,12 +124,12 @@ def to_toml(value: str | int | float | bool | tuple[str, ...]) -> str:
 
 
 def _plain(value: object) -> bool:
-    """Whether a value is a text that can be a name, an address or a path."""
+    """Returns whether a value is a text that can be a name, an address or a path."""
     return isinstance(value, str) and value.strip() == value != "" and "\0" not in value and utf8(value)
 
 
 def _typed(kind: type[Any], text: str) -> str | int | float | bool | list[str]:
-    """Text as a value of a type, or the text itself where it cannot be that."""
+    """Converts a text to a type. Returns the text itself if it cannot be converted."""
     if kind is int and text.removeprefix("-").isdecimal() and text.isascii():
         return int(text) if len(text) < 20 else text
     if kind is float and text.isascii():

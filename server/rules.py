@@ -1,4 +1,4 @@
-"""A game on top of moving and editing: a class with hooks, loaded by name.
+"""The rules of a game: a class with hooks that the server calls, loaded by its name.
 
     class Tag(Rules):
         def on_join(self, player: Player) -> None:
@@ -6,13 +6,14 @@
 
     sovereign-server --game my_game:Tag
 
-All hooks are called within a tick, ahead of its step, in this order: `on_start`, the functions given to `game.soon`,
-`on_leave`, `on_join`, `on_fell_out`, `on_command` and `can_edit`, `on_contact`, `on_tick`. One that raises is reported
-and counted, and the game goes on. A hook is a plain function: whatever waits for something runs elsewhere, in a task or
-a thread, and comes back by `game.soon`.
+The server calls all hooks within a tick, before the step, in this order: `on_start`, the functions given to
+`game.soon`, `on_leave`, `on_join`, `on_fell_out`, `on_command` and `can_edit`, `on_contact`, `on_tick`. If a hook
+raises, the exception is logged and counted, and the game goes on. A hook is a plain function and must not wait. Code
+that waits runs in a task or a thread of its own and hands its result back with `game.soon`.
 
-What they may do is `self.game`, a `server.stage.Stage`. Whatever decides what happens in the world must come from
-there: its `random` is the same again in a game that is computed anew; a clock's time or the order of a set is not.
+Hooks read and change the game through `self.game`, a `server.stage.Stage`. Decisions about the world must use nothing
+else: `self.game.random` gives the same numbers when a game is computed again, but a clock or the order of a set does
+not.
 """
 
 import importlib
@@ -31,62 +32,85 @@ if TYPE_CHECKING:
 
 
 class RulesError(ValueError):
-    """Rules that cannot be used; the message says why."""
+    """Rules that cannot be used. The message says why."""
 
 
 class Rules:
-    """No rules: players walk, jump, place and remove blocks. Override what is to be different."""
+    """The base class of a game's rules.
+
+    As it is, players walk, jump, place and remove blocks. A subclass overrides the hooks that it needs.
+    """
 
     scene = ""
-    """The scene to be played in where the operator names none; empty: the server's default."""
+    """The scene to play if the operator names none: a name or the path of a file. Empty: the server's default."""
 
     game: "Stage"
-    """The running game; not yet there in `__init__` and `prepare`."""
+    """The running game. Not available in `__init__` and `prepare`."""
 
-    if not TYPE_CHECKING:  # so that a type checker goes on to find names that are not there
+    if not TYPE_CHECKING:  # with a visible __getattr__ a type checker would accept every misspelt attribute
 
         def __getattr__(self, name: str) -> Any:
             if name == "game":
-                raise AttributeError("self.game is not there yet in __init__ and prepare; from on_start on it is")
+                raise AttributeError("self.game is not available in __init__ and prepare, only from on_start on")
             raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}", name=name, obj=self)
 
     def prepare(self, scene: Scene) -> Scene:
-        """The scene to play in, before anything begins: the place to add templates (`Scene.with_template`)."""
+        """Returns the scene to play. Called once, before the world is made; add templates here.
+
+        Args:
+            scene: the scene that the operator or `Rules.scene` names; `Scene.with_template` adds a template to it.
+        """
         return scene
 
     def on_start(self) -> None:
-        """The world is there, nobody has joined. Not called when a stored game goes on."""
+        """Called once, when the world exists and no player has joined. Not called when a saved game is restored."""
 
     def on_join(self, player: Player) -> None:
-        """A player has got an entity. Who comes back after a lost connection has never left."""
+        """Called when a new player has an entity. Not called when a player reconnects."""
 
     def on_leave(self, player: Player) -> None:
-        """A player leaves, and the entity will be removed."""
+        """Called when a player leaves for good, before the entity is removed."""
 
     def on_tick(self) -> None:
-        """Once a tick, before anything moves."""
+        """Called once per tick, after the other hooks and before the step."""
 
     def on_command(self, player: Player, name: str, payload: Any) -> bool | None:
-        """A client's command (`Client.command`); False: it is answered with "not allowed"."""
+        """Called for each command that a client sends with `Client.command`, except for edits of blocks.
+
+        Args:
+            player: the sender.
+            name: name of the command, chosen by the game.
+            payload: data of the command: any MessagePack value. A client can send anything, so check it.
+
+        Returns:
+            False if the command is not allowed: the client gets that as the result. True or None if it was done.
+        """
         return False
 
     def on_contact(self, a: int, b: int) -> None:
-        """Two entities (a < b) have begun to touch in the latest step, or were put so."""
+        """Called when two entities (a < b) have begun to touch: in the latest step, or when the rules placed one."""
 
     def on_fell_out(self, entity: int) -> bool | None:
-        """An entity is below the floor of the world; True: it has been seen to. Else it comes back at a spawn."""
+        """Called when an entity is below the floor of the world.
+
+        Returns:
+            True if the rules have dealt with it. Otherwise the server puts the entity at a spawn point.
+        """
         return False
 
     def can_edit(self, player: Player, x: int, y: int, z: int, kind: int) -> bool:
-        """Whether a player may place (kind 1 to 255) or remove (0) that block; reach and overlap are checked anyway."""
+        """Returns whether a player may place (kind 1 to 255) or remove (kind 0) the block at (x, y, z).
+
+        The server checks reach and overlap with entities besides.
+        """
         return True
 
 
 def load_rules(name: str) -> Rules:
-    """The rules `module:Class`; a module beside the working directory is found, too.
+    """Loads the class `module:Class` and returns an instance. The working directory is searched for modules, too.
 
     Raises:
-        RulesError: there is no such class, or it cannot be made.
+        RulesError: there is no such class, it cannot be instantiated, or it cannot be used as rules.
     """
     module_name, colon, class_name = name.partition(":")
     if not colon or not module_name or not class_name:
@@ -106,15 +130,16 @@ def load_rules(name: str) -> Rules:
 
 
 def check_rules(rules: object) -> None:
-    """Checks rules before anything of them is called: a mistake that would be silent is named.
+    """Checks rules before any of their hooks is called, to report mistakes that would have no effect otherwise.
 
     Raises:
-        RulesError: they are no rules; a method is named like a hook that there is not; or a hook cannot be called.
+        RulesError: `rules` is not an instance of a subclass of `Rules`, a method has a name that looks like a hook's
+            and is none, or a hook cannot be called.
     """
     if isinstance(rules, type) and issubclass(rules, Rules):
-        raise RulesError(f"rules = {rules.__qualname__}: is a class; give an instance of it, {rules.__name__}()")
+        raise RulesError(f"rules = {rules.__qualname__}: is a class; pass an instance, {rules.__name__}()")
     if not isinstance(rules, Rules):
-        raise RulesError(f"rules = {shown(rules)}: is no subclass of server.rules.Rules")
+        raise RulesError(f"rules = {shown(rules)}: must be an instance of a subclass of server.rules.Rules")
     owner = type(rules).__qualname__
     if not isinstance(rules.scene, str):
         raise RulesError(f"{owner}.scene = {shown(rules.scene)}: must be the name of a scene, or the path of its file")
@@ -124,46 +149,57 @@ def check_rules(rules: object) -> None:
         looks = name.startswith(("on_", "can_")) or (meant and not name.startswith("_"))
         if looks and name not in HOOKS:
             there = f" (did you mean {meant}?)" if meant else nearest(name, HOOKS)
-            raise RulesError(f"{owner}.{name} is no hook, and nothing calls it{there}; there are {', '.join(HOOKS)}")
+            raise RulesError(
+                f"{owner}.{name} is no hook, and nothing calls it{there}; the hooks are {', '.join(HOOKS)}"
+            )
     for name in HOOKS:
         checked_function(getattr(rules, name), f"{owner}.{name}")
 
 
 def checked_function(act: object, at: str) -> None:
-    """Checks what is to be called within a tick.
+    """Checks that something is a plain function, which can be called within a tick.
+
+    Args:
+        act: the function to check.
+        at: its name, for the error.
 
     Raises:
-        RulesError: it cannot be called, or a call of it would do nothing: it is async, or a generator.
+        RulesError: `act` cannot be called, or calling it would do nothing because it is async or a generator.
     """
     if not callable(act):
         raise RulesError(f"{at} = {shown(act)}: must be a function")
     if any(test(part) for test in ASYNC for part in (act, type(act).__call__)):
-        raise RulesError(f"{at}: must not be async: it is called within a tick, which waits for nothing")
+        raise RulesError(f"{at}: must not be async: it is called within a tick, which cannot wait")
     if inspect.isgeneratorfunction(act):
         raise RulesError(f"{at}: must not contain `yield`: a call of it would do nothing")
 
 
 def checked_result(result: Any, name: str) -> Any:
-    """Returns what a hook has returned.
+    """Returns the result of a hook after a check.
+
+    Args:
+        result: the result.
+        name: name of the hook, for the error.
 
     Raises:
-        RulesError: it is something that still has to be run: the hook is async behind a decorator, for example.
+        RulesError: the result is a coroutine or a generator, for example because a decorator hid that the hook is
+            async. Nothing would run it.
     """
     if result is None or result is True or result is False:
         return result
     if inspect.isawaitable(result) or inspect.isgenerator(result) or inspect.isasyncgen(result):
         if inspect.iscoroutine(result):
-            result.close()  # else Python warns of it as well
+            result.close()  # otherwise Python would warn that it was never awaited
         raise RulesError(f"{name} returned {type(result).__name__}, which nothing runs: it must be a plain function")
     return result
 
 
 def prepared(rules: Rules, scene: Scene) -> Scene:
-    """The scene that rules want to be played in.
+    """Returns the scene to play: the result of `Rules.prepare` for `scene`.
 
     Raises:
-        RulesError: they are no rules, `prepare` fails, or it does not return a scene.
-        SceneError: it makes a scene that cannot be.
+        RulesError: `rules` cannot be used (see `check_rules`), `prepare` fails, or its result is not a scene.
+        SceneError: `prepare` makes an invalid scene.
     """
     check_rules(rules)
     name = f"{type(rules).__qualname__}.prepare"
@@ -179,6 +215,6 @@ def prepared(rules: Rules, scene: Scene) -> Scene:
 
 
 ASYNC = (inspect.iscoroutinefunction, inspect.isasyncgenfunction)
-"""What tells that a function is async."""
+"""Tests that recognise an async function."""
 HOOKS = ("prepare", *(name for name in vars(Rules) if name.startswith(("on_", "can_"))))
-"""The methods of rules that are called."""
+"""Names of the methods of rules that the server calls."""

@@ -1,4 +1,8 @@
-"""What an operator can set: defaults < TOML file < environment < flags; every mistake is named with its origin."""
+"""The settings of a server, from flags, environment variables, a TOML file and defaults.
+
+A flag takes precedence over the environment, the environment over the file, the file over the default. An error names
+the setting, its value and where it came from.
+"""
 
 import argparse
 import dataclasses
@@ -22,57 +26,64 @@ from shared.scene import SCENES, load_scene
 from shared.units import SEGMENT
 
 ENV_PREFIX = "SOVEREIGN_"
+"""Beginning of the names of all environment variables that the server reads."""
 CONFIG_VARIABLE = ENV_PREFIX + "CONFIG"
+"""Environment variable with the path of the TOML file."""
 ADDRESSES = ("none", "loopback", "private", "all")
+"""Groups of client addresses, each including the one before; choices of the setting `figures`."""
 LOG_LEVELS = ("debug", "info", "warning", "error")
 
 DESCRIPTION = """\
-An authoritative game server: fixed ticks, WebSocket clients, one world of blocks, and the rules of a game on top.
+An authoritative game server for WebSocket clients: a world of blocks at a fixed tick rate, with the rules of a game.
 
   sovereign-server                                              players walk, jump, dig and build on hills
   sovereign-server --game sovereign_netcode.examples.tag:Tag    the sample game; sovereign-play opens a window on it
 """
 EPILOG = f"""\
-Other commands: `sovereign-server token --help` (issue tokens), `sovereign-server check --help` (is it ready?).
-Each setting can also come from the environment ({ENV_PREFIX}PORT=9000) or from a TOML file (port = 9000; see
---print-config). A flag wins over the environment, that over the file, and that over the default.
-The server prints "listening on ws://HOST:PORT" when it is ready, then the address of its live page. It answers GET
-/healthz, /readyz, /stats and /metrics on the same port. SIGTERM, SIGINT or SIGHUP: clients are told, exit code 0.
-A bad setting: exit code 2.
+Other commands: `sovereign-server token --help` issues tokens; `sovereign-server check --help` asks whether a server is
+ready. Each setting can also come from an environment variable ({ENV_PREFIX}PORT=9000) or from a TOML file (port = 9000;
+see --print-config). A flag takes precedence over the environment, the environment over the file, the file over the
+default. When the server is ready, it prints "listening on ws://HOST:PORT" and then the address of its live page. It
+answers GET /healthz, /readyz, /stats and /metrics on the same port. After SIGTERM, SIGINT or SIGHUP it tells its
+clients to reconnect later and exits with code 0. If a setting cannot be used, it exits with code 2.
 """
 
 
 @dataclass(frozen=True)
 class Settings:
-    """All settings, valid. `origins` says where each one came from."""
+    """All settings of a server, checked.
+
+    `origins` has the origin of each setting that is not a default, by name: a flag, a variable or a file.
+    """
 
     host: str = setting("127.0.0.1", Kind(str, "address to listen on; 0.0.0.0 or :: for every interface", "ADDRESS"))
-    port: int = setting(8765, Kind(int, "TCP port; 0 lets the system pick one", "PORT", 0, 65535))
-    scene: str = setting("hills", Kind(str, "one of --list-scenes, or a scene file; games may have their own", "SCENE"))
+    port: int = setting(8765, Kind(int, "TCP port; 0: the system chooses a free one", "PORT", 0, 65535))
+    scene: str = setting("hills", Kind(str, "one of --list-scenes, or a scene file; a game may name its own", "SCENE"))
     reach: float | None = setting(
         None,
-        Kind(float, "blocks that a player's hands reach, instead of the scene's own", "BLOCKS", 0, 1024),
+        Kind(float, "distance up to which a player can edit blocks (default: the scene's own)", "BLOCKS", 0, 1024),
     )
     tick_rate: int | None = setting(
         None, Kind(int, "ticks per second (default: the scene's own)", "HZ", 1, TICK_RATE_MAX)
     )
     auth: str = setting(
-        "none", Kind(str, "who may play: none (anyone), token (see `token --help`), or MODULE:NAME of your own", "AUTH")
+        "none",
+        Kind(str, "who may play: none (anyone), token (see `token --help`), or your own function MODULE:NAME", "AUTH"),
     )
     auth_key_file: str | None = setting(
-        None, Kind(str, f"file with the key of the tokens; or the key itself in {KEY_VARIABLE}", "FILE")
+        None, Kind(str, f"file with the key of the tokens; alternatively the key itself in {KEY_VARIABLE}", "FILE")
     )
     tls_cert: str | None = setting(None, Kind(str, "file with the certificate (chain) for wss://, PEM", "FILE"))
     tls_key: str | None = setting(None, Kind(str, "file with the certificate's key, PEM", "FILE"))
     figures: str = setting(
-        "private", Kind(str, "whose addresses get /stats, /metrics and the live page", choices=ADDRESSES)
+        "private", Kind(str, "addresses that may read /stats, /metrics and the live page", choices=ADDRESSES)
     )
-    page: bool = setting(True, Kind(bool, "serve the live page: the world and its players in a browser, at /"))
+    page: bool = setting(True, Kind(bool, "serve the live page at /: the world and its players in a browser"))
     allowed_origins: tuple[str, ...] = setting(
         (),
         Kind(
             tuple,
-            "pages that browsers may play from, besides those at the server's own IP address; * for all",
+            "origins of web pages that may connect, besides those at the server's own IP address; * for all",
             "ORIGIN,...",
         ),
     )
@@ -80,38 +91,40 @@ class Settings:
         (),
         Kind(
             tuple,
-            "names by which pages (/stats, /healthz, ...) may be asked for, besides IP addresses, localhost and the "
+            "host names under which pages (/stats, /healthz, ...) are served, besides IP addresses, localhost and the "
             "name in host; * for all",
             "NAME,...",
         ),
     )
     restart_s: float = setting(
-        2.0, Kind(float, "when it ends, clients are told to come back after so long", "S", 0, 3600)
+        2.0, Kind(float, "seconds after which clients should reconnect when the server stops", "S", 0, 3600)
     )
-    log_level: str = setting("info", Kind(str, "what goes to stderr", choices=LOG_LEVELS))
-    log_format: str = setting("pretty", Kind(str, "how it looks", choices=FORMATS))
-    game: str | None = setting(None, Kind(str, "the rules of a game (default: none)", "MODULE:CLASS"))
-    seed: int = setting(0, Kind(int, "of the randomness of its rules", "N", 0, (1 << 63) - 1))
-    record: str | None = setting(None, Kind(str, "record every change of the world into a new file", "FILE"))
+    log_level: str = setting("info", Kind(str, "lowest level of the log lines on stderr", choices=LOG_LEVELS))
+    log_format: str = setting("pretty", Kind(str, "format of the log", choices=FORMATS))
+    game: str | None = setting(None, Kind(str, "class with the rules of a game (default: none)", "MODULE:CLASS"))
+    seed: int = setting(0, Kind(int, "seed of the random numbers of the rules", "N", 0, (1 << 63) - 1))
+    record: str | None = setting(None, Kind(str, "record every change of the world into this new file", "FILE"))
     kernel: str = setting(
         kernels.AUTO,
         Kind(
             str,
-            "what computes the physics, all to the same bits; auto: the first that is there",
+            "code that computes the physics; all give the same bits; auto: the first that is available",
             choices=kernels.CHOICES,
         ),
     )
-    data: str | None = setting(None, Kind(str, "save the world there, and go on with the one that is there", "DIR"))
+    data: str | None = setting(None, Kind(str, "directory to save the world in, and to restore it from", "DIR"))
     durability: str = setting(
         "power",
         Kind(str, "what a saved edit survives: the end of the process, or a power cut", choices=("process", "power")),
     )
-    checkpoint_s: float = setting(60.0, Kind(float, "a checkpoint of the saved world so often", "S", 0.1, 3600))
+    checkpoint_s: float = setting(
+        60.0, Kind(float, "seconds between two checkpoints of the saved world", "S", 0.1, 3600)
+    )
     limits: Limits = field(default_factory=Limits)
     origins: Mapping[str, str] = field(default_factory=dict, compare=False)
 
     def to_toml(self) -> str:
-        """The settings as a file that `--config` reads, with their origins as comments."""
+        """Returns the settings as the text of a file for `--config`, with their origins as comments."""
         lines = []
         for section, names in SECTIONS.items():
             owner = getattr(self, section) if section else self
@@ -125,30 +138,34 @@ class Settings:
 
 
 GROUPS = {
-    "what is played": ("scene", "game", "seed", "tick_rate", "reach", "kernel"),
-    "where it listens": ("host", "port", "tls_cert", "tls_key", "allowed_origins", "allowed_hosts"),
-    "who may play": ("auth", "auth_key_file"),
-    "what is kept": ("data", "durability", "checkpoint_s", "record"),
-    "what is told": ("log_level", "log_format", "figures", "restart_s"),
+    "the game": ("scene", "game", "seed", "tick_rate", "reach", "kernel"),
+    "network": ("host", "port", "tls_cert", "tls_key", "allowed_origins", "allowed_hosts"),
+    "access": ("auth", "auth_key_file"),
+    "saving": ("data", "durability", "checkpoint_s", "record"),
+    "operation": ("log_level", "log_format", "figures", "restart_s"),
 }
-"""The settings as `--help` shows them, those of a stranger first; all others are limits."""
+"""Groups of settings as `--help` shows them, the ones for beginners first. Settings in no group are shown as limits."""
 SECTIONS: dict[str, dict[str, Kind]] = {"": kinds_of(Settings), "limits": kinds_of(Limits)}
-"""The settings by the table of a TOML file that they stand in. Names are unique, wherever they stand."""
+"""Options by the table of the TOML file that has them, and by name. A name is in one table only."""
 KINDS: dict[str, Kind] = {name: kind for names in SECTIONS.values() for name, kind in names.items()}
+"""Options of all settings by name."""
 VARIABLES = [*(ENV_PREFIX + name.upper() for name in KINDS), CONFIG_VARIABLE, KEY_VARIABLE]
-"""What is read from the environment; others that begin like these are mistakes."""
+"""Environment variables that are read. Another variable that begins with `ENV_PREFIX` is an error."""
 DEFAULTS: dict[str, Any] = {f.name: f.default for owner in (Settings, Limits) for f in dataclasses.fields(owner)}
+"""Default values of all settings by name."""
 
 
 def load(flags: Mapping[str, str], environment: Mapping[str, str], config: str | None = None) -> Settings:
-    """The settings in force.
+    """Returns the settings from flags, environment, file and defaults, in this order of precedence.
 
     Args:
-        flags: what was given on the command line, by the name of the setting.
-        config: path of a TOML file.
+        flags: the values from the command line by the name of the setting.
+        environment: the environment variables.
+        config: path of a TOML file; None: no file.
 
     Raises:
-        SettingsError: a value cannot be used, or the file cannot be read.
+        SettingsError: a value cannot be used, a name is unknown, settings exclude each other, or the file cannot be
+            read.
     """
     values: dict[str, Any] = {}
     origins: dict[str, str] = {}
@@ -180,11 +197,15 @@ def load(flags: Mapping[str, str], environment: Mapping[str, str], config: str |
 
 
 def _check_together(settings: Settings) -> None:
-    """What only makes sense together."""
+    """Checks the settings that depend on each other.
+
+    Raises:
+        SettingsError: a combination cannot be used.
+    """
     host = settings.host
     if "auth" not in settings.origins and not (host == "localhost" or is_loopback(host)):
         raise SettingsError(
-            f"host = {host!r} (from {settings.origins['host']}): others can reach it, so say who may play: "
+            f"host = {host!r} (from {settings.origins['host']}): other machines can connect, so say who may play: "
             "--auth token, or --auth none for anyone"
         )
     if settings.auth not in ("none", "token") and not all(settings.auth.partition(":")):
@@ -205,7 +226,11 @@ def _check_together(settings: Settings) -> None:
 
 
 def _entries(config: str) -> Iterator[tuple[str, object]]:
-    """The settings in a file, each in the table where it belongs."""
+    """Yields the names and values of the settings in a file.
+
+    Raises:
+        SettingsError: the file cannot be read, or has an unknown name or a name in the wrong table.
+    """
     tables = {"": _read(config)}
     tables |= {name: tables[""].pop(name) for name in SECTIONS if isinstance(tables[""].get(name), dict)}
     for section, table in tables.items():
@@ -227,10 +252,13 @@ def _read(path: str) -> dict[str, Any]:
 
 
 def parse(arguments: Sequence[str], environment: Mapping[str, str] = os.environ) -> Settings | str:
-    """The settings, or the text that the operator asked for instead (`--list-scenes`, `--print-config`).
+    """Parses a command line.
+
+    Returns:
+        The settings, or the text to print instead of serving (`--list-scenes`, `--print-config`).
 
     Raises:
-        SettingsError: see `load`; also for flags that do not exist.
+        SettingsError: a flag does not exist, or `load` raises it.
         SystemExit: after `--help`.
     """
     parser = Parser(
@@ -266,7 +294,7 @@ def parse(arguments: Sequence[str], environment: Mapping[str, str] = os.environ)
 
 
 def list_scenes() -> str:
-    """For each built-in scene its name, what its file says of it, and its size."""
+    """Returns a text with the name, the description and the size of each built-in scene."""
     lines = []
     for path in sorted(SCENES.glob("*.toml")):
         try:
@@ -281,6 +309,6 @@ def list_scenes() -> str:
 
 
 def _said(path: Path) -> str:
-    """The first sentence of the comment that a file begins with."""
+    """Returns the first sentence of the comment at the beginning of a file."""
     comment = takewhile(lambda line: line.startswith("#"), path.read_text("utf-8").splitlines())
     return " ".join(line[2:] for line in comment).partition(". ")[0].rstrip(".")

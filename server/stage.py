@@ -1,7 +1,7 @@
-"""What the rules of a game can do and see: `self.game` of `server.rules.Rules`.
+"""The game API: `self.game` of `server.rules.Rules`, by which rules read and change a running game.
 
-Everything here acts at once on the one world, ahead of the step of the coming tick, and through the same functions as
-everybody else; so it is sent, recorded and replayed like all that happens.
+A change takes effect in the world at once, before the step of the coming tick. It goes through the same functions as
+every other change of the world, so it is sent to clients, recorded and replayed like them.
 """
 
 from collections import deque
@@ -33,20 +33,30 @@ from shared.messages import ENTITY_MAX, Command, Happened, ProtocolError, Shared
 from shared.scene import Scene
 
 SOON_MAX = 10_000
-"""The most functions that wait for the next tick."""
+"""Maximum number of functions that wait for the next tick."""
 
 TRUTH = (bool, np.bool_)
+"""Types of the results of hooks that count as a truth value."""
 _FAILED = object()
+"""Result of `Stage._call` for a command whose hook raised."""
 
 
 class Stage:
-    """One running game, as its rules see it. Positions in blocks, velocities in blocks/s.
+    """The game API of one running game. Positions are in blocks, velocities in blocks/s.
 
-    A method that is given the number of an entity that is not there raises `MissingError` (a `KeyError`); one that is
-    given a wrong value raises `SceneError`, which names the field and the value. Nothing has been done then.
+    A method raises `MissingError` (a `KeyError`) if there is no entity with the given number, and `SceneError`, which
+    names the field and the value, if a value is wrong. In both cases it has changed nothing.
 
-    What changes the game may be called within a tick: by the hooks of the rules, and by what `soon` was given. From
-    another thread, or from a callback of an event loop, it raises `OutOfTurnError`.
+    Methods that change the game may be called within a tick only: from hooks of the rules, and from functions that were
+    passed to `soon`. From another thread, or from a callback of an event loop, they raise `OutOfTurnError`.
+
+    Args:
+        world: the world of the game.
+        rewind: the recent past of the world, for `rewound`.
+        counters: where failed hooks and dropped events are counted.
+        rules: the rules of the game; their `game` is set to this object.
+        kept: the persisted state of a game that is restored; None: a new game.
+        seed: seed of `random`.
     """
 
     def __init__(
@@ -64,7 +74,8 @@ class Stage:
         self._soon: deque[tuple[Callable[..., object], tuple[Any, ...]]] = deque()
         self.kept = kept or Kept({}, {}, {})
         self.players = self.kept.players
-        """Who plays, by entity, in the order in which they joined; also who is cut off and may come back."""
+        """Players by entity, in the order in which they joined. Includes players who have lost their connection and
+        may still reconnect."""
         self.steered: dict[int, Input] = {}
         self._attributes = self.kept.attributes
         self.log = ChangeLog(world, self._attributes)
@@ -85,28 +96,31 @@ class Stage:
 
     @property
     def scene(self) -> Scene:
-        """The rules of the physics, and the templates."""
+        """The scene: tick rate, gravity, templates, spawn points."""
         return self._world.scene
 
     @property
     def tick(self) -> int:
-        """The tick that is about to be computed."""
+        """The number of the tick that is about to be computed."""
         return self._world.tick + 1
 
     def ticks(self, seconds: float) -> int:
-        """Returns the number of ticks in some seconds, rounded."""
+        """Returns the number of ticks in a number of seconds, rounded."""
         return round(finite(seconds, "seconds") * self.scene.tick_rate)
 
     @property
     def random(self) -> Random:
-        """A source of randomness that is the same again in the same tick of a game with the same seed."""
+        """A random number generator, seeded anew in each tick with the game's seed and the tick's number.
+
+        A game with the same seed gets the same numbers in the same tick.
+        """
         self.turn.check("random")
         if self._random[0] != self.tick:
             self._random = (self.tick, Random((self._seed << 64) | self.tick))
         return self._random[1]
 
     def entities(self, template: str | None = None) -> list[int]:
-        """The ids of all entities, or of those of a template, ascending."""
+        """Returns the numbers of all entities, or of those with a template, in ascending order."""
         states = self._world.states()
         if template is not None:
             states = states[states[:, TEMPLATE] == self.scene.template(template)]
@@ -117,26 +131,35 @@ class Stage:
         return entity in self._world
 
     def position(self, entity: int) -> Vec:
-        """Where an entity is."""
+        """Returns the position (x, y, z) of an entity in blocks."""
         return self._world.position(self._known(entity))
 
     def velocity(self, entity: int) -> Vec:
-        """How fast an entity is."""
+        """Returns the velocity (x, y, z) of an entity in blocks/s."""
         return self._world.velocity(self._known(entity))
 
     def touching(self, entity: int) -> list[int]:
-        """The ids of those whose boxes share at least a point with that of an entity, ascending: now, not only anew."""
+        """Returns the entities that touch an entity now, in ascending order: their boxes share at least a point.
+
+        Unlike the hook `on_contact`, this includes contacts that began earlier.
+        """
         return self._contacts.of(self._known(entity))
 
     def template(self, entity: int) -> str:
-        """What an entity is."""
+        """Returns the name of an entity's template."""
         return self.scene.templates[self._world.state(self._known(entity))[TEMPLATE]].name
 
     def spawn(self, template: str, position: Vec, velocity: Vec = (0.0, 0.0, 0.0), **attributes: Any) -> int:
-        """Adds an entity and returns its id.
+        """Adds an entity and returns its number.
+
+        Args:
+            template: name of its template.
+            position: (x, y, z) in blocks. If it is taken, the nearest free place within a block is used.
+            velocity: (x, y, z) in blocks/s.
+            attributes: attributes of the entity, as for `set`.
 
         Raises:
-            OverlapError: the place, and all near it, is taken.
+            OverlapError: there is no free place at or near the position.
             SceneError: there is no such template, or a value is out of range.
         """
         self.turn.check("spawn")
@@ -149,38 +172,41 @@ class Stage:
         return entity
 
     def remove(self, entity: int) -> None:
-        """Takes an entity out of the world.
+        """Removes an entity from the world.
 
         Raises:
-            SceneError: it is a player's.
+            SceneError: the entity is a player's.
         """
         self.turn.check("remove")
         entity = self._known(entity)
         if entity in self.players:
-            raise SceneError(f"entity = {entity}: is a player's, and stays until the player leaves")
+            raise SceneError(f"entity = {entity}: is a player's and cannot be removed before the player leaves")
         self._remove(entity)
 
     def place(self, entity: int, position: Vec) -> None:
-        """Puts an entity somewhere else, or as near to it as there is room within a block; its velocity stays.
+        """Moves an entity to a position in blocks, or to the nearest free place within a block. Keeps its velocity.
 
         Raises:
-            OverlapError: there is none.
+            OverlapError: there is no free place.
         """
         self.turn.check("place")
         self._world.place(self._known(entity), position, push=True)
 
     def throw(self, entity: int, velocity: Vec) -> None:
-        """Sets how fast an entity is; one that walks keeps only the upward part beyond the next tick."""
+        """Sets the velocity of an entity in blocks/s.
+
+        An entity that walks keeps only the vertical part beyond the next tick; its input then sets the other two.
+        """
         self.turn.check("throw")
         entity = self._known(entity)
         self._world.set_velocity(entity, velocity)
         self.log.note_act(entity)
 
     def change(self, entity: int, template: str) -> None:
-        """Makes an entity one of another template, where it stands.
+        """Changes the template of an entity. Position and velocity stay.
 
         Raises:
-            OverlapError: its new box has no room there.
+            OverlapError: the box of the new template has no room there.
         """
         self.turn.check("change")
         entity = self._known(entity)
@@ -188,19 +214,25 @@ class Stage:
         self.log.note_act(entity)
 
     def steer(self, entity: int, x: float, y: float, *, jump: bool = False) -> None:
-        """What an entity that is no player's wishes from now on: a direction (east, north), and whether to jump.
+        """Sets the input of an entity that is not a player's. It holds until the next call.
+
+        Args:
+            entity: number of the entity.
+            x: direction to the east, from -1 to 1.
+            y: direction to the north, from -1 to 1.
+            jump: whether to jump.
 
         Raises:
-            SceneError: it is a player's.
+            SceneError: the entity is a player's.
         """
         self.turn.check("steer")
         entity = self._known(entity)
         if entity in self.players:
-            raise SceneError(f"entity = {entity}: is a player's, and goes where the player wants")
+            raise SceneError(f"entity = {entity}: is a player's, whose client chooses its inputs")
         self.steered[entity] = make_input(x, y, jump=jump)
 
     def block(self, x: int, y: int, z: int) -> int:
-        """The kind of a block; 0: there is none."""
+        """Returns the kind of a block: 1 to 255, or 0 for air and for places that are not loaded."""
         return self._world.block(x, y, z) or 0
 
     def set_block(self, x: int, y: int, z: int, kind: int) -> None:
@@ -208,33 +240,42 @@ class Stage:
 
         Raises:
             OverlapError: an entity is in the way.
-            SceneError: there is no such place, or kind.
+            SceneError: the place is not loaded, or there is no such kind.
         """
         self.turn.check("set_block")
         if self._world.set_block(x, y, z, kind):
             self.log.note_edit(int(x), int(y), int(z))
 
     def rewound(self, player: Player, seen: float | None = None) -> Past:
-        """The world as a player saw it, at most 250 ms ago: answers rays and boxes.
+        """Returns the world as a player saw it, for queries of rays and boxes (lag compensation).
+
+        It looks back at most `Limits.rewind_s` seconds (0.5 by default).
 
         Args:
-            seen: the tick at which that client drew the others; None: what its command says, within `on_command`.
+            player: the player. No query finds the player's own entity.
+            seen: server time in ticks at which the player's client drew the other entities; None: as the command says
+                that is being carried out, for calls within `on_command`.
         """
         if not isinstance(player, Player):
-            raise SceneError(f"player = {shown(player)}: must be a `Player`, as hooks are given one")
+            raise SceneError(f"player = {shown(player)}: must be a `Player`, as hooks get it")
         seen = None if seen is None else finite(seen, "seen")
         gaps = player.session.gaps if player.session is not None else ()
         return self._rewind.at(self._seen if seen is None else seen, player.entity, gaps)
 
-    # -- what the players are told ---------------------------------------------------------------------------
+    # -- what clients receive --------------------------------------------------------------------------------
 
     def set(self, entity: int, name: str, value: Any) -> None:
-        """Says something of an entity to all who see it: a small MessagePack value. None: nothing any more.
+        """Sets an attribute of an entity, which is sent to every client that sees the entity.
 
-        It is told as it is now: who changes a list later has to say so again.
+        The value is sent as it is now. If you change a list later, call `set` again.
+
+        Args:
+            entity: number of the entity.
+            name: name of the attribute, 1 to 32 characters.
+            value: any MessagePack value of at most 256 bytes; None removes the attribute.
 
         Raises:
-            SceneError: more than 32 attributes, or more than 256 bytes.
+            SceneError: the entity would have more than 32 attributes, or the value has more than 256 bytes.
         """
         self.turn.check("set")
         entity = self._known(entity)
@@ -243,22 +284,26 @@ class Stage:
             self._say(entity, values.with_value(before, name, payload, f"entity {entity}"))
 
     def get(self, entity: int, name: str, default: Any = None) -> Any:
-        """What has been said of an entity; a list or a table is a copy."""
+        """Returns an attribute of an entity, or `default` if it is not set. A list or a table is a copy."""
         said = self._attributes.get(self._number(entity), {})
         return values.copied(said.get(text(name, "name", messages.NAME_MAX), default))
 
     @property
     def shared(self) -> Mapping[str, Any]:
-        """The values that all clients know, a copy."""
+        """The shared values of the game by name, as a copy."""
         return MappingProxyType({name: values.copied(value) for name, value in self._shared.items()})
 
     def share(self, name: str, value: Any) -> None:
-        """Tells all clients, also those who join later, a value of the game: the time left, a score. None: no more.
+        """Sets a shared value of the game, such as the time left. It is sent to all clients, also to later ones.
 
-        It is told as it is now: who changes a list later has to say so again.
+        The value is sent as it is now. If you change a list later, call `share` again.
+
+        Args:
+            name: name of the value, 1 to 32 characters.
+            value: any MessagePack value of at most 256 bytes; None removes the value.
 
         Raises:
-            SceneError: more than 32 values, or more than 256 bytes.
+            SceneError: the game would have more than 32 shared values, or the value has more than 256 bytes.
         """
         self.turn.check("share")
         payload = values.checked(name, value)
@@ -272,10 +317,15 @@ class Stage:
         self._shared_message = encode(Shared(self._shared))
 
     def send(self, name: str, data: Any = None, to: Player | Iterable[Player] | None = None) -> None:
-        """Tells one player, some or (None) all that something has happened: `Happened` in the client.
+        """Sends a game event; the client gets it as `Happened`.
+
+        Args:
+            name: name of the event, 1 to 32 characters.
+            data: any MessagePack value of at most 1,024 bytes.
+            to: one player, several players, or None for all.
 
         Raises:
-            SceneError: the name is longer than 32 characters, the data than 1,024 bytes as MessagePack.
+            SceneError: the name or the data are too long, the data are no MessagePack value, or `to` is wrong.
         """
         self.turn.check("send")
         text(name, "name", messages.NAME_MAX)
@@ -287,47 +337,48 @@ class Stage:
         self._outgoing.append((entities, encode(Happened(self.tick, name, payload))))
 
     def soon(self, act: Callable[..., object], *arguments: Any) -> None:
-        """Calls a function within the next tick, ahead of the other hooks: the way into a game from elsewhere.
+        """Calls a function within the next tick, before the other hooks.
 
-        May be called at any time and from any thread, callbacks of asyncio included. The functions are called in the
-        order in which they came. One that raises is reported and counted as a failing hook is.
+        `soon` may be called at any time and from any thread or callback of asyncio; it is the way to change a game from
+        there. The functions are called in the order of the calls. If one raises, the exception is logged and counted
+        like that of a hook.
 
         Args:
             act: the function.
-            arguments: are handed to it.
+            arguments: its arguments.
 
         Raises:
-            OutOfTurnError: 10,000 functions wait already: the game does not tick.
-            RulesError: it is none, or is async.
+            OutOfTurnError: 10,000 functions wait already; the game probably does not tick.
+            RulesError: `act` is not a function, or is async.
         """
         checked_function(act, "soon: act")
         if len(self._soon) >= SOON_MAX:
             raise OutOfTurnError(f"soon: {SOON_MAX} functions wait already; does the game tick?")
         self._soon.append((act, arguments))
 
-    # -- what the game calls -----------------------------------------------------------------------------------
+    # -- called by the game ------------------------------------------------------------------------------------
 
     def joined(self, player: Player) -> None:
-        """A player has an entity."""
+        """Sets the name of a new player as an attribute, and calls `on_join`."""
         if player.name:
             self.set(player.entity, "name", player.name)
         player.announced = True
         self._call(self._rules.on_join, player)
 
     def left(self, player: Player) -> None:
-        """A player leaves, and the entity with it, if the rules have not removed that already."""
+        """Calls `on_leave`, and removes the player's entity if the rules have not removed it."""
         if player.announced:
             self._call(self._rules.on_leave, player)
         if player.entity in self._world:
             self._remove(player.entity)
 
     def fell_out(self, entity: int) -> bool:
-        """Whether the rules have seen to an entity that is below the floor."""
+        """Calls `on_fell_out` for an entity below the floor. Returns whether the rules dealt with it or removed it."""
         seen_to = self._call(self._rules.on_fell_out, entity)
         return (isinstance(seen_to, TRUTH) and bool(seen_to)) or entity not in self._world
 
     def command(self, player: Player, command: Command) -> int:
-        """Has the rules carry out a command; the verdict."""
+        """Carries out a command of a client by `on_command`. Returns the verdict."""
         try:
             payload = unpack_value(command.payload)
         except ProtocolError:
@@ -341,7 +392,7 @@ class Stage:
         return messages.FORBIDDEN if isinstance(done, TRUTH) and not done else messages.DONE
 
     def may_edit(self, player: Player, edit: Edit) -> bool:
-        """Whether the rules allow an edit; not, if they fail."""
+        """Returns whether the rules allow an edit. A `can_edit` that raises does not allow it."""
         return bool(self._call(self._can_edit, player, edit, failed=False))
 
     def _can_edit(self, player: Player, edit: Edit) -> object:
@@ -351,37 +402,41 @@ class Stage:
         return checked_result(allowed, "can_edit")
 
     def start(self) -> None:
-        """Tells the rules, once in a game's life, that the world is there; and does what was to be done soon."""
+        """Calls `on_start` in the first tick of a new game, then the functions that were passed to `soon`."""
         if not self._started:
             self._started = True
             self._call(self._rules.on_start)
-        for _ in range(len(self._soon)):  # what they hand over in turn is for the tick after
+        for _ in range(len(self._soon)):  # functions that these pass to `soon` wait for the next tick
             act, arguments = self._soon.popleft()
             self._call(act, *arguments)
 
     def act(self) -> None:
-        """The part of the rules in a tick that nobody asks for."""
+        """Calls `on_contact` for new contacts, then `on_tick`."""
         for a, b in self._contacts.begun() if self._told_contacts else ():
             if a in self._world and b in self._world:
                 self._call(self._rules.on_contact, a, b)
         self._call(self._rules.on_tick)
 
     def stepped(self) -> None:
-        """The step is over."""
+        """Takes note of what the step has changed, for `on_contact`. Call it after the step."""
         if self._told_contacts:
             self._contacts.stepped()
 
     def tell(self, most: int) -> None:
-        """Queues the events of this tick for the players, at most `most` for each; also for those who are away."""
+        """Puts the game events of this tick into the players' outboxes, also of players without a connection.
+
+        Args:
+            most: maximum number of events in one outbox.
+        """
         for entities, message in self._outgoing:
             for entity in self.players if entities is None else entities & self.players.keys():
                 player = self.players[entity]
-                if player.inputs.wheel is None:  # to a player inside the server, nothing is sent
+                if player.inputs.wheel is None:  # an in-process player has no client to send to
                     self._counters.events_dropped += player.outbox.add(self._world.tick, message, most)
         self._outgoing.clear()
 
     def show(self, session: Session) -> None:
-        """Files the shared values for a client, if it does not have them as they are."""
+        """Queues the shared values for a client if they have changed since it got them."""
         if session.shared != self._version:
             session.shared = self._version
             session.shared_due = self._shared_message
@@ -399,19 +454,28 @@ class Stage:
         self.log.note_removal(entity)
 
     def _number(self, entity: object) -> int:
-        """The number of an entity, as Python's own."""
+        """Checks the number of an entity, which need not exist, and returns it as an int of Python.
+
+        Raises:
+            SceneError: it is not a whole number, or out of range.
+        """
         if isinstance(entity, Player):
             raise SceneError(f"entity = {shown(entity)}: is a player; its entity is `player.entity`")
         return whole(entity, "entity", 1, ENTITY_MAX)
 
     def _known(self, entity: object) -> int:
-        """The number of an entity that is there."""
+        """Checks the number of an existing entity and returns it as an int of Python.
+
+        Raises:
+            MissingError: there is no such entity.
+            SceneError: it is not a whole number, or out of range.
+        """
         number = self._number(entity)
-        self._world.awake(number)  # raises where it is not
+        self._world.awake(number)  # raises MissingError if there is no such entity
         return number
 
     def _call(self, hook: Any, *arguments: Any, failed: Any = None) -> Any:
-        """Calls a hook; where it raises, that is counted, and `failed` is the answer."""
+        """Calls a hook and returns its result. If it raises, counts and logs that, and returns `failed`."""
         try:
             return checked_result(hook(*arguments), getattr(hook, "__name__", "a function"))
         except Exception:
@@ -425,8 +489,12 @@ def _overrides(rules: Rules, name: str) -> bool:
 
 
 def _entities_of(to: object) -> frozenset[int]:
-    """The entities of a player, or of some."""
+    """Returns the entities of a player or of several players.
+
+    Raises:
+        SceneError: `to` is neither.
+    """
     players = [to] if isinstance(to, Player) else list(to) if isinstance(to, Iterable) else [None]
     if not all(isinstance(player, Player) for player in players):
-        raise SceneError(f"to = {shown(to)}: must be a `Player`, some of them, or None for all")
+        raise SceneError(f"to = {shown(to)}: must be a `Player`, several of them, or None for all")
     return frozenset(player.entity for player in players if isinstance(player, Player))

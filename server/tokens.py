@@ -1,4 +1,4 @@
-"""Signed tokens (JWT, HS256) with a subject and an expiry: who may come in, until when; and issuing them."""
+"""Signed tokens (JWT, HS256) with a subject and an expiry time: checks them for the game, and issues them."""
 
 import json
 import math
@@ -16,20 +16,21 @@ from shared.checks import text, utf8
 
 ALGORITHM = "HS256"
 KEY_BYTES_MIN = 32
-"""HS256 is as strong as its key: one shorter than its digest is refused."""
+"""Minimum length of a key in bytes: that of an HS256 digest. A shorter key would make the signature weaker."""
 KEY_VARIABLE = "SOVEREIGN_AUTH_KEY"
-"""The key itself, in the environment; there is no flag for it, since everybody can see those."""
+"""Environment variable with the key itself. There is no flag for it: every user of a machine can read flags."""
 LEEWAY_S = 5.0
-"""So much may the clocks of who issues and of who checks differ."""
+"""Seconds by which the clocks of the issuer and of this server may differ."""
 HOURS_MAX = 24 * 366
+"""Maximum validity of a token that `sovereign-server token` issues, in hours."""
 
 
 class Tokens:
-    """Checks tokens; an `Authenticator`.
+    """An `Authenticator` that checks signed tokens.
 
     Args:
-        key: with which they must be signed.
-        clock: seconds since 1970.
+        key: the key with which a token must be signed.
+        clock: returns seconds since 1970.
     """
 
     def __init__(self, key: bytes, clock: Callable[[], float] = time.time) -> None:
@@ -38,17 +39,17 @@ class Tokens:
         self._signatures = jwt.PyJWS(algorithms=[ALGORITHM])
 
     def __call__(self, token: str) -> str:
-        """The subject of a token.
+        """Checks a token and returns its subject.
 
         Raises:
-            AuthError: it is none, it is not signed with the key, or it is not its time.
+            AuthError: it is not a token, is not signed with the key, has no subject, has expired or is not valid yet.
         """
         if not token:
-            raise AuthError("this server asks for a token")
+            raise AuthError("this server requires a token")
         claims, now = self._signed(token), self._clock()
         expiry, begin = _time(claims, "exp"), _time(claims, "nbf")
         if expiry is None:
-            raise AuthError("the token has no expiry")
+            raise AuthError("the token has no expiry time")
         if now >= expiry + LEEWAY_S:
             raise AuthError(f"the token expired {now - expiry:.0f} s ago")
         if begin is not None and now < begin - LEEWAY_S:
@@ -59,7 +60,7 @@ class Tokens:
         if len(subject) > SUBJECT_MAX:
             raise AuthError(f"the token's subject is longer than {SUBJECT_MAX} characters")
         if not utf8(subject):
-            raise AuthError(f"the token's subject {subject!r} is not a text that UTF-8 can hold")
+            raise AuthError(f"the token's subject {subject!r} cannot be encoded in UTF-8")
         return subject
 
     def _signed(self, token: str) -> dict[str, Any]:
@@ -70,46 +71,56 @@ class Tokens:
         except jwt.InvalidAlgorithmError:
             raise AuthError(f"the token is not signed by {ALGORITHM}") from None
         except (jwt.PyJWTError, ValueError, TypeError, RecursionError):
-            raise AuthError("this is no token") from None
+            raise AuthError("the token is not a JWT") from None
         if not isinstance(claims, dict):
-            raise AuthError("this is no token")
+            raise AuthError("the token is not a JWT")
         return claims
 
 
 def _time(claims: Mapping[str, Any], name: str) -> float | None:
-    """A claim in seconds since 1970; None if there is none.
+    """Returns a claim in seconds since 1970; None if the token does not have it.
 
     Raises:
-        AuthError: it is no number.
+        AuthError: it is not a number.
     """
     value = claims.get(name)
     if value is None:
         return None
     if type(value) not in (int, float) or not -1e15 < value < 1e15 or math.isnan(value):
-        raise AuthError(f"the token's {name} is no time")
+        raise AuthError(f"the token's {name} is not a time")
     return float(value)
 
 
 def issue(key: bytes, subject: str, seconds: float, now: float) -> str:
-    """A token for a subject, valid for so long from now (seconds since 1970) on.
+    """Returns a signed token.
+
+    Args:
+        key: the key to sign with.
+        subject: name of the player, 1 to `SUBJECT_MAX` characters.
+        seconds: how long the token is valid.
+        now: begin of its validity, in seconds since 1970.
 
     Raises:
-        SceneError: the subject is too long, or no text that UTF-8 can hold.
+        SceneError: the subject is empty or too long, or UTF-8 cannot encode it.
     """
     text(subject, "subject", SUBJECT_MAX)
     return jwt.encode({"sub": subject, "iat": int(now), "exp": math.ceil(now + seconds)}, key, ALGORITHM)
 
 
 def read_key(path: str | None, environment: Mapping[str, str]) -> bytes:
-    """The key in a file, without space around it; without a file, that in the environment.
+    """Returns the key for tokens.
+
+    Args:
+        path: a file with the key, of which leading and trailing spaces are ignored; None: read `KEY_VARIABLE` instead.
+        environment: the environment variables.
 
     Raises:
-        SettingsError: there is none, or it is too short.
+        SettingsError: there is no key, or it is too short.
     """
     if path is None:
         origin, key = KEY_VARIABLE, environment.get(KEY_VARIABLE, "").encode(errors="surrogateescape")
         if not key:
-            raise SettingsError(f"auth_key_file is not set, and neither is {KEY_VARIABLE}: tokens need a key")
+            raise SettingsError(f"tokens need a key, but neither auth_key_file nor {KEY_VARIABLE} is set")
     else:
         origin = f"auth_key_file = {path!r}"
         try:
@@ -117,23 +128,27 @@ def read_key(path: str | None, environment: Mapping[str, str]) -> bytes:
         except OSError as error:
             raise SettingsError(f"{origin}: cannot be read ({error.strerror or error})") from error
     if len(key) < KEY_BYTES_MIN:
-        raise SettingsError(f"{origin}: a key has {KEY_BYTES_MIN} bytes or more, like that of: openssl rand -hex 32")
+        raise SettingsError(
+            f"{origin}: a key of {len(key)} bytes; it needs at least {KEY_BYTES_MIN}, as made by: openssl rand -hex 32"
+        )
     return key
 
 
 def main(arguments: Sequence[str], environment: Mapping[str, str] = os.environ) -> int:
-    """`sovereign-server token`: prints a token.
+    """Runs `sovereign-server token`: prints a token. Returns the exit code 0.
 
     Raises:
         SettingsError: the key or an argument cannot be used.
     """
     parser = Parser(
-        prog="sovereign-server token", description="Issues a token that lets a player in.", allow_abbrev=False
+        prog="sovereign-server token", description="Issues a token with which a player can join.", allow_abbrev=False
     )
-    parser.add_argument("--subject", required=True, help=f"who the player is, up to {SUBJECT_MAX} characters")
-    parser.add_argument("--hours", type=float, default=24.0, help="how long the token is valid (default: 24)")
+    parser.add_argument("--subject", required=True, help=f"name of the player, up to {SUBJECT_MAX} characters")
+    parser.add_argument("--hours", type=float, default=24.0, help="hours for which the token is valid (default: 24)")
     parser.add_argument(
-        "--auth-key-file", default=environment.get("SOVEREIGN_AUTH_KEY_FILE"), help=f"the key; or {KEY_VARIABLE}"
+        "--auth-key-file",
+        default=environment.get("SOVEREIGN_AUTH_KEY_FILE"),
+        help=f"file with the key; alternatively the key itself in {KEY_VARIABLE}",
     )
     flags = parser.flags(arguments)
     subject, hours = flags["subject"], flags["hours"]

@@ -128,8 +128,8 @@ def left(game: Game, token: str = "", change: Callable[[Client], None] | None = 
 @pytest.mark.parametrize(
     ("token", "wanted"),
     [
-        ("", "this server asks for a token"),
-        ("rubbish", "this is no token"),
+        ("", "this server requires a token"),
+        ("rubbish", "the token is not a JWT"),
         (signed(GOOD | {"exp": NOW - 90}), "the token expired 90 s ago"),
         (signed(GOOD, OTHER), "the token is signed with another key"),
     ],

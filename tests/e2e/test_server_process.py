@@ -123,7 +123,7 @@ def test_players_show_tokens_which_are_in_no_log(tmp_path: Path) -> None:
     ) as server:
         address = server.address()
         assert says(address, Hello(VERSION, {}, "ann", good)) is Welcome
-        for token, reason in (("", "asks for a token"), (forged, "another key"), (good[:-4] + "AAAA", "another key")):
+        for token, reason in (("", "requires a token"), (forged, "another key"), (good[:-4] + "AAAA", "another key")):
             bye = says(address, Hello(VERSION, {}, "eve", token))
             assert isinstance(bye, Bye)
             assert bye.code == UNAUTHORISED

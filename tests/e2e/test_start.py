@@ -183,7 +183,7 @@ def test_bad_settings(tmp_path: Path) -> None:
     assert "--prot 1 (did you mean --port?)" in fails("--prot", "1")
     assert "SOVEREIGN_PROT: there is no such setting (did you mean SOVEREIGN_PORT?)" in fails(SOVEREIGN_PROT="1")
     assert "tick_rate = 0 (from SOVEREIGN_TICK_RATE)" in fails(SOVEREIGN_TICK_RATE="0")
-    assert "auth_key_file is not set" in fails("--auth", "token")
+    assert "neither auth_key_file nor" in fails("--auth", "token")
     assert "auth = 'no.such:thing': cannot be used" in fails("--auth", "no.such:thing")
     assert "tls_cert = 'nowhere'" in fails("--tls-cert", "nowhere", "--tls-key", "nowhere")
     assert "no_such" in fails("--config", broken(tmp_path, "no_such = 1"))
@@ -191,9 +191,10 @@ def test_bad_settings(tmp_path: Path) -> None:
 
 def test_bad_commands() -> None:
     assert fails("chek") == (
-        "error: 'chek': no such command (did you mean check?); there are token and check, or just flags (--help)\n"
+        "error: 'chek': no such command (did you mean check?); the commands are token and check; "
+        "to start a server, give only flags (--help)\n"
     )
-    assert fails("my_game:Tag").startswith("error: 'my_game:Tag': no such command; there are")
+    assert fails("my_game:Tag").startswith("error: 'my_game:Tag': no such command; the commands are")
     assert "are required: --subject; --help lists all flags" in fails("token")
     assert "--urk x (did you mean --url?)" in fails("check", "--urk", "x")
 
@@ -210,8 +211,8 @@ def test_bad_addresses() -> None:
         port = str(taken.getsockname()[1])
         line = fails("--scene", "flat", "--port", port)
         assert line == (
-            f"error: host = '127.0.0.1', port = {port}: in use by another program, so end that one or choose another "
-            "--port (0: any that is free)\n"
+            f"error: host = '127.0.0.1', port = {port}: in use by another program; end that one or choose another "
+            "--port (0: any free one)\n"
         )
     assert "no.such.host.invalid" in fails("--scene", "flat", "--host", "no.such.host.invalid")
     assert "a..b" in fails("--scene", "flat", "--host", "a..b")

@@ -46,7 +46,7 @@ def wanted(bad: str, field: str) -> str:
 
 @pytest.mark.parametrize("bad", BAD)
 def test_the_subject_of_a_token(bad: str) -> None:
-    with pytest.raises(AuthError, match=r"the token's subject '.*\\u.*' is not a text that UTF-8 can hold"):
+    with pytest.raises(AuthError, match=r"the token's subject '.*\\u.*' cannot be encoded in UTF-8"):
         tokens.Tokens(KEY, lambda: NOW)(token(bad))
     with pytest.raises(SceneError, match=wanted(bad, "subject")):
         tokens.issue(KEY, bad, 60, NOW)

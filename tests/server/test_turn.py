@@ -77,7 +77,7 @@ def test_a_hook_that_would_do_nothing_is_named(hook: str, method: Any, why: str)
 )  # fmt: skip
 def test_a_misspelt_hook_is_named_everywhere(name: str, meant: str) -> None:
     hint = rf" \(did you mean {meant}\?\)" if meant else ""
-    said = rf"^Mine\.{name} is no hook, and nothing calls it{hint}; there are prepare, on_"
+    said = rf"^Mine\.{name} is no hook, and nothing calls it{hint}; the hooks are prepare, on_"
     for enter in everywhere(made(**{name: lambda self: None})):
         with pytest.raises(RulesError, match=said):
             enter()
@@ -100,7 +100,7 @@ def test_what_prepare_raises_is_told_with_its_name() -> None:
         self.game.spawn("player", (0, 0, 0))
         return scene
 
-    with pytest.raises(RulesError, match=r"^Mine\.prepare failed \(AttributeError: self.game is not there yet"):
+    with pytest.raises(RulesError, match=r"^Mine\.prepare failed \(AttributeError: self.game is not available"):
         prepared(made(prepare=prepare), FLAT)
     with pytest.raises(SceneError, match="like = 'no such'"):
         prepared(made(prepare=lambda self, scene: scene.with_template("a", like="no such")), FLAT)
@@ -119,7 +119,7 @@ class Silent(Rules):
 
 
 @pytest.mark.parametrize(
-    ("name", "why"), [("TooEarly", "AttributeError: self.game is not there yet"), ("Silent", "Silent.on_tick: .*async")]
+    ("name", "why"), [("TooEarly", "AttributeError: self.game is not available"), ("Silent", "Silent.on_tick: .*async")]
 )
 def test_rules_that_are_loaded_by_name_are_checked(name: str, why: str) -> None:
     with pytest.raises(RulesError, match=rf"^game = '{__name__}:{name}': .*{why}"):

@@ -188,8 +188,8 @@ def test_numbers_of_numpy_do_what_pythons_do() -> None:
         ({"seed": 1.5}, SceneError, "seed = 1.5: must be a whole number"),
         ({"seed": True}, SceneError, "seed = True: must be a whole number"),
         ({"authenticate": "token"}, RulesError, "authenticate = 'token': must be a function"),
-        ({"rules": Rules}, RulesError, r"rules = Rules: is a class; give an instance of it, Rules\(\)"),
-        ({"rules": "tag:Tag"}, RulesError, "rules = 'tag:Tag': is no subclass"),
+        ({"rules": Rules}, RulesError, r"rules = Rules: is a class; pass an instance, Rules\(\)"),
+        ({"rules": "tag:Tag"}, RulesError, "rules = 'tag:Tag': must be an instance of a subclass"),
     ],
 )
 def test_a_game_of_wrong_parts_is_refused(given: dict[str, Any], error: type[Exception], said: str) -> None:
