@@ -1,4 +1,4 @@
-"""What a server counts."""
+"""The counters of a game."""
 
 from dataclasses import dataclass, field
 
@@ -7,12 +7,13 @@ from server.session import InputQueue
 
 @dataclass
 class Counters:
-    """What has happened since the start."""
+    """Counts since the start of the process. `server.metrics` describes most of them."""
 
     joined: int = 0
     left: int = 0
     resumed: int = 0
     refused: int = 0
+    """Clients refused at their hello: wrong version, wrong scene, no valid token, server full."""
     malformed: int = 0
     kicked: int = 0
     inputs_used: int = 0
@@ -26,15 +27,15 @@ class Counters:
     fell_out: int = 0
     resyncs: int = 0
     closed: dict[int, int] = field(default_factory=dict)
-    """Clients told to go, by close code."""
+    """Connections that the server closed, by close code."""
     rules_failed: int = 0
     events_dropped: int = 0
-    """Events of the rules that waited too long for a slow client, which is told so."""
+    """Game events dropped because too many waited for one player. The client is notified."""
     corrections: int = 0
-    """As the clients report them."""
+    """Corrections that the clients have reported."""
 
     def add(self, queue: InputQueue) -> None:
-        """Counts in how one player's inputs have fared."""
+        """Adds the counts of one player's inputs."""
         self.inputs_used += queue.used
         self.inputs_late += queue.late
         self.inputs_substituted += queue.substituted

@@ -1,11 +1,11 @@
-"""The authoritative game: external events are filed, the tick acts.
+"""The authoritative game: it queues external events, and changes the world in a tick only.
 
-Theory of operation. Whatever arrives is checked and filed with its session; the world changes in `tick` and
-nowhere else, in the order in which that function reads. A tick never waits for a client: each is sent the newest
-snapshot if its link has room for one, and otherwise nothing (it gets the union of what it missed with the next).
-A peer's mistake closes its connection with a code and a reason; no input of a peer raises. Links call back: one may
-report itself as lost while it is being sent to or closed, so wherever that can happen a copy of the sessions is gone
-through.
+Theory of operation. A message that arrives is checked and queued with its session. The world changes only in `tick`, in
+the order of that function's lines. A tick never waits for a client: it sends the newest snapshot to each client whose
+connection has room for one. A client that was left out gets the union of what it missed with its next snapshot. An
+error of a peer closes its connection with a code and a reason; no message of a peer raises an exception here. A link
+may report itself as lost during a call of its `send` or `close`. Loops in which that can happen iterate over a copy of
+the sessions.
 """
 
 import dataclasses
@@ -47,29 +47,30 @@ from shared.messages import (
 from shared.scene import Scene
 
 RESYNC_S = 1.0
-"""A client may ask for everything anew so often."""
+"""Minimum time between two resynchronisations that one client requests, in seconds."""
 BURST_S, BURST_TICKS_MIN = 1.0, 32
-"""A client may send this many seconds' (at least this many ticks') worth of messages at once, and as many more as the
-server itself is behind."""
+"""Size of a burst of messages: a client may send those of this many seconds (at least of this many ticks) at once.
+If ticks of the server are late, the messages of that time are allowed besides."""
 SEED_MAX = (1 << 63) - 1
+"""Largest seed of the random numbers."""
 AWAY_S = 1.0
-"""After a pause between two ticks of more than this many seconds, the clients' silence is not counted against them."""
+"""Seconds. After a longer pause between two ticks, the silence of clients during it is not counted against them."""
 
 
 class Game:
-    """One world and its clients.
+    """One world, its players and their connections.
 
     Args:
-        scene: the rules; its terrain is generated at once.
-        limits: bounds.
-        compiled: as for `World`.
-        world: to be played in, with its blocks; by default a new one.
-        saves: where that world is saved, if it is: the game goes on with what was kept beside it, and a verdict is told
-            when no crash can undo it any more.
-        rules: what happens beyond moving and editing.
-        seed: of their randomness.
-        authenticate: gives the subject of the token that a client shows; a `ValueError` of it refuses the client,
-            with its text. None: whoever comes may play.
+        scene: the scene to play.
+        limits: the limits.
+        compiled: whether the kernel is compiled, as for `World`.
+        world: the world to play in, with its blocks; None: a new one with the terrain of the scene.
+        saves: the store of the world, if it is saved. The game restores the persisted state from it, and sends the
+            result of a command when no crash can undo the command any more.
+        rules: the rules of the game; None: players can only move and edit.
+        seed: seed of the rules' random numbers.
+        authenticate: returns the subject of a client's token, or raises a `ValueError`, whose text is sent to the
+            refused client. None: anyone may play.
     """
 
     def __init__(
@@ -119,16 +120,16 @@ class Game:
         self._burst = in_ticks(BURST_S, scene.tick_rate, BURST_TICKS_MIN) * self.limits.messages_per_tick
         self._rules = scene.to_table()
 
-    # -- what arrives is filed -----------------------------------------------------------------------------
+    # -- external events: queued ---------------------------------------------------------------------------
 
     def open(self, link: Link, now: float) -> Session:
-        """A connection is there; its client has to say hello."""
+        """Adds a new connection and returns its session. Its client has to send a Hello within `Limits.hello_s`."""
         session = Session(link, now)
         self.sessions.append(session)
         return session
 
     def receive(self, session: Session, data: bytes, now: float) -> None:
-        """One message of a client."""
+        """Checks one message of a client and queues it, or closes the connection if it is not allowed."""
         if session.closed:
             return
         session.heard = now
@@ -154,7 +155,7 @@ class Game:
         elif isinstance(message, Ping):
             tick = self.world.tick + 1 - self._ticks_left(now)
             session.send(encode(Pong(message.sent, tick)))
-            if session.corrections >= 0:  # what it begins with has been told over the connection before
+            if session.corrections >= 0:  # the first report of a connection includes those of the connection before
                 self.counters.corrections += max(message.corrections - session.corrections, 0)
             session.corrections = max(message.corrections, session.corrections)
         elif isinstance(message, Hello) and not session.entity and session.hello is None:
@@ -173,29 +174,40 @@ class Game:
             self.roster.dismiss(session)
             session.close(messages.GOING_AWAY, "goodbye")
         else:
-            self._kick(session, messages.MALFORMED, f"{type(message).__name__} at this point")
+            state = "after the join" if session.entity else "before the join"
+            self._kick(session, messages.MALFORMED, f"unexpected {type(message).__name__} {state}")
 
     def lost(self, session: Session, now: float) -> None:
-        """The connection of a session is gone."""
+        """Removes a session whose connection is gone. Its player may reconnect."""
         session.closed = True
         if session in self.sessions:
             self.sessions.remove(session)
         self.roster.lost(session, now)
 
     def shut_down(self, reason: str, wait: float) -> None:
-        """Tells every client, with the seconds after which to come back, and closes the connections."""
+        """Closes all connections.
+
+        Args:
+            reason: the reason, sent to the clients.
+            wait: seconds after which the clients should reconnect.
+        """
         for session in tuple(self.sessions):
             if not session.closed:
                 self._end(session, messages.GOING_AWAY, reason, wait)
 
     def keep(self) -> list[list[Any]]:
-        """What belongs to the game and is not in its world, for a checkpoint."""
+        """Returns the persisted state and the unanswered commands as notes, for a checkpoint."""
         return [*keeping.whole(self.stage.kept), *self.orders.notes()]
 
-    # -- the tick acts -------------------------------------------------------------------------------------
+    # -- the tick: the only place where the world changes --------------------------------------------------
 
     def tick(self, deadline: float, now: float) -> None:
-        """One tick. `deadline`: the time it was due, by the same clock as `now`; it ends tick T at `deadline`."""
+        """Computes the next tick.
+
+        Args:
+            deadline: the time at which this tick was due, in seconds of the same clock as `now`.
+            now: the current time in seconds.
+        """
         self._excuse(now)
         self._deadline, self._ticked = deadline, now
         with self.stage.turn:
@@ -215,7 +227,7 @@ class Game:
         self._check_clocks(now)
 
     def _excuse(self, now: float) -> None:
-        """The time in which the server itself had no turn (it was suspended) is counted against nobody."""
+        """Extends the time limits of all clients after a pause of the server itself, such as a suspended process."""
         paused_s = 0.0 if self._ticked is None else now - self._ticked - 1 / self.scene.tick_rate
         if paused_s > AWAY_S:
             credit = paused_s * self.scene.tick_rate * self.limits.messages_per_tick
@@ -271,9 +283,9 @@ class Game:
         for session in tuple(self.sessions):
             if session.allowance:
                 most = self.limits.messages_per_tick
-                if session.allowance < 0:  # what exceeds the burst has been found excusable
+                if session.allowance < 0:  # messages beyond the burst were allowed because of late ticks
                     session.allowance = min(max(session.allowance, -self._burst) + most, 0.0)
-                else:  # for messages that waited while the server had no turn
+                else:  # credit for messages that waited during a pause of the server
                     session.allowance = max(session.allowance - most, 0.0)
             if session.entity and not session.closed:
                 try:
@@ -281,12 +293,16 @@ class Game:
                     if session.greeting is None or self._greeted(session, *session.greeting):
                         self.delivery.serve(session, now)
                     else:
-                        session.sent_at = now  # it waits for the disk, and nobody for it
+                        session.sent_at = now  # the welcome waits for the disk, which is not a stall of the client
                 except Exception:
                     self._break(session, "serving a client")
 
     def _greeted(self, session: Session, tick: int, welcome: bytes) -> bool:
-        """Lets a client in once its token will last; at once, if it cannot be saved: then it plays all the same."""
+        """Sends the welcome once the resume token in it is durable, or at once if nothing can be saved.
+
+        Returns:
+            Whether the welcome has been sent.
+        """
         if self.orders.durable_tick < tick and not self.orders.trouble:
             return False
         session.send(welcome)
@@ -301,22 +317,22 @@ class Game:
                 if session.hello is None and now - session.opened > self.limits.hello_s:
                     self._kick(session, messages.NO_HELLO, f"no hello within {self.limits.hello_s:g} s")
             elif now - session.heard > self.limits.silence_s:
-                self._kick(session, messages.TOO_SLOW, f"nothing heard for {self.limits.silence_s:g} s")
+                self._kick(session, messages.TOO_SLOW, f"no message received for {self.limits.silence_s:g} s")
             elif now - session.sent_at > self.limits.stalled_s:
-                self._kick(session, messages.TOO_SLOW, f"nothing read for {self.limits.stalled_s:g} s")
+                self._kick(session, messages.TOO_SLOW, f"the client read nothing for {self.limits.stalled_s:g} s")
 
     # -- inside --------------------------------------------------------------------------------------------
 
     def _owes(self, session: Session, now: float) -> bool:
-        """Whether ticks that are late explain how much a session has sent since the latest."""
+        """Returns whether the ticks that are late now explain why a session exceeds its allowance of messages."""
         behind = 0.0 if self._ticked is None else max((now - self._ticked) * self.scene.tick_rate - 1, 0.0)
         return session.allowance >= -self._burst - behind * self.limits.messages_per_tick
 
     def _ticks_left(self, now: float) -> float:
-        """Ticks until the next tick's deadline; negative if it has passed.
+        """Returns the ticks until the next tick's deadline, with a fraction; negative if it has passed.
 
-        Of more missed ticks than are caught up on, the schedule drops the earliest: they do not count as time here, or
-        every client would be told of a time that never comes.
+        If more ticks are missed than are caught up on, the schedule drops the earliest. They do not count here;
+        otherwise clients would be sent a server time that never comes.
         """
         if self._deadline is None:
             return 1.0
@@ -350,10 +366,10 @@ class Game:
             try:
                 session.subject = checked_subject(subject)
             except ValueError:
-                self.faults.report("what authenticates clients")
-                self._refuse(session, messages.UNAUTHORISED, "the server cannot use what its check of tokens says")
+                self.faults.report("the result of the authenticator")
+                self._refuse(session, messages.UNAUTHORISED, "the server's authenticator returned no valid subject")
                 return
-        session.pacing.answered(now - session.opened, 0, now)  # of a path that was empty
+        session.pacing.answered(now - session.opened, 0, now)  # a round trip with nothing on the way
         session.hello = hello._replace(token="")
 
     def _refuse(self, session: Session, code: int, reason: str) -> None:
@@ -362,12 +378,19 @@ class Game:
 
     def _kick(self, session: Session, code: int, reason: str) -> None:
         self.counters.kicked += 1
-        if code != messages.TOO_SLOW:  # that is the network's fault
+        if code != messages.TOO_SLOW:  # slowness is the network's fault: the player may reconnect
             self.roster.dismiss(session)
         self._end(session, code, reason)
 
     def _break(self, session: Session, what: str) -> None:
-        """An exception of ours has hit one client: it is let go without a word, may come back, and the tick goes on."""
+        """Handles an exception in our own code that affects one client: closes its connection, and the tick goes on.
+
+        The player may reconnect.
+
+        Args:
+            session: the client's session.
+            what: what the exception interrupted, for the log.
+        """
         self.faults.report(what)
         try:
             session.close(messages.INTERNAL, "internal error")
@@ -385,7 +408,7 @@ class Game:
             self._break(session, "saying goodbye")
 
     def stats(self) -> dict[str, Any]:
-        """Counters, with those of the clients that are connected."""
+        """Returns all counters, including the inputs of the present players, and the size of the game."""
         totals = dataclasses.replace(self.counters)
         for player in self.players.values():
             totals.add(player.inputs)

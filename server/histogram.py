@@ -1,12 +1,12 @@
-"""Durations, counted in buckets: bounded memory, whatever is recorded and for however long."""
+"""A histogram of durations. It takes the same memory for any number of durations."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 
 FINE = 32
-"""Below so many microseconds each one has a bucket of its own; above, each doubling has half as many (6 % wide)."""
+"""Microseconds below which each has its own bucket. Above, each doubling has `FINE / 2` buckets, up to 6 % wide."""
 BUCKETS = FINE + 26 * FINE // 2
-"""Up to 2^31 us, more than half an hour; what is longer goes into the last one."""
+"""Number of buckets. They reach to 2^31 us (35 minutes); the last one takes longer durations, too."""
 
 
 def _bucket(us: int) -> int:
@@ -17,7 +17,7 @@ def _bucket(us: int) -> int:
 
 
 def _upper_us(bucket: int) -> int:
-    """The lowest duration that no longer goes into a bucket."""
+    """Returns the lowest duration above a bucket, in microseconds."""
     if bucket < FINE:
         return bucket + 1
     shift = bucket // (FINE // 2) - 1
@@ -26,7 +26,7 @@ def _upper_us(bucket: int) -> int:
 
 @dataclass
 class Histogram:
-    """Counts durations given in seconds, and answers in milliseconds, at most 6 % too high."""
+    """A histogram of durations that are given in seconds. Quantiles are in milliseconds, at most 6 % too high."""
 
     count: int = 0
     sum_s: float = 0.0
@@ -41,7 +41,7 @@ class Histogram:
             self.max_s = seconds
 
     def quantile_ms(self, q: float) -> float:
-        """An upper bound of the `q` quantile; 0 if nothing was recorded."""
+        """Returns an upper bound of the `q` quantile in milliseconds; 0 if nothing was recorded."""
         left = max(1.0, q * self.count)
         for bucket, n in enumerate(self.buckets):
             left -= n
@@ -50,16 +50,20 @@ class Histogram:
         return self.max_s * 1e3
 
     def summary(self) -> dict[str, float]:
-        """p50, p99 and max, in milliseconds."""
+        """Returns p50, p99 and max in milliseconds."""
         values = {"p50": self.quantile_ms(0.5), "p99": self.quantile_ms(0.99), "max": self.max_s * 1e3}
         return {name: round(value, 3) for name, value in values.items()}
 
     def counts(self) -> list[list[int]]:
-        """For every bucket with something in it, ascending: the lowest duration above it in us, and how many."""
+        """Returns for each non-empty bucket, ascending: the lowest duration above it in us, and its count."""
         return [[_upper_us(bucket), n] for bucket, n in enumerate(self.buckets) if n]
 
     def below(self, bounds_s: Sequence[float]) -> list[int]:
-        """For each bound (ascending), how many durations are certainly below it: no bucket is divided."""
+        """Returns for each bound how many durations are certainly below it; a bucket around a bound does not count.
+
+        Args:
+            bounds_s: the bounds in seconds, ascending.
+        """
         found, n, bucket = [], 0, 0
         for bound_s in bounds_s:
             while bucket < BUCKETS and _upper_us(bucket) <= bound_s * 1e6:
@@ -75,9 +79,13 @@ class Histogram:
 
 
 def between(before: Iterable[Sequence[int]], after: Iterable[Sequence[int]]) -> dict[str, float]:
-    """p50, p99 and max, in milliseconds, of what was recorded between two `counts` of one histogram.
+    """Returns p50, p99 and max in milliseconds of the durations recorded between two moments.
 
-    Each is an upper bound, at most 6 % too high; all are 0 if nothing was.
+    Each is an upper bound, at most 6 % too high, and 0 if nothing was recorded.
+
+    Args:
+        before: the histogram's `counts` at the first moment.
+        after: its `counts` at the second moment.
     """
     earlier = {pair[0]: pair[1] for pair in before}
     counts = [(upper, n - earlier.get(upper, 0)) for upper, n in after]

@@ -1,11 +1,12 @@
-"""The live page: the world from above and the server's figures, as a browser draws them.
+"""The live page: a map of the world and the server's figures, drawn by a browser.
 
-    /              the page, one file that asks for nothing from anywhere else
-    /live          JSON: who is where, what has been counted, and the version of each tile of the map
-    /live/0, 1 ..  a tile of the map: zlib of 64 x 64 u16 heights, then as many u8 kinds, in rows from the south-west
+    /              the page, one file that loads nothing from other servers
+    /live          JSON: positions of entities, figures, and the version of each tile of the map
+    /live/0, 1 ..  a tile of the map: zlib of 64 x 64 u16 heights, then 64 x 64 u8 kinds, in rows from the south-west
 
-All of it is made when it is asked for, at most `ANSWERS_PER_S` times a second however many look, and is bounded: of a
-crowd every so-manieth row is shown, of a large world every so-manieth block. Nobody looking costs nothing.
+The answers are computed when they are requested, at most `ANSWERS_PER_S` times per second for any number of viewers.
+Their size is bounded: of many entities every n-th is shown, of a large world every n-th block. Without viewers the page
+costs nothing.
 """
 
 import base64
@@ -32,25 +33,27 @@ from shared.units import BLOCK, SEGMENT
 from shared.world import World
 
 ANSWERS_PER_S = 8
+"""Maximum number of times per second that `/live` is computed."""
 SHOWN_MAX = 1000
-"""So many players at most are told of, and about as many other entities."""
+"""Maximum number of players in `/live`, and about the maximum number of other entities."""
 SIDE_MAX = 512
-"""The map has at most so many cells along a side, each the column of one block in `step` along both axes."""
+"""Maximum number of cells along a side of the map. A cell shows one column of blocks of every `step` in x and y."""
 VERSION_BYTES = 6
-"""Bytes of a tile's version: JavaScript holds no whole number of eight."""
+"""Bytes of a tile's version. A number in JavaScript cannot hold whole numbers of eight bytes."""
 TILE = 64
-"""Cells along a side of a tile."""
+"""Number of cells along a side of a tile."""
 FIGURES = (
     "tick tick_rate ticks ticks_late skipped_s clients connections entities entities_awake inputs_used inputs_late "
     "inputs_substituted snapshots_sent snapshots_skipped snapshot_bytes terrain_bytes corrections ready uptime_s cpu_s "
     "rss_mb"
 ).split()
-"""What is shown of `/stats`."""
+"""Names of the figures of `/stats` that the page shows."""
 HEADERS = (("Cache-Control", "no-store"), ("X-Content-Type-Options", "nosniff"))
+"""HTTP headers of all answers."""
 
 
 class Relief:
-    """A world's ground from above, in tiles; each is made when it is asked for and has changed since."""
+    """A map of a world's ground in tiles. A tile is computed when it is requested and has changed since."""
 
     def __init__(self, world: World) -> None:
         self._blocks = world.blocks
@@ -64,19 +67,19 @@ class Relief:
         self._packed: dict[int, tuple[int, bytes]] = {}
 
     def versions(self) -> list[int]:
-        """A number for each tile, row by row from the south-west: another one once anything in it has changed."""
+        """Returns the version of each tile, row by row from the south-west. It changes with the blocks of the tile."""
         self._blocks.freshen()
         table = self._table()
         return [self._version(self._part(table, number)) for number in range(self.columns * self.rows)]
 
     def tile(self, number: int) -> bytes:
-        """One tile as it is sent. A height counts from the lowest block of the world, 0 is a hole."""
+        """Returns the bytes of one tile. A height counts from the lowest block of the world; 0 means no block."""
         self._blocks.freshen()
         rows = self._part(self._table(), number)
         version = self._version(rows)
         if self._packed.get(number, (-1, b""))[0] != version:
             heights, kinds = np.zeros((TILE, TILE), "<u2"), np.zeros((TILE, TILE), np.uint8)
-            stride = max(self.step // SEGMENT, 1)  # where a cell is wider than a segment
+            stride = max(self.step // SEGMENT, 1)  # more than 1 if a cell is wider than a segment
             found = self._tops(rows[::stride, ::stride])
             depth, width = found[0].shape
             heights[:depth, :width], kinds[:depth, :width] = found
@@ -84,7 +87,11 @@ class Relief:
         return self._packed[number][1]
 
     def _tops(self, rows: Int64s) -> tuple[Int64s, Kinds]:
-        """Height and kind of the highest block of each column, [y, x], of segments [y, x, z]."""
+        """Returns height and kind of the highest block of each column, [y, x].
+
+        Args:
+            rows: rows of segments in the arrays of `Blocks`, [y, x, z].
+        """
         cells = self._blocks.kinds.reshape(-1, SEGMENT, SEGMENT, SEGMENT)[:, :, :: self.step, :: self.step]
         depth, width = (part * cells.shape[2] for part in rows.shape[:2])
         heights, kinds = np.zeros((depth, width), np.int64), np.zeros((depth, width), np.uint8)
@@ -100,7 +107,7 @@ class Relief:
         return heights, kinds
 
     def _table(self) -> Int64s:
-        """The row of each segment of the scene in the arrays of `Blocks`, [y, x, z]; 0: it is not loaded."""
+        """Returns the row of each segment of the scene in the arrays of `Blocks`, [y, x, z]; 0: not loaded."""
         width, depth, height = self._segments
         table = np.zeros((depth, width, height), np.int64)
         rows = np.fromiter(self._blocks.rows.values(), np.int64, len(self._blocks.rows))
@@ -121,11 +128,12 @@ class Relief:
 
 
 class Live:
-    """The pages of one game.
+    """The live pages of one game.
 
     Args:
-        figures: what `/stats` shows.
-        durations: histograms to be shown, by name.
+        game: the game.
+        figures: returns the figures of `/stats`.
+        durations: returns the histograms to show, by name.
     """
 
     def __init__(
@@ -136,7 +144,7 @@ class Live:
         self._answer: tuple[int, Page] | None = None
 
     def pages(self) -> dict[str, Callable[[], Page]]:
-        """All of them by their paths."""
+        """Returns the functions that make the pages, by path."""
         tiles = range(self._relief.columns * self._relief.rows)
         made = {f"/live/{number}": partial(self._tile, number) for number in tiles}
         return {"/": html_page, "/live": self._state, **made}
@@ -152,7 +160,10 @@ class Live:
         return self._answer[1]
 
     def state(self) -> dict[str, Any]:
-        """What `/live` shows. Positions in hundredths of a block; sizes of templates and of the map in blocks."""
+        """Returns the content of `/live`.
+
+        Positions are in hundredths of a block; sizes of templates and of the map are in blocks.
+        """
         game, relief = self._game, self._relief
         scene, figures = game.scene, self._figures()
         shown = list(islice(game.players, SHOWN_MAX))
@@ -183,7 +194,7 @@ class Live:
         }
 
     def _sample(self) -> Int64s:
-        """Some entities, the same ones from time to time, and all if they are few."""
+        """Returns the rows of at most about `SHOWN_MAX` entities, mostly the same ones in each call."""
         matrix = self._game.world.matrix
         rows: Int64s = matrix[:: max(-(-len(matrix) // SHOWN_MAX), 1)]
         there: Int64s = rows[rows[:, ID] != 0]
@@ -191,7 +202,7 @@ class Live:
 
 
 def _shown(value: Any) -> Any:
-    """What the rules share, or, where JSON has no such thing (bytes, NaN), text for it."""
+    """Returns a shared value, or a text for it if JSON cannot hold it (bytes, NaN)."""
     try:
         json.dumps(value, allow_nan=False)
     except (TypeError, ValueError):
@@ -201,7 +212,10 @@ def _shown(value: Any) -> Any:
 
 @cache
 def html_page() -> Page:
-    """The page itself. Its policy allows nothing but its own script, its own style and this server's answers."""
+    """Returns the page itself.
+
+    Its content security policy allows only its own script, its own style, and requests to this server.
+    """
     text = Path(__file__).with_name("live.html").read_text("utf-8")
     hashes = {
         tag: base64.b64encode(hashlib.sha256(inside.encode()).digest()).decode()

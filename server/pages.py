@@ -1,4 +1,4 @@
-"""What the server's port answers to HTTP requests that ask for no WebSocket."""
+"""The pages on the server's port: answers to HTTP requests that do not open a WebSocket."""
 
 import json
 from collections.abc import Callable, Mapping
@@ -6,11 +6,13 @@ from http import HTTPStatus
 from typing import Any, NamedTuple
 
 TEXT = "text/plain; charset=utf-8"
+"""Content type of a plain text."""
 JSON = "application/json"
+"""Content type of JSON."""
 
 
 class Page(NamedTuple):
-    """An HTTP answer, after which the connection closes."""
+    """An HTTP response. The connection closes after it."""
 
     status: int
     body: bytes
@@ -19,18 +21,28 @@ class Page(NamedTuple):
 
 
 def line(status: int, text: str, **headers: str) -> Page:
-    """One line of text; `retry_after` stands for the header Retry-After."""
+    """Returns a page with one line of text.
+
+    Args:
+        status: the HTTP status.
+        text: the line.
+        headers: further headers, such as `retry_after` for Retry-After.
+    """
     named = ((name.replace("_", "-").title(), value) for name, value in headers.items())
     return Page(status, f"{text}\n".encode(), headers=tuple(named))
 
 
 def json_page(figures: Callable[[], Mapping[str, Any]]) -> Callable[[], Page]:
-    """A page that shows figures, which are asked for when it is."""
+    """Returns a function that makes a page with figures as JSON. `figures` is called for each request."""
     return lambda: Page(HTTPStatus.OK, json.dumps(figures()).encode() + b"\n", JSON)
 
 
 def ready_page(reason: Callable[[], str]) -> Callable[[], Page]:
-    """200 while there is no reason not to send players here, else 503 with the reason."""
+    """Returns a function that makes the page `/readyz`: status 200 if the server is ready, otherwise 503.
+
+    Args:
+        reason: returns why the server is not ready; empty if it is ready.
+    """
 
     def page() -> Page:
         why = reason()
@@ -41,17 +53,17 @@ def ready_page(reason: Callable[[], str]) -> Callable[[], Page]:
 
 HEALTHY = line(HTTPStatus.OK, "ok")
 BROKEN = line(HTTPStatus.INTERNAL_SERVER_ERROR, "internal error")
-NO_GET = line(HTTPStatus.METHOD_NOT_ALLOWED, "GET is all there is", allow="GET")
+NO_GET = line(HTTPStatus.METHOD_NOT_ALLOWED, "only GET is allowed", allow="GET")
 GAME = line(HTTPStatus.UPGRADE_REQUIRED, "this is a game server: connect by WebSocket", upgrade="websocket")
 
 
 class Pages:
-    """The pages by their paths.
+    """All pages of a server, by path.
 
     Args:
-        public: for everyone; `/` and `/healthz` are there anyway.
-        private: only for those whom the door lets see them, and ahead of the public ones.
-        failed: told which page has raised.
+        public: functions that make the pages for every client, by path. `/` and `/healthz` exist besides.
+        private: functions that make the pages for trusted clients, by path. They take precedence over public ones.
+        failed: called with the path of a page whose function has raised.
     """
 
     def __init__(
@@ -65,13 +77,19 @@ class Pages:
         self._failed = failed
 
     def get(self, method: str, target: str, *, trusted: bool) -> Page:
-        """The answer to a request; never raises."""
+        """Returns the answer to a request. Never raises.
+
+        Args:
+            method: the HTTP method.
+            target: the request target: path and query.
+            trusted: whether the client may see private pages.
+        """
         path = target.partition("?")[0]
         make = (self._private.get(path) if trusted else None) or self._public.get(path)
         if method != "GET":
             return NO_GET
         if make is None and path in self._private:
-            return line(HTTPStatus.FORBIDDEN, f"{path}: not for your address")
+            return line(HTTPStatus.FORBIDDEN, f"{path}: not allowed for your address")
         if make is None:
             return line(HTTPStatus.NOT_FOUND, f"{path}: no such page")
         try:

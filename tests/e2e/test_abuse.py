@@ -92,8 +92,8 @@ def abuses() -> Iterator[Abuse]:
         yield Abuse(unmasked, (PROTOCOL,), "mask", joins=True)
     yield Abuse(framed(encode(Welcome(VERSION, 1, 1, {}))), (MALFORMED,))
     yield Abuse(framed(encode(Pong(1.0, 2.0))), (MALFORMED,))
-    yield Abuse(framed(encode(WELL_FORMED[1])), (MALFORMED,), "Inputs at this point")
-    yield Abuse(framed(encode(WELL_FORMED[0])), (MALFORMED,), "Hello at this point", joins=True)
+    yield Abuse(framed(encode(WELL_FORMED[1])), (MALFORMED,), "unexpected Inputs before the join")
+    yield Abuse(framed(encode(WELL_FORMED[0])), (MALFORMED,), "unexpected Hello after the join", joins=True)
     yield Abuse(framed(encode(Ping(1.0))) * 2000, (MALFORMED,), "too many messages", joins=True)
 
 

@@ -162,7 +162,7 @@ def test_nobody_is_blamed_for_the_time_that_the_server_was_away() -> None:
     link.say(Ping(1.0))
     assert link.got(Pong)
     table.tick(6 * table.game.scene.tick_rate)
-    assert link.refusal()[1] == "nothing heard for 5 s"
+    assert link.refusal()[1] == "no message received for 5 s"
     assert late.refusal()[1] == "no hello within 5 s"
 
 

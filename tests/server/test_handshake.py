@@ -110,7 +110,7 @@ def test_what_is_out_of_place_or_malformed_ends_the_connection(table: Table, sai
 def test_hello_in_the_middle_of_the_game_ends_it(table: Table) -> None:
     link = table.join()
     link.say(HELLO)
-    assert link.refusal() == (messages.MALFORMED, "Hello at this point")
+    assert link.refusal() == (messages.MALFORMED, "unexpected Hello after the join")
 
 
 def test_goodbye_is_answered_by_closing(table: Table) -> None:
@@ -181,7 +181,7 @@ def test_who_says_nothing_any_more_is_closed_and_who_pings_is_not() -> None:
     for _ in range(70):
         alive.say(Ping(0.0))
         table.tick()
-    assert silent.refusal() == (messages.TOO_SLOW, "nothing heard for 1 s")
+    assert silent.refusal() == (messages.TOO_SLOW, "no message received for 1 s")
     assert alive.closings == []
 
 
@@ -192,7 +192,7 @@ def test_who_reads_nothing_is_closed() -> None:
     for _ in range(66):
         link.say(Ping(0.0))
         table.tick()
-    assert link.refusal() == (messages.TOO_SLOW, "nothing read for 1 s")
+    assert link.refusal() == (messages.TOO_SLOW, "the client read nothing for 1 s")
 
 
 def test_a_flood_of_messages_is_closed_and_a_burst_is_not() -> None:

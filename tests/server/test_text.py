@@ -63,7 +63,7 @@ def test_what_a_check_of_ones_own_returns(bad: Any) -> None:
     table = Table()
     table.game._authenticate = lambda token: bad
     code, reason = table.connect(Hello(messages.VERSION, {}, "Ann", "x")).refusal()
-    assert (code, reason) == (messages.UNAUTHORISED, "the server cannot use what its check of tokens says")
+    assert (code, reason) == (messages.UNAUTHORISED, "the server's authenticator returned no valid subject")
     assert table.game.faults.total == 1
     table.tick()
     assert (table.game.players, len(table.game.world), table.game.sessions[1:]) == ({}, 0, [])

@@ -98,7 +98,7 @@ def test_a_long_sleep_ends_the_connection_with_a_reason() -> None:
     player.suspend(20)
     match.run(21)
     left = [event for event in player.events if isinstance(event, Left)]
-    assert [event.reason for event in left] == ["nothing heard for 15 s"]
+    assert [event.reason for event in left] == ["no message received for 15 s"]
     assert match.game.sessions == []
     assert len(match.game.world) == 1, "it may come back for a while"
     match.run(match.game.limits.resume_s)
