@@ -1,34 +1,38 @@
-r"""When is it on the server, and how far ahead of it to live.
+r"""The client's estimate of the server time, and its own timeline, which runs ahead of the server.
 
-Theory of operation. Let a clock's phase be its tick minus `rate` times the local time: constant, but for drift.
-`ServerClock` estimates the server's phase from pings; of those, the third with the least round trip are the ones
-that stood in no queue, and their median is the estimate.
+Theory of operation. The *phase* of a clock is its tick minus `rate` times the local time: a constant, apart from drift.
+`ServerClock` estimates the server's phase from pings. The third of the pings with the shortest round trips waited in no
+queue; their median is the estimate.
 
-Either clock may step: a server that stood still drops the ticks that it missed, and a computer that slept halts its
-monotonic clock. A pong bounds the phase without any assumption about the path: the server read its time after the
-ping was sent and before the pong arrived. A snapshot bounds it from below. So a bound that contradicts the ones before
-proves a step; the samples from before it are void, and pings follow each other quickly again. What the lead has
-learned of stalls stays right, while the needs of the moment have to be learned anew (`LeadController.step`).
+Both clocks may step: a server that stood still drops the ticks that it missed, and a computer that sleeps stops its
+monotonic clock. A pong bounds the phase without any assumption about the path, because the server read its time after
+the ping was sent and before the pong arrived. A snapshot bounds it from below. A bound that contradicts the earlier
+ones therefore proves a step. Then the samples from before the step are void, and pings follow each other quickly again.
+What the lead has learned about stalls stays valid, but the current needs have to be learned again
+(`LeadController.step`).
 
-An input for tick t is sent when the client's own *timeline* reaches t, and the server tells by how many ticks it
-was early: its margin. The timeline's phase at that moment minus the margin is the phase that would just have done:
-the input's *need*. It does not depend on where the timeline was, only on the path; so the client's own corrections
-cancel out of the measurement, exactly and at once, and the loop cannot oscillate however long the round trip is.
+The client sends an input for tick t when its own *timeline* reaches t, and the server reports by how many ticks the
+input was early: its margin. The timeline's phase at that moment minus the margin is the phase that would just have been
+enough: the *need* of this input. The need depends on the path alone, not on where the timeline was. So the client's own
+adjustments cancel out of the measurement, exactly and at once, and the loop cannot oscillate, however long the round
+trip is.
 
 `PricedLead` splits a need into the *base*, which is the path as it is now, and the *excess* of this one input:
 
-    need    |\      |\     ____                 base     morphological opening: raised only by what holds for longer
-            | \     | \   |    |    |\                  than a retransmission takes, i.e. a spike, a queue, a new route
-    base  __|  \____|  \__|    |____| \____     excess   loss (a retransmission, then a burst) and jitter
-             loss    loss  spike   loss
+    need    |\      |\     ____                 base     morphological opening: rises only if the need stays high for
+            | \     | \   |    |    |\                   longer than a retransmission takes (a spike, a queue, a new
+    base  __|  \____|  \__|    |____| \____              route)
+             loss    loss  spike   loss         excess   loss (a retransmission, then a burst) and jitter
 
-The base is followed, up and down alike, at up to 10 % faster or slower than real time. No lead chosen in advance
-should pay for a rare second of it, and it lasts long enough to be followed. A retransmission is over before anybody
-knows of it: it can only be covered in advance, and whether that is worth it is a matter of how often and of how much.
-So a late input has a price in ticks of lead, and of the excesses of the last minutes those are covered that are worth
-it: the cover is the lead with the least sum of itself and the price of what comes late. A stated share of late inputs
-in its place (0.5 %, as it was) cuts a bounded jitter off that costs next to nothing to cover, and pays nine ticks on a
-bad path for the last third of a percent, whose retransmissions are lost as well. Cover rises at once and falls slowly.
+The timeline follows the base, up and down alike, at up to 10 % faster or slower than real time. The base lasts long
+enough to be followed, so no lead has to be paid in advance for a rare second of it. A retransmission is over before
+either side can know of it; it can only be covered in advance, and whether that pays depends on how often it happens and
+how long it takes. So a late input has a price in ticks of lead. Of the excesses of the last minutes, those are covered
+that are worth it: the *cover* is the lead with the least sum of itself and the price of the inputs that stay late.
+
+Rejected: a fixed share of late inputs in place of the price (0.5 %, as it was). It cuts off a bounded jitter that costs
+next to nothing to cover, and on a bad path it pays nine ticks for the last third of a percent, whose retransmissions
+are lost as well. Cover rises at once and falls slowly.
 """
 
 import math
@@ -43,20 +47,28 @@ import numpy.typing as npt
 from shared.bounds import UPDATE_S
 
 PINGS = 5
+"""Number of pings that follow each other quickly; the clock is ready when all of them are answered."""
 PING_FIRST_S = 0.1
+"""Time between two of the first pings, in seconds."""
 PING_LATER_S = 1.0
+"""Time between two later pings, in seconds."""
 PINGS_KEPT = 15
+"""Number of the newest pongs that the estimate uses."""
 STEP_S = 0.1
-"""Two bounds may contradict each other by this much, in seconds, for the clocks drift and programs read them late."""
+"""Contradiction between two bounds that is tolerated, in seconds, because clocks drift and programs read them late."""
 
 
 class ServerClock:
-    """The server's time in ticks, by local time."""
+    """An estimate of the server time in ticks, as a function of the local time.
+
+    `rate` is the tick rate in ticks per second (0: not known yet), `phase` the server's phase in ticks, `rtt_s` the
+    shortest round trip of the kept pongs, and `spread_s` the difference between their longest and shortest one.
+    """
 
     def __init__(self) -> None:
         self.rate = 0.0
         self._samples: deque[tuple[float, float]] = deque(maxlen=PINGS_KEPT)  # round trip, phase
-        self._least, self._most = -math.inf, math.inf  # the phase is between these, by the samples
+        self._least, self._most = -math.inf, math.inf  # bounds of the phase, from the samples
         self._answers = 0
         self._sent = 0
         self._next = 0.0
@@ -65,7 +77,7 @@ class ServerClock:
         self.spread_s = 0.0
 
     def due(self, now: float) -> bool:
-        """Whether to send a ping now (not before `rate` is known); if so, it counts as sent."""
+        """Returns whether to send a ping now, and counts it as sent if so. False as long as `rate` is not known."""
         if self.rate == 0 or now < self._next:
             return False
         self._sent += 1
@@ -74,18 +86,26 @@ class ServerClock:
 
     @property
     def next_ping(self) -> float:
-        """Local time at which the next ping is due."""
+        """The local time at which the next ping is due, in seconds; `inf` as long as `rate` is not known."""
         return self._next if self.rate else math.inf
 
     @property
     def ready(self) -> bool:
-        """Whether enough pings have come back."""
+        """Whether enough pings were answered for an estimate."""
         return self.rate > 0 and self._answers >= PINGS
 
     def answered(self, sent: float, tick: float, now: float) -> float:
-        """Takes the answer to a ping sent at `sent`: the server's time in ticks. Returns by how many ticks that steps.
+        """Takes the answer to a ping.
 
-        The answers to pings sent before a step say nothing after it: drop them.
+        Do not pass answers to pings that were sent before a step: they describe the time before it.
+
+        Args:
+            sent: local time at which the ping was sent, in seconds.
+            tick: the server time in the answer, in ticks.
+            now: local time at which the answer arrived, in seconds.
+
+        Returns:
+            By how many ticks the server's time has stepped; 0 if it has not.
         """
         if not sent <= now:
             return 0.0
@@ -104,12 +124,15 @@ class ServerClock:
         return 0.0
 
     def seen(self, tick: int, now: float) -> float:
-        """Takes the tick of a snapshot, which the server has reached. Returns by how many ticks its time steps."""
+        """Takes the tick of a snapshot, which the server has reached. Returns by how many ticks its time has stepped.
+
+        The result is 0 if the time has not stepped.
+        """
         least = tick - self.rate * now
         return 0.0 if least <= self._most else self._step(least, math.inf)
 
     def _step(self, least: float, most: float) -> float:
-        """Sets the phase anew if it cannot be between these and within the bounds known before."""
+        """Sets a new phase if `least` and `most` contradict the known bounds. Returns the step in ticks, or 0."""
         slack = STEP_S * self.rate if self._samples else 0.0
         if not (least > self._most + slack or most < self._least - slack):
             return 0.0
@@ -121,81 +144,100 @@ class ServerClock:
         return self.phase - before
 
     def tick(self, now: float) -> float:
-        """The server's time in ticks."""
+        """Returns the server time at the local time `now`, in ticks."""
         return self.rate * now + self.phase
 
 
 def jump_ticks(rate: float) -> float:
-    """Returns the least difference of two phases that counts as a jump: `JUMP_S`, at least one tick."""
+    """Returns the smallest difference of two phases that counts as a jump, in ticks: `JUMP_S`, at least one tick."""
     return max(JUMP_S * rate, 1.0)
 
 
 class LeadController(Protocol):
-    """Steers the phase of the timeline: how far ahead of the server to live."""
+    """A controller of the timeline's phase, which decides how far the client runs ahead of the server.
+
+    All phases and margins are in ticks.
+    """
 
     def start(self, clock: ServerClock, now: float) -> float:
-        """The phase to begin with, before any input has been sent."""
+        """Returns the phase to begin with, before any input was sent."""
         ...
 
     def observe(self, tick: int, margin: float, phase: float, now: float) -> None:
-        """The input for `tick`, sent while the timeline had `phase`, came `margin` ticks before its deadline."""
+        """Takes the arrival margin of one input.
+
+        Args:
+            tick: the tick of the input.
+            margin: by how many ticks the input arrived before its deadline; negative if it was late.
+            phase: the timeline's phase when the input was sent.
+            now: local time in seconds.
+        """
 
     def steer(self, phase: float, elapsed: float, clock: ServerClock, now: float) -> float:
-        """The new phase, `elapsed` ticks after the last call. Called once per update."""
+        """Returns the new phase, `elapsed` ticks after the last call. Called once per update."""
         ...
 
     def step(self, clock: ServerClock) -> float:
-        """The server's time has stepped: returns the phase to go on with."""
+        """Takes a step of the server's time. Returns the phase to go on with."""
         ...
 
 
 FASTER, HURRY = 0.10, 0.50
-"""The timeline runs at most `FASTER` off real time, and by up to `HURRY` ahead while every input comes late."""
+"""Greatest deviation of the timeline from real time, as a share of it: `FASTER` in both directions, and `HURRY` forward
+while every input is late."""
 JUMP_S = 0.3125
-"""Where the path is further than this from where the timeline is, in seconds, it jumps."""
+"""Distance in seconds between the timeline and the phase that the path needs, beyond which the timeline jumps."""
 START_S = 0.0625
-"""What the first lead has on top of the path as it was measured, in seconds."""
+"""Reserve of the first lead on top of the measured path, in seconds."""
 SLOWER_S = 2.0
-"""Cover that is not needed any more is given up with this time constant."""
+"""Time constant with which cover that is no longer needed is given up, in seconds."""
 LATELY_S, LATELY_MIN = 0.09375, 3
-"""Inputs that came late for this long (at least so many) are no stall: the last ones of a stall come in its burst, and
-early."""
+"""The least need of the inputs of the last `LATELY_S` seconds, at least `LATELY_MIN` inputs, is the need of the path
+now. A stall does not raise it, because the last inputs of a stall arrive in its burst, and early."""
 PRICE_S = 6.25
-"""What it is worth that no input comes late, in seconds of lead: half a percent of them is worth 31 ms, a tick at
-32 Hz."""
+"""Price of all inputs being late, in seconds of lead: half a percent of late inputs costs 31 ms, a tick at 32 Hz."""
 SAFETY_S = 0.03 / 32
-"""Seconds on top of what was needed,"""
+"""Reserve on top of base and cover, in seconds."""
 SURPRISE_S = 0.15 / 32
-"""and, at most, on top of what a rising path needs that was not foreseen."""
+"""Greatest additional reserve in seconds: while the path needs more than base and cover, or few inputs are known."""
 STALL_S = 0.25
-"""With two round trips on top: the longest stall that a loss makes, and the shortest change of the path."""
+"""Time in seconds which, with two round trips added, is the longest stall that a loss makes, and the shortest change
+of the path."""
 CALM_S = 5.0
+"""Time whose least need is the base, in seconds, unless the path has changed within it (`SHIFT_S`)."""
 SHIFT_S = 0.5 / 32
-"""The base is the least need of `CALM_S`, unless that of a stall's length is more than `SHIFT_S` higher."""
+"""Smallest change of the path, in seconds: if the least need within the length of a stall is higher than the base by
+more than this, it is the new base."""
 MEMORY_S = 120.0
+"""Time for which excesses are kept, in seconds."""
 FIRST_S = 20.0
-"""Until there have been inputs for so long, shares are of this; the fewer there were, the more is kept for safety."""
+"""Shortest time that shares of late inputs refer to, in seconds. With fewer inputs than that, the reserve is larger."""
 FINE_RATE = 32.0
-"""At fewer ticks per second, the three above stay the share of a tick that they are at this rate."""
+"""Tick rate below which `SAFETY_S`, `SURPRISE_S` and `SHIFT_S` count in ticks: they stay the share of a tick that they
+are at this rate."""
 FIRST_INPUTS_S, FIRST_INPUTS_MIN = 0.5, 8
-"""The lead stays as it began until inputs of this length (at least so many) have been learned from."""
+"""Inputs to learn from before the first lead is changed: those of `FIRST_INPUTS_S` seconds, at least
+`FIRST_INPUTS_MIN`."""
 SPREAD_S_MAX = 0.5
-"""A pong that took longer than that waited for a program that was busy (loading, compiling), not for the path."""
+"""Greatest jitter that the first lead believes, in seconds: a pong that took longer waited for a busy program (loading,
+compiling), not for the path."""
 NEEDS_S, NEEDS_MIN = 32.0, 1024
-"""Needs are kept for this long (at least so many), and at least half of them; what is left must hold two stalls."""
+"""Limit of the needs that are kept: those of `NEEDS_S` seconds, at least `NEEDS_MIN`. Beyond it the older half is
+deleted, and the rest must hold two stalls."""
 REVIEW_S = 0.25
-"""How often the cover is thought over."""
+"""Time between two computations of the cover, in seconds."""
 SLOW_S = 0.1
-"""A program that makes an input this late, in seconds, three times in a row is slow: that was no hitch."""
+"""A program that makes an input this late, in seconds, three times in a row counts as slow; once or twice may be a
+short delay."""
 
 
 class PricedLead:
-    """The lead that would have been the best of the last two minutes, late inputs having a price.
+    """The controller that sets the lead which would have been best in the last two minutes, given a price of lateness.
 
     Args:
-        price_s: of all inputs being late, in seconds of lead.
-        safety_s: seconds on top of the cover.
-        stall_s: see `STALL_S`.
+        price_s: price of all inputs being late, in seconds of lead.
+        safety_s: reserve on top of the cover, in seconds.
+        stall_s: length of a stall without the two round trips, in seconds (`STALL_S`).
     """
 
     def __init__(self, price_s: float = PRICE_S, safety_s: float = SAFETY_S, stall_s: float = STALL_S) -> None:
@@ -204,22 +246,22 @@ class PricedLead:
         self._stall_s = stall_s
         self._rtt_s = 0.0
         self._in_ticks(1.0)
-        self._stall = 1  # inputs in the longest stall
-        self._calm = 1  # inputs in which the least need is the base
-        self._needs: list[float] = []  # the newest ones, as phases
-        self._least: list[float] = []  # of each of these and the stall before it
-        self._calmest = math.inf  # the least of the newest `_calm` needs,
-        self._fresh = 0  # which is still one of these after so many further inputs
-        self._excess: deque[float] = deque()
-        self._ordered = array("d")
-        self._prices: npt.NDArray[np.float64] = np.zeros(0)  # of so many inputs being late
+        self._stall = 1  # number of inputs in the longest stall
+        self._calm = 1  # number of inputs whose least need is the base
+        self._needs: list[float] = []  # the newest needs, as phases
+        self._least: list[float] = []  # for each need: the least of it and those of the stall before it
+        self._calmest = math.inf  # the least of the newest `_calm` needs
+        self._fresh = 0  # number of further inputs for which `_calmest` stays one of the newest `_calm` needs
+        self._excess: deque[float] = deque()  # excesses, oldest first
+        self._ordered = array("d")  # excesses, ascending
+        self._prices: npt.NDArray[np.float64] = np.zeros(0)  # price of n late inputs, at index n
         self._base = 0.0
         self._level = 0.0
         self._review = 0
         self._cover: float | None = None
 
     def _in_ticks(self, rate: float) -> None:
-        """Expresses all times in ticks, or in inputs, of which there is one per tick."""
+        """Converts all times to ticks, or to numbers of inputs: one per tick."""
         self._rate = rate
         self._price, self._jump = self._price_s * rate, jump_ticks(rate)
         fine = max(rate, FINE_RATE)
@@ -230,7 +272,7 @@ class PricedLead:
         self._reviews = math.ceil(REVIEW_S * rate)
 
     def start(self, clock: ServerClock, now: float) -> float:
-        """Half the round trip, all the jitter there was (up to a bound), and a little more."""
+        """Returns the first phase: half the round trip, the measured jitter (at most `SPREAD_S_MAX`), and `START_S`."""
         if clock.rate != self._rate:
             self._in_ticks(clock.rate)
         self._measure(clock.rtt_s)
@@ -238,7 +280,10 @@ class PricedLead:
         return clock.phase + (clock.rtt_s / 2 + jitter + START_S) * clock.rate
 
     def step(self, clock: ServerClock) -> float:
-        """Forgets the needs, some of which may be from after the step, and keeps the excesses. See `LeadController`."""
+        """Takes a step of the server's time. Returns the phase to go on with.
+
+        Forgets the needs, because some may already be from after the step, and keeps the excesses.
+        """
         self._needs.clear()
         self._least.clear()
         self._calmest, self._fresh = math.inf, 0
@@ -246,7 +291,7 @@ class PricedLead:
         return self._base + (self._cover or 0.0) + self._safety
 
     def observe(self, tick: int, margin: float, phase: float, now: float) -> None:
-        """See `LeadController`."""
+        """Takes the arrival margin of one input: learns the base, and the excess of an input one stall earlier."""
         needs, leasts, stall = self._needs, self._least, self._stall
         need = phase - margin
         needs.append(need)
@@ -260,14 +305,14 @@ class PricedLead:
             self._look_back()
         calm = self._calmest
         self._base = least if least > calm + self._shift_up else calm
-        if len(needs) >= 2 * stall:  # all stalls that could contain the input of `stall` ago are known
+        if len(needs) >= 2 * stall:  # every stall that could contain the input `stall` inputs ago is complete
             base = max(leasts[-stall:])
             self._remember(needs[-stall] - (base if base > calm + self._shift_up else calm))
         if len(needs) > self._needs_max:
             del needs[: self._needs_max // 2], leasts[: self._needs_max // 2]
 
     def steer(self, phase: float, elapsed: float, clock: ServerClock, now: float) -> float:
-        """See `LeadController`."""
+        """Returns the new phase: towards base, cover and reserve, at a bounded speed, or there at once if it jumps."""
         if clock.rtt_s != self._rtt_s:
             self._measure(clock.rtt_s)
         inputs = len(self._excess)
@@ -298,7 +343,7 @@ class PricedLead:
             self._calm, self._calmest, self._fresh = calm, -math.inf, 0
 
     def _look_back(self) -> None:
-        """Finds the least of the newest needs anew: once in dozens of inputs."""
+        """Searches the least of the newest `_calm` needs again; happens once in dozens of inputs."""
         newest = self._needs[: -self._calm - 1 : -1]
         self._calmest = min(newest)
         self._fresh = self._calm - 1 - newest.index(self._calmest)
@@ -315,22 +360,22 @@ class PricedLead:
             self._level = self._best()
 
     def _best(self) -> float:
-        """The excess that is best covered: with it, those above are late."""
+        """Returns the best cover: the excess with the least sum of itself and the price of the excesses above it."""
         ordered, known = self._ordered, len(self._ordered)
         if len(self._prices) != known:
             self._prices = self._price * (np.arange(known) / max(known, FIRST_S * self._rate))
-        # With more late than this, they cost more than all that there is to save: of 3,840, say, 10 are looked at
-        # (1.6 us, all of them 11).
+        # More late inputs than `most` cost more than any cover can save, so only these candidates are compared: 10 of
+        # 3,840, for example (1.6 us; all of them would take 11 us).
         most = int(self._prices.searchsorted(ordered[-1] - ordered[0], "right")) + 1
         falling = np.frombuffer(ordered)[: -most - 1 : -1]
         return float(falling[(falling + self._prices[:most]).argmin()])
 
 
 class Timeline:
-    """The client's own tick: continuous, a little ahead of the server.
+    """The client's own time in ticks: continuous, and ahead of the server.
 
-    It is ahead by what the path needs, which a `LeadController` says, and by `own` ticks for a program that is slow:
-    the inputs of one update leave together, the first of them long after its time.
+    It is ahead by the lead that a `LeadController` sets for the path, plus `own` ticks for a slow program: such a
+    program sends the inputs of one update together, the first of them long after its time.
     """
 
     def __init__(self, rate: float, phase: float, now: float) -> None:
@@ -341,23 +386,23 @@ class Timeline:
         self._late = (0.0, 0.0, 0.0)
 
     def tick(self, now: float) -> float:
-        """Ticks, whole and fraction."""
+        """Returns the timeline's tick at the local time `now`, with a fraction."""
         return self.rate * now + self.phase
 
     def when(self, tick: float) -> float:
-        """The local time at which a tick is reached, as things stand."""
+        """Returns the local time at which `tick` is reached if the phase stays as it is, in seconds."""
         return (tick - self.phase) / self.rate
 
     def made(self, late: float, now: float) -> None:
-        """Takes notice that the first input of an update was made `late` ticks after its time.
+        """Notes that the first input of an update was made `late` ticks after its time.
 
-        If that is much, the next may be late by as much as updates are apart.
+        If that is more than `SLOW_S`, the next input may be as late as the time between two updates.
         """
         slow = late > SLOW_S * self.rate
         self._late = (*self._late[1:], max(late, (now - self._steered) * self.rate) if slow else 0.0)
 
     def steer(self, lead: LeadController, clock: ServerClock, now: float) -> bool:
-        """Goes where the controller wants. Returns whether that was a jump."""
+        """Moves the phase to where the controller wants it. Returns whether that was a jump."""
         before = self.phase
         elapsed = max(now - self._steered, 0.0) * self.rate
         self._steered = now
@@ -368,7 +413,7 @@ class Timeline:
         return abs(self.phase - before) > jump_ticks(self.rate)
 
     def _follow_program(self, elapsed: float) -> None:
-        """Follows how late the program makes inputs: up at once, down slowly."""
+        """Adapts `own` to how late the program makes inputs: it rises at once and falls slowly."""
         least = min(self._late)
         slow = min(max(self._late), 2 * least, UPDATE_S * self.rate) if least > SLOW_S * self.rate else 0.0
         self.own = max(slow, self.own - FASTER * elapsed)

@@ -1,8 +1,8 @@
-"""The chosen kernel, compiled beside a client that plays already.
+"""Compiles the kernel with Numba in the background, while a client already plays with the plain kernel.
 
-Only where `shared.kernels` chooses Numba, so where there is no prebuilt kernel. A process of its own compiles, into
-Numba's cache on disk, so that no frame is slower for it; then a thread loads what is there. Where that fails, as in a
-frozen program, the client goes on with the plain kernel.
+This happens only if `shared.kernels` chooses Numba, that is, where there is no prebuilt kernel. Another process
+compiles into Numba's cache on disk, so that no frame of the program is delayed. Then a thread loads the result from the
+cache. If this fails, for example in a frozen program, the client goes on with the plain kernel.
 """
 
 import atexit
@@ -15,18 +15,19 @@ import threading
 from shared import kernels
 
 PROGRAM = f"from {kernels.__name__.rpartition('.')[0]} import kernels; kernels.get()"
-NO_WINDOW = getattr(subprocess, "CREATE_NO_WINDOW", 0)  # of Windows alone
+"""Python code that the other process runs."""
+NO_WINDOW = getattr(subprocess, "CREATE_NO_WINDOW", 0)  # exists on Windows only
 LOADING_S = 10.0
-"""The end of the program waits for the thread no longer."""
+"""Longest time that the end of the program waits for the thread, in seconds."""
 
 logger = logging.getLogger(__name__)
 
 
 class Compiler:
-    """Gets the chosen kernel ready beside the program, once.
+    """A background compilation of the chosen kernel, which happens once per program.
 
     Args:
-        program: what the other process runs.
+        program: Python code that the other process runs.
     """
 
     def __init__(self, program: str = PROGRAM) -> None:
@@ -37,10 +38,10 @@ class Compiler:
         self._over = False
 
     def begin(self) -> None:
-        """Returns at once, and does nothing where nothing has to be compiled.
+        """Starts the compilation and returns at once. Does nothing if nothing has to be compiled.
 
         Raises:
-            ValueError: the setting SOVEREIGN_KERNEL is none of its choices.
+            ValueError: the setting SOVEREIGN_KERNEL has an unknown value.
         """
         with self._lock:
             if self._thread is None and not kernels.ready():
@@ -49,12 +50,12 @@ class Compiler:
                 self._thread.start()
 
     def wait(self) -> None:
-        """Returns as soon as the kernel is there, or cannot be had."""
+        """Waits until the kernel is ready, or has failed to compile."""
         if self._thread is not None:
             self._thread.join()
 
     def end(self) -> None:
-        """Leaves nothing running; called at the end of the program."""
+        """Ends the process and the thread; called at the end of the program."""
         with self._lock:
             self._over = True
             if self._process is not None:
@@ -67,7 +68,7 @@ class Compiler:
             kernels.get()
 
     def _compiled(self) -> bool:
-        """Whether another process has compiled the kernel into the cache."""
+        """Compiles the kernel into the cache, in another process. Returns whether that succeeded."""
         environment = os.environ | {
             "PYTHONPATH": os.pathsep.join(filter(None, sys.path)),
             kernels.VARIABLE: kernels.chosen(),
@@ -86,7 +87,7 @@ class Compiler:
                     creationflags=NO_WINDOW,
                 )
             except OSError as error:
-                logger.warning("the physics stays in plain Python: no compiler can be started (%s)", error)
+                logger.warning("the physics stays in plain Python: the compiler could not be started (%s)", error)
                 return False
         status = self._process.wait()
         if status and not self._over:

@@ -1,6 +1,8 @@
-"""The server's world as of the newest snapshot, as far as this client sees it.
+"""The confirmed world: the server's world as of the newest snapshot, as far as this client sees it.
 
-It is never stepped: what happens in it is told, and what goes on as it did goes on (`shared.snapshot`).
+Theory of operation. The confirmed world is never stepped. A snapshot contains states, turns, removed entities and
+edits. States are written; turns are applied to entities that changed their motion in this tick; all other entities are
+extrapolated by the rules in `shared.snapshot`. Checksums in the snapshots show if the result differs from the server's.
 """
 
 from typing import Any
@@ -18,32 +20,33 @@ from shared.units import SEGMENT, TO_SEGMENT
 from shared.world import World
 
 NEAR_BLOCKS = 5.0
-"""An edit this near may explain a correction."""
+"""Distance in blocks from the own entity within which an edit may explain a correction."""
 
 
 class Confirmed:
-    """Is written by snapshots and terrain, for the client whose entity is `entity`."""
+    """The confirmed world of the client whose entity is `entity`; snapshots and terrain write it."""
 
     def __init__(self, scene: Scene, entity: int, *, compiled: bool | None = None) -> None:
         self.entity = entity
         self.world = World(scene, compiled=compiled)
         self.states = self.world.states()
-        """Those of the world, [n, 12], ascending by id. Not to be written to."""
+        """States of the world, [n, 12], ascending by id. Do not write to them."""
         self.attributes: dict[int, dict[str, Any]] = {}
-        """What the game's rules say of the entities that are seen."""
+        """Attributes of the entities that the client sees, by entity and name."""
         self.terrain_changed = self.edited_near = False
-        """Whether blocks have changed, and whether any near the own entity; whoever has seen to that takes it back."""
+        """Whether blocks have changed, and whether any near the own entity has, since the last replay (it resets
+        both)."""
         self._templates = len(scene.templates)
-        self.follow_max = bounds(scene.tick_rate).history  # after more ticks, everything is sent anew
+        self.follow_max = bounds(scene.tick_rate).history  # after more ticks, the server sends everything again
         self._exist = frozenset(scene.segments())
         self.placed: Ring[frozenset[int]] = Ring(self.follow_max)
-        """The entities that the server's rules placed before a snapshot and after the one before it, by its tick."""
+        """Entities that the server's rules placed since the snapshot before, by the tick of the snapshot."""
         self._acted: set[int] = set()
-        self._coming: Cell | None = None
-        self._early: dict[int, int] = {}  # blocks of that one which changed since it was packed
+        self._coming: Cell | None = None  # the segment whose pieces are arriving
+        self._early: dict[int, int] = {}  # blocks of that segment that changed since the server packed it
 
     def expect_segment(self, segment: Cell) -> None:
-        """The first piece of a segment has come: it was packed before any edit that comes from here on.
+        """Takes the first piece of a segment, which the server packed before all edits that arrive from now on.
 
         Raises:
             ProtocolError: the scene has no such segment.
@@ -53,7 +56,7 @@ class Confirmed:
         self._coming, self._early = segment, {}
 
     def load_segment(self, segment: Cell, kinds: np.ndarray[tuple[int, ...], np.dtype[np.uint8]]) -> None:
-        """The blocks of a segment have come."""
+        """Takes the blocks of a whole segment, and applies the edits that arrived while it was being sent."""
         self.world.load_segment(segment, kinds)
         if segment == self._coming:
             self.world.write_blocks(segment, self._early.keys(), self._early.values())
@@ -61,16 +64,19 @@ class Confirmed:
         self.terrain_changed = True
 
     def apply(self, snapshot: Snapshot) -> str:
-        """Writes a snapshot into the confirmed world; what is wrong with the result, or nothing.
+        """Writes a snapshot into the confirmed world.
+
+        Returns:
+            A text that names a difference from the server's world; empty if there is none.
 
         Raises:
-            ProtocolError: a part of it is malformed.
+            ProtocolError: a part of the snapshot is malformed.
         """
         world = self.world
         parts, states, turns = decode_parts(snapshot.segments, self._templates, world.kernel)
         ticks = snapshot.tick - world.tick
         if len(turns) and ticks != 1:
-            raise ProtocolError("segment.heads: the tick before was not told")
+            raise ProtocolError("segment.heads: turns without a snapshot of the tick before")
         drops: set[Cell] = set()
         if snapshot.drops:
             drops = {(x, y, z) for x, y, z in np.frombuffer(snapshot.drops, "<i4").reshape(-1, 3).tolist()}
@@ -95,30 +101,30 @@ class Confirmed:
         self.states = world.states()
         for part in parts:
             if part.check and part.segment in world.blocks and checksum(world, part.segment) != part.check:
-                return f"segment {part.segment} is not the server's"
+                return f"segment {part.segment} differs from the server's"
         return "" if there else "entities are missing"
 
     def grounded(self) -> bool:
-        """Whether the blocks of every segment that exists around the own entity are there."""
+        """Whether the blocks of all segments around the own entity have arrived, as far as the scene has them."""
         place = self.world.state(self.entity)[X : X + 3]
         x, y, z = (part >> TO_SEGMENT for part in place)
         around = {(x + i, y + j, z + k) for i in (-1, 0, 1) for j in (-1, 0, 1) for k in (-1, 0, 1)}
         return all(segment in self.world.blocks for segment in around & self._exist)
 
     def take_acted(self) -> frozenset[int]:
-        """The entities on which the server's rules have acted since the last call."""
+        """Returns the entities on which the server's rules have acted since the last call."""
         acted, self._acted = frozenset(self._acted), set()
         return acted
 
     def _act(self, states: Int64s, tick: int) -> None:
-        """Takes the flags of the server's rules off the states of a snapshot."""
+        """Notes which entities the server's rules acted on or placed, and clears these flags in the states."""
         flags, ids = states[:, FLAGS], states[:, ID]
         self._acted.update(ids[flags & ACTED != 0].tolist())
         self.placed.put(tick, frozenset(ids[flags & PLACED != 0].tolist()))
         flags &= FALLING
 
     def _edit(self, part: SegmentPart) -> None:
-        """Blocks of a segment have changed."""
+        """Writes the changed blocks of a segment."""
         changes = part.edits["block"].tolist(), part.edits["kind"].tolist()
         if part.segment in self.world.blocks:
             self.world.write_blocks(part.segment, *changes)
@@ -128,7 +134,7 @@ class Confirmed:
             self._early.update(zip(*changes, strict=True))
 
     def _near(self, segment: Cell, offsets: Int64s) -> bool:
-        """Whether one of these blocks is so near to the own entity that it may have met it."""
+        """Returns whether one of these blocks is within `NEAR_BLOCKS` of the own entity, along every axis."""
         if self.entity not in self.world:
             return False
         inside = SEGMENT - 1
@@ -139,7 +145,13 @@ class Confirmed:
         return bool((ways.max(axis=1) < NEAR_BLOCKS).any())
 
     def _take_away(self, parts: list[SegmentPart], drops: set[Cell], here: set[int]) -> None:
-        """Removes who is gone, or was in a segment that is not seen any more or sent whole, and is not `here`."""
+        """Removes entities that have left the client's view.
+
+        Args:
+            parts: segment deltas of the snapshot, which list entities that are gone, and may be keyframes.
+            drops: segments that the client no longer sees.
+            here: entities whose states the snapshot contains; these stay.
+        """
         segments = (self.states[:, X : X + 3] >> TO_SEGMENT).tolist()
         whole = drops | {part.segment for part in parts if part.ago == KEYFRAME}
         gone = {(part.segment, entity) for part in parts for entity in part.gone}

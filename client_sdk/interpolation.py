@@ -1,13 +1,13 @@
-"""Where the others are drawn: between two confirmed snapshots, a little in the past.
+"""Interpolation: other entities are drawn between two confirmed snapshots, a little in the past.
 
-The delay rises at once by what was missing when a snapshot came late. Once all is well again it falls: slowly while it
-is short, since paths that stall do so time and again, and the faster the further it is above `LONG_S`. Motion that is
-shown late then looks up to twice as fast, but never jumps or goes back.
+Theory of operation. The delay rises at once when a snapshot is late, by the time that was missing. After some time
+without a late snapshot it falls: slowly while it is short, because a path that stalls does so again and again, and the
+faster the further it is above `LONG_S`. While it falls, motion looks up to twice as fast, but never jumps or goes back.
 
-What the rules do takes effect at the tick of the snapshot that tells of it, and no sooner: until then an entity that
-they placed is drawn where it was, one that they removed is still drawn, one that they changed looks as before, and one
-that is new is not drawn. `server.rewind` answers shots by the same rule. Beyond the newest snapshot, entities go on by
-their velocities, for less than a tick: the next one may bring anything.
+Changes by the rules take effect at the tick of the snapshot that contains them, and no sooner. Until then, an entity
+that the rules placed is drawn at its old position, a removed one is still drawn, a changed one looks as before, and a
+new one is not drawn. `server.rewind` answers shots by the same rule. Beyond the newest snapshot, entities move on by
+their velocities for less than a tick, because the next snapshot may change anything.
 """
 
 import math
@@ -20,24 +20,28 @@ from shared.layout import ID, VX, Int64s, X
 from shared.units import BLOCK, SPEED
 
 KEPT_S, KEPT_MIN = 3.0, 16
-"""Confirmed states are kept for this long, in seconds, and at least so many."""
+"""Length of the history of confirmed states: `KEPT_S` seconds, at least `KEPT_MIN` entries."""
 EXTRAPOLATE_S = 0.1
-"""Bound on the time beyond the newest snapshot that is drawn; it is also less than one tick."""
+"""Longest time beyond the newest snapshot that is drawn, in seconds; it is also kept below one tick."""
 FALL_S_PER_S = 0.01
+"""Speed at which a delay of at most `LONG_S` falls, in seconds per second."""
 CALM_S = 3.0
-"""The delay begins to fall after this long without a late snapshot, in seconds."""
+"""Time without a late snapshot after which a delay of at most `LONG_S` begins to fall, in seconds."""
 LONG_S = 0.2
-"""What the delay has above this, in seconds, falls at `LONG_FALL` seconds per second, and `LONG_SHARE` of itself more,
-after `LONG_CALM_S`; at most at `FALL_MAX`."""
+"""Delay above which it falls faster, in seconds."""
 LONG_FALL, LONG_SHARE, LONG_CALM_S, FALL_MAX = 0.05, 0.5, 1.0, 1.0
+"""Fall of a delay above `LONG_S`: it begins after `LONG_CALM_S` seconds without a late snapshot. Its speed in seconds
+per second is `LONG_FALL` plus `LONG_SHARE` times the seconds above `LONG_S`, at most `FALL_MAX`."""
 
 Positions = npt.NDArray[np.float64]
+"""Positions in blocks, [n, 3]."""
 Entry = tuple[int, Int64s, frozenset[int]]
-"""The tick of a snapshot, the states at its end, and the entities placed since the one before."""
+"""An entry of the history: the tick of a snapshot, the states at its end, and the entities that the rules placed since
+the snapshot before."""
 
 
 class Interpolation:
-    """A short history of confirmed states, and the moment in it that is shown."""
+    """A short history of confirmed states, and the delay with which it is drawn (`delay_ticks`, in ticks)."""
 
     def __init__(self, rate: float) -> None:
         self._rate = rate
@@ -49,14 +53,19 @@ class Interpolation:
         """Adds a snapshot to the history.
 
         Args:
-            tick: the one that it ends.
-            states: the confirmed states, [n, 12], ascending by id.
+            tick: the tick of the snapshot.
+            states: the confirmed states at the end of that tick, [n, 12], ascending by id.
             placed: the entities that the rules placed since the snapshot before.
         """
         self._states.append((tick, states, placed))
 
     def advance(self, server_tick: float, now: float) -> None:
-        """Adapts the delay to how old the newest snapshot is now."""
+        """Adapts the delay to the age of the newest snapshot.
+
+        Args:
+            server_tick: the server time in ticks.
+            now: local time in seconds.
+        """
         if not self._states:
             return
         if self._at == -math.inf:
@@ -70,19 +79,19 @@ class Interpolation:
         self._at = now
 
     def _fall(self, calm_s: float) -> float:
-        """How fast the delay falls after so much calm, in seconds per second."""
+        """Returns the speed at which the delay falls, in seconds per second, `calm_s` after the last late snapshot."""
         long_s = self.delay_ticks / self._rate - LONG_S
         if long_s > 0 and calm_s > LONG_CALM_S:
             return min(LONG_FALL + LONG_SHARE * long_s, FALL_MAX)
         return FALL_S_PER_S if calm_s > CALM_S else 0.0
 
     def shift(self, ticks: float) -> None:
-        """The server's time has stepped by so many ticks. What is shown does not go back for it."""
+        """Takes a step of the server's time, by `ticks`, so that the drawn moment does not go back with it."""
         if ticks < 0:
             self.delay_ticks = max(self.delay_ticks + ticks, 1.0)
 
     def shown(self, server_tick: float) -> float:
-        """The moment that is drawn, as a tick: no earlier than the history, less than a tick beyond it."""
+        """Returns the view tick: the moment that is drawn, within the history or less than a tick after it."""
         at = server_tick - self.delay_ticks
         if not self._states:
             return at
@@ -91,7 +100,7 @@ class Interpolation:
         return latest if at > latest else max(oldest, at)
 
     def sample(self, server_tick: float) -> tuple[Int64s, Positions]:
-        """States and positions (blocks, [n, 3]) of all entities as they are to be drawn: as they were when `shown`."""
+        """Returns states ([n, 12]) and positions (blocks, [n, 3]) of all entities at the tick `shown(server_tick)`."""
         if not self._states:
             return np.zeros((0, 12), np.int64), np.zeros((0, 3))
         at = self.shown(server_tick)
@@ -108,7 +117,10 @@ class Interpolation:
 
 
 def _between(before: Entry, after: Entry, at: float) -> tuple[Int64s, Positions]:
-    """States and positions at a moment between two snapshots: those who are there before it, on their ways."""
+    """Returns states and positions at the tick `at` between two snapshots, of the entities in the earlier one.
+
+    An entity that the rules placed or removed meanwhile stays at its earlier position.
+    """
     share = (at - before[0]) / (after[0] - before[0])
     states, new = before[1], after[1]
     places = states[:, X : X + 3] / BLOCK

@@ -1,13 +1,16 @@
-"""One direction of a TCP connection in simulated time: nothing lost, nothing reordered, sometimes late, then a burst.
+"""Simulated links: a model of a TCP connection in simulated time. Messages may be late, then arrive in a burst; no
+message is lost or reordered.
 
-Theory of operation. A message is cut into packets. Each waits for the line (`rate`), flies (`delay`, jitter, the
-weather's spikes; the path itself is first in, first out) and may be lost. A lost packet is found missing the way
-RACK does it: a transmission sent after it is acknowledged (acknowledgements are lost as often), and a reorder window
-of a quarter of the round trip has passed; where nothing else is sent, a time-out of a round trip and 200 ms, doubled
-each time, does it. It is sent again, may be lost again, and whatever arrived behind it waits. Left out, because a
-game's thin stream hardly ever meets them: the congestion window, delayed acknowledgements, tail loss probes.
+Theory of operation. A message is cut into packets. Each packet waits until the line is free (`rate`), travels (`delay`,
+jitter, spikes; packets leave the path in the order in which they entered it), and may be lost. The sender detects a
+lost packet as RACK does: a packet sent after it was acknowledged (acknowledgements are lost as often as packets), and a
+reorder window of a quarter of the round trip has passed. If no other packet is sent, a time-out detects the loss: a
+round trip and 200 ms, doubled each time. The packet is sent again, may be lost again, and everything that arrived
+behind it waits. Not modelled, because a game's thin stream hardly ever meets them: the congestion window, delayed
+acknowledgements, tail loss probes.
 
-`Weather` is what happens to both directions of a connection at the same time; it is drawn from a seed as time goes on.
+`Weather` has the link events that concern both directions of a connection at the same time. They are drawn from a seed
+as time goes on.
 """
 
 import heapq
@@ -22,13 +25,16 @@ from typing import Protocol
 from shared.checks import SceneError, duration, shown
 
 PACKET_BYTES = 1448
+"""Largest payload of a packet, in bytes."""
 HEADER_BYTES = 66
-"""Ethernet, IP, and TCP with its time stamps, per packet."""
+"""Headers of a packet in bytes: Ethernet, IP, and TCP with time stamps."""
 FRAME_BYTES = 6
-"""WebSocket, per message."""
+"""Header of a message in bytes: the WebSocket frame."""
 TIMEOUT_S = 0.2
+"""Part of the first retransmission time-out that is added to the round trip, in seconds."""
 TIMER_S = 0.01
-"""A kernel's timer for the reorder window fires so much later: two to three jiffies of 4 ms."""
+"""Delay with which an operating system's timer for the reorder window fires, in seconds: two to three jiffies of
+4 ms."""
 
 
 class Scheduler(Protocol):
@@ -37,21 +43,24 @@ class Scheduler(Protocol):
     now: float
 
     def at(self, when: float, act: Callable[[], None]) -> None:
-        """Files something for a time."""
+        """Plans the call of `act` for the time `when`, in seconds."""
 
 
 @dataclass(frozen=True)
 class Path:
-    """How a connection behaves, each way. Times in seconds.
+    """The properties of a simulated link, equal for both directions. Times in seconds.
 
     Args:
-        delay_s: from one end to the other, at least.
-        jitter_s: up to so much more, evenly drawn per packet.
-        loss: share of packets lost.
+        delay_s: least time from one end to the other.
+        jitter_s: largest additional delay, drawn evenly for each packet.
+        loss: share of packets that are lost, 0 to 1.
         rate: bits per second.
-        dip: during the last `dip[1]` of every `dip[0]` seconds, the rate is `dip[2]`.
-        spike: about every `spike[0]` seconds, for about `spike[1]` seconds, up to `spike[2]` more delay.
+        dip: during the last `dip[1]` of every `dip[0]` seconds, the rate is `dip[2]` bits per second.
+        spike: about every `spike[0]` seconds, for about `spike[1]` seconds, the delay is up to `spike[2]` longer.
         outage: during the last `outage[1]` of every `outage[0]` seconds, everything is lost.
+
+    Raises:
+        ValueError: a delay or the loss is negative, the loss is above 1, or the rate is not above 0.
     """
 
     delay_s: float = 0.0
@@ -72,12 +81,12 @@ class Path:
 
     @property
     def rtt_s(self) -> float:
-        """The round trip, on average and in fair weather."""
+        """The average round trip in seconds, without loss and link events."""
         return 2 * self.delay_s + self.jitter_s
 
 
 def path(rtt_ms: float, jitter_ms: float, loss: float = 0.0) -> Path:
-    """A path whose round trip is `rtt_ms` +- `jitter_ms`."""
+    """Returns a link whose round trip is `rtt_ms` +- `jitter_ms` (milliseconds)."""
     return Path((rtt_ms - jitter_ms) / 2000, jitter_ms / 1000, loss)
 
 
@@ -91,13 +100,14 @@ PRESETS = {
     "outage": replace(path(50, 2), outage=(3.0, 0.12)),
     "thin": replace(path(60, 5), rate=30e3),
 }
+"""Simulated links by name."""
 
 
 def named(link: str | Path | None) -> Path | None:
-    """A preset by its name; a path, or None for no link at all, as it is.
+    """Returns the preset of that name. Returns a `Path`, or None (no link), unchanged.
 
     Raises:
-        ValueError: there is no preset of that name.
+        ValueError: no preset has that name.
     """
     if isinstance(link, str):
         if link not in PRESETS:
@@ -109,7 +119,7 @@ def named(link: str | Path | None) -> Path | None:
 
 
 class Agenda:
-    """The scheduler of who is told the time: what is filed is done, in order, once its time has come."""
+    """An event queue: a scheduler whose calls are made, in order of time, when `advance` reaches their times."""
 
     def __init__(self, now: float) -> None:
         self.now = now
@@ -118,15 +128,15 @@ class Agenda:
 
     @property
     def due(self) -> float:
-        """When there is something to do."""
+        """The time of the next call, in seconds; `inf` if none is planned."""
         return self._queue[0][0] if self._queue else math.inf
 
     def at(self, when: float, act: Callable[[], None]) -> None:
-        """Files something for a time."""
+        """Plans the call of `act` for the time `when`, in seconds."""
         heapq.heappush(self._queue, (when, next(self._number), act))
 
     def advance(self, now: float) -> None:
-        """Does all that was to be done up to now."""
+        """Makes all calls that are due by `now`."""
         while self._queue and self._queue[0][0] <= now:
             self.now, _, act = heapq.heappop(self._queue)
             act()
@@ -134,26 +144,31 @@ class Agenda:
 
 
 class Weather:
-    """What changes about a path, the same for both directions."""
+    """The link events of a path, which concern both directions: spikes, dips and outages.
+
+    Args:
+        path: properties of the link.
+        seed: all chance of the link events comes from it.
+    """
 
     def __init__(self, path: Path, seed: int) -> None:
         self.path = path
         self.spikes: list[tuple[float, float, float]] = []
-        """Drawn so far: begin, end, extra delay."""
+        """Spikes drawn until now: begin and end (seconds), extra delay (seconds)."""
         self._rng = random.Random(seed)
         self._drawn = 0.0 if path.spike else math.inf
 
     def rate(self, now: float) -> float:
-        """Bits per second."""
+        """Returns the rate at the time `now`, in bits per second."""
         path = self.path
         return path.dip[2] if path.dip and _late(now, path.dip) else path.rate
 
     def out(self, now: float) -> bool:
-        """Whether nothing comes through."""
+        """Returns whether there is an outage at the time `now`."""
         return self.path.outage is not None and _late(now, self.path.outage)
 
     def extra(self, now: float) -> float:
-        """The delay on top, in seconds."""
+        """Returns the extra delay of a spike at the time `now`, in seconds; 0 if there is none."""
         while now >= self._drawn:
             self._draw()
         for begin, end, extra in reversed(self.spikes):
@@ -162,7 +177,7 @@ class Weather:
         return 0.0
 
     def dipped(self, now: float) -> float:
-        """Seconds since the dip began; negative outside of one."""
+        """Returns the seconds since the current dip began; negative if there is none."""
         dip = self.path.dip
         return now % dip[0] - (dip[0] - dip[1]) if dip else -1.0
 
@@ -180,11 +195,11 @@ def _late(now: float, cycle: tuple[float, ...]) -> bool:
 
 
 _Packet = tuple[int, int, bytes | None]
-"""Its number in the stream, its bytes, and the message that it completes, if it does."""
+"""A packet: its number in the stream, its payload in bytes, and the message that it completes, or None."""
 
 
 class _Loss:
-    """A transmission that does not arrive."""
+    """A transmission that does not arrive, with its retransmission time-out."""
 
     def __init__(self, packet: _Packet, sent: float, timeout_s: float) -> None:
         self.packet = packet
@@ -193,33 +208,34 @@ class _Loss:
 
 
 class Wire:
-    """One direction.
+    """One direction of a simulated TCP connection.
 
     Args:
-        time: delivers.
-        weather: the path, and what changes about it; share it with the other direction.
-        seed: everything random of this direction comes from it.
-        deliver: takes the messages in order.
+        time: the simulated time, which calls the deliveries.
+        weather: the link and its events; the other direction uses the same object.
+        seed: all chance of this direction comes from it.
+        deliver: called with each message that arrives, in order.
     """
 
     def __init__(self, time: Scheduler, weather: Weather, seed: int, deliver: Callable[[bytes], None]) -> None:
         self._time, self._weather, self._path, self._deliver = time, weather, weather.path, deliver
         self._random = random.Random(seed).random
-        self._flying: deque[_Packet] = deque()  # in order of arrival, which is that of transmission
-        self._missing: list[_Loss] = []  # not yet sent again
-        self._early: dict[int, _Packet] = {}  # arrived, and waits for one before it
+        self._flying: deque[_Packet] = deque()  # on the way, in order of transmission and of arrival
+        self._missing: list[_Loss] = []  # lost, and not yet sent again
+        self._early: dict[int, _Packet] = {}  # arrived, but wait for a packet before them
         self._numbers = count()
-        self._next = 0  # the number that is delivered next
-        self._free = 0.0  # when the line is
-        self._last = 0.0  # when the newest transmission arrives
+        self._next = 0  # number of the packet to deliver next
+        self._free = 0.0  # time at which the line is free
+        self._last = 0.0  # time at which the newest transmission arrives
         self._bytes = 0
-        self._unacked: deque[tuple[float, int]] = deque()  # when the acknowledgement is back, bytes
+        self._unacked: deque[tuple[float, int]] = deque()  # time at which an acknowledgement is back, bytes
         self.sent_bytes = 0
-        """Everything that was transmitted, headers too."""
+        """Number of bytes that were transmitted, including headers."""
         self.resent = 0
+        """Number of packets that were sent again."""
 
     def send(self, message: bytes) -> None:
-        """Takes a message; never blocks."""
+        """Sends a message; never blocks."""
         left = len(message) + FRAME_BYTES
         self._bytes += left
         while left > PACKET_BYTES:
@@ -228,36 +244,36 @@ class Wire:
         self._transmit((next(self._numbers), left, message))
 
     def cut(self) -> None:
-        """What is on the way is lost, and what is sent from here on."""
+        """Cuts the connection: messages on the way, and those sent from now on, are lost."""
         self._deliver = _nowhere
 
     @property
     def idle(self) -> bool:
-        """Whether everything has arrived."""
+        """Whether every packet has arrived."""
         return not self._flying and not self._missing
 
     @property
     def busy(self) -> bool:
-        """Whether something waits for the line."""
+        """Whether the line is still transmitting."""
         return self._free > self._time.now
 
     def waiting(self) -> list[bytes]:
-        """The messages that have not arrived, in order."""
+        """Returns the messages that have not arrived, in order."""
         packets = [*self._flying, *(loss.packet for loss in self._missing), *self._early.values()]
         return [message for _, _, message in sorted(packets) if message is not None]
 
     def follow(self, weather: Weather) -> None:
-        """Another path from here on; what is under way stays in front."""
+        """Changes to another link; packets that are under way stay in front."""
         self._weather, self._path = weather, weather.path
 
     def outstanding(self) -> int:
-        """Bytes sent and not yet acknowledged."""
+        """Returns the bytes that were sent and are not acknowledged yet."""
         while self._unacked and self._unacked[0][0] <= self._time.now:
             self._bytes -= self._unacked.popleft()[1]
         return self._bytes
 
     def _transmit(self, packet: _Packet, lost: _Loss | None = None) -> None:
-        """Sends a packet, or sends it again after a loss."""
+        """Transmits a packet, for the first time or again after the loss `lost`."""
         path, weather, now, free = self._path, self._weather, self._time.now, self._free
         size = packet[1] + HEADER_BYTES
         self.sent_bytes += size
@@ -276,7 +292,7 @@ class Wire:
         self._last = comes
         self._flying.append(packet)
         self._time.at(comes, self._arrive)
-        if self._missing and self._random() >= path.loss:  # its acknowledgement tells of the missing
+        if self._missing and self._random() >= path.loss:  # its acknowledgement reveals the missing packets
             told = comes + path.delay_s + path.jitter_s / 2 + extra + path.rtt_s / 4 + TIMER_S
             self._time.at(told, lambda: self._find_missing(now))
 
@@ -300,7 +316,7 @@ class Wire:
         first = self._flying.popleft()
         now, path, early, unacked = self._time.now, self._path, self._early, self._unacked
         if unacked and unacked[0][0] <= now:
-            self.outstanding()  # lets go of what has been acknowledged, where nobody asks
+            self.outstanding()  # removes acknowledged packets, in case no caller asks for the number
         if first[0] != self._next:
             early[first[0]] = first
             return
@@ -316,4 +332,4 @@ class Wire:
 
 
 def _nowhere(message: bytes) -> None:
-    """Takes what was sent over a connection that is gone."""
+    """Discards a message that was sent over a cut connection."""

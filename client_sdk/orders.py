@@ -1,4 +1,4 @@
-"""What the player has asked of the server: each order is answered once, and asked again after a lost connection."""
+"""The commands of one client that the server has not answered yet; after a reconnect they are sent again."""
 
 from typing import Any
 
@@ -12,25 +12,31 @@ from shared.snapshot import VERDICT
 
 
 class Orders:
-    """Those that are not answered yet."""
+    """The commands without a result, by number."""
 
     def __init__(self) -> None:
         self._number = 0
         self._unanswered: dict[int, bytes] = {}
 
     def number(self) -> int:
-        """That of a further order."""
+        """Allocates the next command number."""
         self._number += 1
         return self._number
 
     def command(self, tick: int, seen: float, name: str, data: Any) -> Command:
-        """An order to the game's rules.
+        """Returns a new command to the rules of the game.
+
+        Args:
+            tick: the tick at which to carry it out.
+            seen: the view tick, at which the player saw the other entities.
+            name: name of the command, up to 32 characters.
+            data: a value that MessagePack can hold, up to 1,024 bytes when packed.
 
         Raises:
-            ValueError: the name or the data are too long (32 characters, 1,024 bytes), or no MessagePack.
+            ValueError: the name or the data are too long, or MessagePack cannot hold the data.
         """
         if text(name, "name", messages.NAME_MAX) == edits.NAME:
-            raise ValueError(f"name = {name!r}: must be another one, which the client itself does not use")
+            raise ValueError(f"name = {name!r}: must be another name, because the client uses this one for edits")
         try:
             payload = messages.pack_value(data)
         except ValueError as error:
@@ -38,11 +44,14 @@ class Orders:
         return Command(self.number(), tick, seen, name, payload)
 
     def file(self, command: Command) -> bytes:
-        """Keeps an order until it is answered; what to send."""
+        """Keeps a command until it is answered. Returns the message to send."""
         return self._unanswered.setdefault(command.number, encode(command))
 
     def answer(self, verdicts: bytes) -> list[Answered]:
-        """The server's word on orders, as `Snapshot.verdicts`; without second answers to what was asked twice."""
+        """Takes the verdicts of a snapshot (`Snapshot.verdicts`). Returns one result per command.
+
+        A second answer to a command that was sent twice is ignored.
+        """
         answers = []
         for number, verdict in np.frombuffer(verdicts, VERDICT).tolist() if verdicts else ():
             if self._unanswered.pop(number, None) is not None:
@@ -51,11 +60,11 @@ class Orders:
         return answers
 
     def again(self) -> list[bytes]:
-        """What to send once more, to a server that knows which of them it has carried out."""
+        """Returns the messages to send again after a reconnect; the server knows which commands it has carried out."""
         return list(self._unanswered.values())
 
     def give_up(self) -> list[Answered]:
-        """Nobody will answer any more."""
+        """Forgets all commands, because the player is a new one to the server. Returns a failed result for each."""
         numbers = list(self._unanswered)
         self._unanswered.clear()
         return [Answered(number, False, "the connection was lost") for number in numbers]

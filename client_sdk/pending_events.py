@@ -1,18 +1,19 @@
-"""The events that wait until the program takes them: in order, bounded, and counted where some were dropped."""
+"""The events that wait until the program takes them: in order and bounded; dropped ones are counted."""
 
 from client_sdk.events import Disconnected, Event, EventsDropped, Happened, Joined, Left, Resumed
 
 EVENTS_MAX = 10_000
-"""Limit of the game events that wait, and of the SDK's own events except those that it never drops."""
+"""Limit of the waiting game events, and separately of the waiting other events that may be dropped."""
 NEVER, GAME, OTHER = range(3)
 """Kinds of events: never dropped, game events, and other events of the SDK."""
 KINDS = {
     Happened: GAME, EventsDropped: GAME, Joined: NEVER, Disconnected: NEVER, Resumed: NEVER, Left: NEVER,
 }  # fmt: skip
+"""Kind of an event by its class; all others are OTHER."""
 
 
 class PendingEvents(list[Event]):
-    """Waiting events. Of too many of one kind the oldest are dropped; an `EventsDropped` in their place counts them.
+    """The waiting events. If too many of one kind wait, the oldest is dropped, and an `EventsDropped` there counts it.
 
     Use `append`, `take` and `next` only.
     """
@@ -22,7 +23,7 @@ class PendingEvents(list[Event]):
         self._counts = [0, 0, 0]
 
     def append(self, event: Event) -> None:
-        """Adds an event behind the others."""
+        """Adds an event at the end, and drops the oldest of its kind if there are too many."""
         super().append(event)
         self._counts[_kind(event)] += 1
         for kind in (OTHER, GAME):
@@ -47,7 +48,10 @@ class PendingEvents(list[Event]):
         return event
 
     def _drop(self, kind: int) -> None:
-        """Drops the oldest event of a kind, or two: an `EventsDropped` before it, or in their place, counts them."""
+        """Drops the oldest event of a kind, which the `EventsDropped` in front of it counts.
+
+        If there is none in front, a new `EventsDropped` takes the place of the two oldest events of this kind.
+        """
         oldest = (at for at, event in enumerate(self) if _kind(event) == kind)
         last = next(oldest)
         first = last - 1
@@ -61,7 +65,7 @@ class PendingEvents(list[Event]):
 
 
 def _weight(event: Event) -> int:
-    """Returns the number of events that one stands for."""
+    """Returns the number of events that an event stands for."""
     return event.count if isinstance(event, EventsDropped) else 1
 
 

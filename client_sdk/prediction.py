@@ -1,20 +1,21 @@
-"""The two worlds of a client, and how the one catches the other's mistakes.
+"""Prediction and reconciliation: the confirmed and the predicted world of a client.
 
-Theory of operation. *Confirmed* is the server's world as of the newest snapshot, as far as this client sees it
-(`client_sdk.confirmed`). *Predicted* is confirmed plus a replay: stepped by the same function as the server's, with the
-own inputs, while everybody else goes on with the latest input known of them. For every predicted tick the states are
-kept. When the snapshot for tick T comes, it is compared with what was predicted for T, `==` on every bit of every
-entity:
+Theory of operation. The *confirmed* world is the server's world as of the newest snapshot, as far as this client sees
+it (`client_sdk.confirmed`). The *predicted* world is the confirmed one plus a replay: the function that steps the
+server's world steps it with the own inputs, while other entities go on with their latest known inputs. The states of
+every predicted tick are kept. When the snapshot for tick T arrives, it is compared with the prediction for T, bit by
+bit for every entity:
 
-    equal     the prediction stands; nothing is done (nor where only those differ who are too far away to be met
-              before the next replay: they are put right with it)
-    not       predicted = confirmed, and the inputs for T+1 .. now are replayed
+    equal       the prediction stays, and nothing is done. This also holds if only entities differ that are too far
+                away to be met before the next replay, and are not drawn as predicted; that replay corrects them.
+    different   predicted = confirmed, and the inputs for T+1 .. now are replayed
 
-Edits are predicted as well: carried out at their tick by the rule that the server uses, and forgotten when it has
-given its verdict, so that a replay undoes what was refused.
+Edits are predicted, too: they are applied at their tick by the rule that the server uses, and forgotten when the
+server's verdict arrives. So a replay undoes an edit that was refused.
 
-A difference in the own entity is a *correction* and is counted; one in others only is a *reprediction* (someone
-pressed a key). No tolerance: the physics is exact, so a lone player is never corrected, whatever the network does.
+A difference in the own entity is a *correction*; one in other entities only is a *reprediction* (another player pressed
+a key, for example). Both are counted. There is no tolerance: the physics is exact, so a player who meets no others is
+never corrected as long as inputs arrive in time.
 """
 
 import math
@@ -34,13 +35,13 @@ from shared.units import BLOCK
 from shared.world import World
 
 MEET_BLOCKS = 12
-"""Whoever is further away cannot be met before a replay, at the speeds that legs have."""
+"""Distance in blocks beyond which another entity cannot be met before the next replay, at walking speeds."""
 
 NONDETERMINISM = "nondeterminism"
-"""The cause that must never occur: both sides knew the same and computed something else."""
+"""Cause of a correction that must never occur: both sides knew the same and computed different results."""
 
 LOOK_BACK = 4
-"""A drawn moment lies at most this many ticks after the kept state before it: snapshots may have been skipped."""
+"""Number of ticks to search back for a kept state before a drawn moment; skipped snapshots leave gaps."""
 
 Place = tuple[float, float, float]
 State = tuple[int, ...]
@@ -48,29 +49,30 @@ State = tuple[int, ...]
 
 @dataclass(frozen=True)
 class Reconciled:
-    """What a snapshot did to the prediction."""
+    """The result of comparing a snapshot with the prediction; `replayed` is the number of replayed ticks."""
 
     correction: Corrected | None
     repredicted: bool
     replayed: int
     offsets: dict[int, Place]
-    """Where each predicted entity was, minus where it is now, in blocks."""
+    """Old minus new position of each predicted entity that the replay moved, in blocks."""
     acted: frozenset[int]
-    """Entities on which the server's rules have acted: their pictures jump."""
+    """Entities on which the server's rules have acted: they are drawn at their new place at once."""
     placed: frozenset[int] = frozenset()
-    """Entities that the server's rules have placed: nothing is left of an earlier correction, either."""
+    """Entities that the server's rules have placed: the smoothing of earlier corrections ends, too."""
 
 
 NOTHING = Reconciled(None, False, 0, {}, frozenset())
+"""The result if nothing was replayed and no entity was placed."""
 
 
 class Prediction:
-    """Confirmed and predicted world of one client, for its entity.
+    """The confirmed and the predicted world of one client.
 
     Args:
-        known: the confirmed one, which snapshots go into.
-        neighbours: carry others on in the predicted world, too, so that blocking each other is predicted; else they
-            are left out of it.
+        known: the confirmed world, which snapshots write.
+        neighbours: whether the predicted world has other entities, so that blocking each other is predicted; otherwise
+            it has the own entity only.
     """
 
     def __init__(self, known: Confirmed, *, neighbours: bool = True) -> None:
@@ -78,11 +80,11 @@ class Prediction:
         self.entity = known.entity
         self.neighbours = neighbours
         self.ahead = 0
-        """Inputs are filed so many ticks ahead of the predicted world: the input delay."""
+        """Input delay in ticks: inputs are filed this far ahead of the predicted world."""
         self.confirmed = known.world
         self.predicted = World(known.world.scene, compiled=known.world.compiled)
         self.attributes = known.attributes
-        """What the game's rules say of the entities that are seen."""
+        """Attributes of the entities that the client sees, by entity and name."""
         self.begun = False
         limits = bounds(known.world.scene.tick_rate)
         self._repeats = limits.repeats
@@ -90,25 +92,28 @@ class Prediction:
         self._states: Ring[Int64s] = Ring(limits.predicted)
         templates = known.world.scene.templates
         self._shown_ahead = np.array([template.shown == "predicted" for template in templates], np.int64)
-        self._edits: dict[int, tuple[int, Edit]] = {}  # by number, with its tick; until there is a verdict
-        self._refused = False  # an edit that was carried out in the last replay has been, since
+        self._edits: dict[int, tuple[int, Edit]] = {}  # edits without a verdict, with their ticks, by number
+        self._refused = False  # whether an edit that the last replay applied was refused since
         self._compared = -1
 
     def begin(self, tick: int) -> None:
-        """(Re)starts the prediction at `tick` from the confirmed world, with the inputs that have been sent."""
+        """Starts the prediction at `tick`, or starts it again: replays the filed inputs from the confirmed world."""
         self._replay(tick)
         self.begun = True
 
     def adopt(self, old: "Prediction") -> None:
-        """Goes on from where an earlier one of the same entity was: its inputs, and its edits without a verdict."""
+        """Takes over the inputs and the edits without a verdict from an earlier prediction of the same entity."""
         self._inputs, self._edits = old._inputs, old._edits
 
     def rows_since(self, tick: int, to: int) -> bytes:
-        """The own inputs after `tick`, up to `to`, as `Inputs.rows`; what was left out is what would stand in."""
+        """Returns the own inputs after `tick`, up to `to`, packed as `Inputs.rows`.
+
+        For a tick without an input, the row is the substitute that the server would use.
+        """
         return b"".join(row(self._wish(at)) for at in range(tick + 1, to + 1))
 
     def file(self, tick: int, wish: Input) -> None:
-        """The own input for a tick to come."""
+        """Files the own input for a future tick."""
         self._inputs.put(tick, wish)
 
     def step(self) -> None:
@@ -116,14 +121,14 @@ class Prediction:
         world = self.predicted
         tick = world.tick + 1
         for due, edit in self._edits.values():
-            # One that is due but has no verdict yet is carried out as soon as the replay begins.
+            # An earlier edit without a verdict is not in the confirmed world: the first tick of a replay applies it.
             if due == tick or (due < tick and tick == self.confirmed.tick + 1):
                 edits.apply(world, self.entity, edit)
         world.step({self.entity: self._wish(tick)} if self.entity in world else None)
         self._states.put(tick, world.states())
 
     def _wish(self, tick: int) -> Input:
-        """The own input of a tick; where none was sent, what the server puts in its place."""
+        """Returns the own input of a tick, or the substitute that the server uses if none was sent."""
         for before in range(tick, tick - self._repeats - 1, -1):
             wish = self._inputs.get(before)
             if wish is not None:
@@ -132,23 +137,24 @@ class Prediction:
 
     @property
     def next_order(self) -> int:
-        """The next tick that has no input yet: what is ordered now is done then."""
+        """The next tick that has no input yet, at which a command or edit of now is carried out."""
         return self.predicted.tick + self.ahead + 1
 
     def edit(self, number: int, edit: Edit) -> int:
-        """Files an edit for the next tick that has no input yet; that tick."""
+        """Files an edit for the next tick that has no input yet. Returns that tick."""
         self._edits[number] = (self.next_order, edit)
         return self.next_order
 
     def settle(self, number: int, done: bool) -> None:
-        """The server has given its verdict on an edit."""
+        """Takes the server's verdict on an edit; one that was not `done` is undone by the next replay."""
         if self._edits.pop(number, None) is not None and not done:
             self._refused = True
 
     def reconcile(self, late: bool) -> Reconciled:
-        """Compares the newest confirmed tick with what was predicted for it, and replays if they differ.
+        """Compares the newest confirmed tick with the prediction for it, and replays if they differ.
 
-        `late`: an input up to that tick, and after the one before, was late or missing at the server.
+        Args:
+            late: whether the server lacked an input in time for a tick since the last comparison.
         """
         known, tick = self.known, self.confirmed.tick
         if tick == self._compared:
@@ -159,7 +165,7 @@ class Prediction:
         self._compared = tick
         if not self.begun:
             return NOTHING
-        if tick > self.predicted.tick:  # overtaken: nothing was predicted for this tick
+        if tick > self.predicted.tick:  # the snapshot overtook the prediction: nothing to compare
             self._replay(tick)
             return Reconciled(None, False, 0, {}, acted, placed) if placed else NOTHING
         guess, truth = self._states.get(tick), self._truth()
@@ -185,15 +191,19 @@ class Prediction:
         return Reconciled(correction, correction is None, now - tick, offsets, acted, placed)
 
     def around(self, entity: int, at: float) -> tuple[State, State, float]:
-        """Finds what to draw of an entity at a moment up to the newest predicted tick.
+        """Returns the states to draw an entity between, at a moment up to the newest predicted tick.
+
+        Args:
+            entity: number of the entity.
+            at: the moment, in ticks.
 
         Returns:
-            Its states before and after the moment, and the share of the way between them that lies behind it. The two
-            are the same one where it stands: until the snapshot of the tick in which it was placed, or where nothing
-            older is kept.
+            The states before and after the moment, and the share of the way between them, 0 to 1. Both states are one
+            and the same if the entity is drawn standing: before the tick in which the rules placed it, or if no
+            earlier state is kept.
 
         Raises:
-            KeyError: it is not predicted.
+            KeyError: the entity is not predicted.
         """
         newest = self.predicted.tick
         tick = min(math.floor(at), newest - 1)
@@ -210,12 +220,12 @@ class Prediction:
         return after, after, 0.0
 
     def _placed(self, since: int, to: int) -> frozenset[int]:
-        """The entities that the server's rules placed after the tick `since` and up to `to`."""
+        """Returns the entities that the server's rules placed after the tick `since`, up to `to`."""
         ticks = range(max(since, to - self.known.follow_max) + 1, to + 1)
         return frozenset().union(*(ids for tick in ticks if (ids := self.known.placed.get(tick))))
 
     def _state(self, entity: int, tick: int) -> State | None:
-        """The kept state of an entity at the end of a tick."""
+        """Returns the kept state of an entity at the end of a tick; None if none is kept."""
         states = self._states.get(tick)
         if states is None:
             return None
@@ -223,7 +233,7 @@ class Prediction:
         return tuple(mine[0].tolist()) if len(mine) else None
 
     def rehearse(self) -> None:
-        """Goes back to the confirmed world and replays all since: the sync test. Changes nothing, if all is well."""
+        """Runs the sync test: replays everything since the confirmed world. Changes nothing unless state is hidden."""
         self._replay(self.predicted.tick)
 
     def _truth(self) -> Int64s:
@@ -242,7 +252,7 @@ class Prediction:
             self.step()
 
     def _near_equal(self, guess: Int64s, truth: Int64s) -> bool:
-        """Whether all that could meet the own entity, or is drawn as predicted, is as predicted."""
+        """Returns whether all entities are as predicted that could meet the own one, or are drawn as predicted."""
         if guess.tobytes() == truth.tobytes():
             return True
         kernel, reach = self.confirmed.kernel, MEET_BLOCKS * BLOCK
@@ -250,7 +260,7 @@ class Prediction:
         return bool(kernel.alike(a, len(guess), b, len(truth), self.entity, reach, always))
 
     def _difference(self, guess: Int64s, truth: Int64s) -> tuple[tuple[str, ...], float] | None:
-        """In which fields, and by how many blocks, the own entity is not as predicted."""
+        """Returns the fields and the distance (blocks) by which the own entity differs; None if it does not."""
         was, mine = guess[guess[:, ID] == self.entity], truth[truth[:, ID] == self.entity]
         if not len(mine) or not len(was) or np.array_equal(mine, was):
             return None
@@ -262,7 +272,7 @@ class Prediction:
 
 
 def _offsets(before: Int64s, after: Int64s) -> dict[int, Place]:
-    """How far each entity that is in both has jumped back, in blocks."""
+    """Returns old minus new position of each entity that is in both and has moved, in blocks."""
     was = dict(zip(before[:, ID].tolist(), before[:, X : X + 3].tolist(), strict=True))
     offsets: dict[int, Place] = {}
     for entity, place in zip(after[:, ID].tolist(), after[:, X : X + 3].tolist(), strict=True):

@@ -22,6 +22,7 @@ COMPLIANT = (
     "CHANGELOG.md",
     "CONTRIBUTING.md",
     "README.md",
+    "client_sdk",
     "docs/client.md",
     "docs/games.md",
     "docs/glossary.md",

@@ -91,7 +91,7 @@ def test_a_compiler_that_fails_leaves_the_client_with_plain_python(
 ) -> None:
     monkeypatch.setenv(kernels.VARIABLE, NUMBA)
     monkeypatch.setattr(kernels, "ready", lambda: False)
-    for program, said in (("raise SystemExit(3)", "exit code 3"), (None, "no compiler can be started")):
+    for program, said in (("raise SystemExit(3)", "exit code 3"), (None, "the compiler could not be started")):
         if program is None:
             monkeypatch.setattr("sys.executable", "/nowhere/python")
         compiler = Compiler(program or "")
