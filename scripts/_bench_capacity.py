@@ -8,8 +8,8 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
-import _bench_server as server
-from _env import lacking
+from scripts import _bench_server as server
+from scripts.environment import lacking
 
 
 def run(args: argparse.Namespace, console: Console) -> tuple[dict[str, Any], int]:

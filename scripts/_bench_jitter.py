@@ -15,7 +15,7 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
-import _bench_server as server
+from scripts import _bench_server as server
 from server.histogram import between
 
 VARIANTS = {

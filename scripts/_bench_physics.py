@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
-import _step_c
-from _crowds import Samples, crowd, hills, take_turns, wishes
-from _slabs import Slabs, boxes_on, dense_hits
+from scripts import _step_c
+from scripts._crowds import Samples, crowd, hills, take_turns, wishes
+from scripts._slabs import Slabs, boxes_on, dense_hits
 from shared.scene import Scene, Template
 from shared.units import SEGMENT
 from shared.world import World

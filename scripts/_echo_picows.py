@@ -25,7 +25,7 @@ from picows import (
     ws_create_server,
 )
 
-from _busy_server import Echo
+from scripts._busy_server import Echo
 from server import process
 from server.ticker import Ticker, best_alarm
 

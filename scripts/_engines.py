@@ -10,8 +10,8 @@ from typing import Any, Protocol
 import numpy as np
 import numpy.typing as npt
 
-import _variants
-from _slabs import Slabs
+from scripts import _variants
+from scripts._slabs import Slabs
 from shared.inputs import JUMP, MOVE_MAX, Input
 from shared.layout import FLAGS, MOVE_X, VX, X
 from shared.scene import Scene

@@ -7,8 +7,8 @@ from collections.abc import Callable
 import numpy as np
 import numpy.typing as npt
 
-import _variants
-from _engines import GRAVITY, JUMP_SPEED, LOW, SIDES, WALK, Choice, Engine, Floats, Kinds, engine, slabs_of
+from scripts import _variants
+from scripts._engines import GRAVITY, JUMP_SPEED, LOW, SIDES, WALK, Choice, Engine, Floats, Kinds, engine, slabs_of
 from shared.inputs import MOVE_MAX
 from shared.terrain import generate
 

@@ -13,10 +13,10 @@ from typing import Any
 import msgpack
 import numpy as np
 
-from _generator import REQUEST, frame
-from _progress import Progress
 from client_sdk.confirmed import Confirmed
 from client_sdk.replica import check_scene
+from scripts._generator import REQUEST, frame
+from scripts._progress import Progress
 from shared import edits, messages
 from shared.messages import Bye, Command, Hello, Inputs, Ping, Snapshot, Welcome, decode_from_server, encode
 from shared.snapshot import VERDICT

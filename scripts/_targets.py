@@ -12,7 +12,7 @@ import tempfile
 from collections.abc import Callable
 from pathlib import Path
 
-from _house import House
+from scripts._house import House
 from server.kinds import SettingsError
 from server.settings import KINDS, Settings, parse
 from shared import edits

@@ -15,9 +15,9 @@ from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
-from _conclusion import Row, conclusion
-from _engines import Choice
-from _env import lacking
+from scripts._conclusion import Row, conclusion
+from scripts._engines import Choice
+from scripts.environment import lacking
 from shared import kernels
 
 PRODUCT = Choice(product=True)
@@ -62,7 +62,7 @@ SHARES = ("inside_share", "tangential_lost")
 
 
 def run(progress: Progress, *, quick: bool) -> list[Row]:
-    import _errors  # compiles the variants
+    from scripts import _errors  # compiles the variants
 
     choices = [(group, choice) for group, members in GROUPS.items() for choice in members]
     task = progress.add_task("speed", total=len(choices) + 1)
@@ -135,7 +135,7 @@ def main(argv: list[str] | None = None) -> int:
             json.dumps({"quick": args.quick, "rows": rows, "conclusion": text}, indent=1) + "\n", "utf-8"
         )
     if args.plot:
-        from _picture import draw
+        from scripts._picture import draw
 
         draw(rows, args.plot)
     return 0

@@ -35,16 +35,16 @@ from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
-import _bench_bytes as wire
-import _bench_capacity as capacity
-import _bench_entities as entities
-import _bench_jitter as jitter
-import _bench_memory as memory
-import _bench_physics as physics
-import _bench_rss as rss
-import _step_c
-from _bench_server import RigError
-from _crowds import Samples
+from scripts import _bench_bytes as wire
+from scripts import _bench_capacity as capacity
+from scripts import _bench_entities as entities
+from scripts import _bench_jitter as jitter
+from scripts import _bench_memory as memory
+from scripts import _bench_physics as physics
+from scripts import _bench_rss as rss
+from scripts import _step_c
+from scripts._bench_server import RigError
+from scripts._crowds import Samples
 from shared import kernels
 
 Report = dict[str, Any]

@@ -26,8 +26,8 @@ from typing import Any
 from rich.console import Console
 from rich.progress import Progress
 
-import _mutate
-from _targets import TARGETS, Target
+from scripts import _mutate
+from scripts._targets import TARGETS, Target
 
 ROOT = Path(__file__).resolve().parent.parent
 CORPUS = ROOT / "tests" / "fuzz" / "corpus"

@@ -34,15 +34,13 @@ from itertools import count
 from pathlib import Path as File
 from typing import Any
 
-sys.path.insert(0, str(File(__file__).resolve().parent.parent))
-
 from rich import box
 from rich.console import Console
 from rich.table import Table
 
 from client_sdk.clock import PRICE_S, SAFETY_S, STALL_S, LeadController, PricedLead, ServerClock, Timeline
 from client_sdk.links import PRESETS, Weather, Wire
-from controllers import RIVALS, Rival
+from scripts.controllers import RIVALS, Rival
 
 RATE = 32
 TICK_MS = 1000 / RATE

@@ -6,8 +6,6 @@ import random
 import sys
 from pathlib import Path
 
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
-
 from client_sdk.bots import POLICIES, Bot
 from client_sdk.transports.aio import AsyncClient
 from sovereign_netcode.loadtest.processes import own_server

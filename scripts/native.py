@@ -1,110 +1,14 @@
 #!/usr/bin/env python3
-"""Runs a program of the repository with its sources compiled by mypyc. The network lab takes half the time.
-
-    python scripts/native.py scripts/netlab.py --preset typical --minutes 60
-    python scripts/native.py -m server --scene hills
-
-Needs a C compiler and Python's headers. A copy of the sources is compiled in `build/native`, once for each state of the
-sources (a minute, 30 MB), and the program runs there. Nothing else uses the compiled copy.
-"""
+"""Runs a program of the repository with its sources compiled by mypyc. `--help` tells how."""
 
 from __future__ import annotations
 
-import hashlib
-import os
-import shutil
-import subprocess
 import sys
-import time
-from pathlib import Path
 
-from _env import DEV, PYTHON, ROOT, ensure
-
-SOURCES = ("client_sdk", "scripts", "server", "shared", "sovereign_netcode", "tests")
-BUILT = ROOT / "build" / "native"
-MODULES = (
-    "client_sdk/clock.py", "client_sdk/comeback.py", "client_sdk/confirmed.py", "client_sdk/core.py",
-    "client_sdk/events.py", "client_sdk/interpolation.py", "client_sdk/linked.py", "client_sdk/links.py",
-    "client_sdk/orders.py", "client_sdk/picture.py", "client_sdk/play.py", "client_sdk/prediction.py",
-    "client_sdk/replica.py", "client_sdk/smoothing.py", "client_sdk/stats.py",
-    "server/counters.py", "server/delivery.py", "server/door.py", "server/game.py", "server/gateway.py",
-    "server/interest.py", "server/orders.py", "server/pacing.py", "server/replication.py", "server/roster.py",
-    "server/session.py", "server/sight.py",
-    "shared/inputs.py", "shared/messages.py", "shared/ring.py", "shared/snapshot.py",
-    "sovereign_netcode/playtest/match.py",
-)  # fmt: skip
-"""Modules that a tick of a server and of a client runs. Other programs cannot derive from the classes of a compiled
-module, so rules, policies and transports are not among them."""
-
-
-def built() -> Path:
-    """Returns the folder with the compiled copy of the current sources. Compiles them if there is none.
-
-    Raises:
-        SystemExit: the sources cannot be compiled.
-    """
-    digest = hashlib.sha256(sys.version.encode())
-    for file in sources():
-        digest.update(f"{file.relative_to(ROOT)}\0".encode() + file.read_bytes())
-    place = BUILT / digest.hexdigest()[:16]
-    if not place.exists():
-        print("compiling the sources for this machine, once: a minute or two ... ", end="", file=sys.stderr, flush=True)
-        started = time.perf_counter()
-        raw = BUILT / f"unfinished-{os.getpid()}"
-        build(raw)
-        raw.rename(place)
-        print(f"done in {time.perf_counter() - started:.0f} s", file=sys.stderr, flush=True)
-    return place
-
-
-def sources() -> list[Path]:
-    """Returns all files that a program of the repository may need."""
-    files = (file for folder in SOURCES for file in (ROOT / folder).rglob("*") if "__pycache__" not in file.parts)
-    return [ROOT / "pyproject.toml", *sorted(file for file in files if file.is_file())]
-
-
-def build(place: Path, optimise: int = 3) -> None:
-    """Copies the sources to a new folder, and compiles them there.
-
-    Args:
-        optimise: the C compiler's level of optimisation, from 0 to 3.
-
-    Raises:
-        SystemExit: the sources cannot be compiled.
-    """
-    for file in sources():
-        copy = place / file.relative_to(ROOT)
-        copy.parent.mkdir(parents=True, exist_ok=True)
-        shutil.copy2(file, copy)
-    command = (sys.executable, str(ROOT / "scripts" / "_native_build.py"), str(optimise), *MODULES)
-    environment = os.environ | {"PYTHONPATH": str(place)}
-    done = subprocess.run(command, cwd=place, env=environment, capture_output=True, text=True, check=False)
-    if done.returncode:
-        shutil.rmtree(place)
-        sys.exit(
-            f"failed\n{done.stdout[-2000:]}{done.stderr[-2000:]}\nAre a C compiler and Python's headers installed?"
-        )
-    shutil.rmtree(place / "build")  # the C sources and object files
-
-
-def main(arguments: list[str]) -> None:
-    if not arguments or arguments[0] in ("-h", "--help"):
-        print(__doc__)
-        sys.exit(not arguments)
-    if Path(sys.executable) != ensure(DEV):
-        os.execv(PYTHON, (str(PYTHON), __file__, *arguments))
-    place = built()
-    if arguments[0] == "-m":
-        command = ["-P", *arguments]  # modules in the current folder cannot hide others
-    else:
-        script = Path(arguments[0]).resolve()
-        if not script.is_relative_to(ROOT):
-            sys.exit(f"{arguments[0]}: not a program in {ROOT}")
-        command = [str(place / script.relative_to(ROOT)), *arguments[1:]]
-    path = os.pathsep.join(filter(None, (str(place), os.environ.get("PYTHONPATH"))))
-    # Replaces this process, so that a signal to it reaches the program.
-    os.execve(sys.executable, (sys.executable, *command), os.environ | {"PYTHONPATH": path})
-
+from environment import enter
 
 if __name__ == "__main__":
+    enter(pinned=True)
+    from scripts.native_build.app import main
+
     main(sys.argv[1:])

@@ -23,13 +23,11 @@ from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
-
-import league
-from _env import lacking
 from client_sdk.events import Corrected
 from client_sdk.links import PRESETS
 from client_sdk.stats import Stats
+from scripts import league
+from scripts.environment import lacking
 from shared.scene import load_scene
 from sovereign_netcode.playtest import Match, Player, wander
 
@@ -181,7 +179,7 @@ def main() -> int:
     if chosen.json:
         chosen.json.write_text(json.dumps({"seed": chosen.seed, "presets": presets, "league": rows}, indent=1) + "\n")
     if chosen.plot:
-        import netlab_plot
+        from scripts import netlab_plot
 
         netlab_plot.draw(presets, rows, chosen.plot)
     return 1 if any(row["divergences"] or row["disconnects"] for row in presets.values()) else 0

@@ -10,7 +10,6 @@ import sys
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
-sys.path.insert(0, str(ROOT))
 
 from shared import kernels  # noqa: E402
 from tests.golden.scripts import SCRIPTS, run  # noqa: E402

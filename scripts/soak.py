@@ -32,8 +32,8 @@ from typing import Any
 from rich.console import Console
 from rich.progress import Progress
 
-from _soakers import Cells, Honest
-from _walkers import Walker
+from scripts._soakers import Cells, Honest
+from scripts._walkers import Walker
 from server.store import Store
 from shared.scene import load_scene
 from shared.world import World

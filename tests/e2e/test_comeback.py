@@ -13,11 +13,9 @@ import pytest
 from client_sdk.client import Client
 from client_sdk.events import Disconnected, Event, Joined, Left, Resumed
 from client_sdk.transports.aio import AsyncClient
+from scripts._walkers import walk
 from tests.client_sdk.servers import ROOT
 from tests.e2e.processes import MOVING_BLOCKS, RECOVERY_S, Strider
-
-sys.path.insert(0, str(ROOT / "scripts"))
-from _walkers import walk
 
 pytestmark = pytest.mark.e2e
 COMMAND = (sys.executable, "-m", "server", "--host", "127.0.0.1", "--scene", "flat", "--log-level", "warning")

@@ -8,14 +8,10 @@ from pathlib import Path
 
 import pytest
 
+from scripts import _soakers, _walkers, soak
 from shared import messages
 from tests.e2e.processes import ROOT
 from tests.worlds import build, floor
-
-sys.path.insert(0, str(ROOT / "scripts"))
-import _soakers
-import _walkers
-import soak
 
 MINUTES = 0.25
 CLIENTS = 8

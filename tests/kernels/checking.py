@@ -2,13 +2,12 @@
 
 It is what `scripts/kernels` builds for this machine, from the same IR but for the checks. LLVM loads it into this
 process, so no linker is needed. A function that meets an index out of bounds raises a SystemError. Set the environment
-of `_kernel_build.BUILDING` for the process.
+of `scripts.kernel_build.build.BUILDING` for the process.
 """
 
 import contextlib
 import ctypes
 import importlib.machinery
-import sys
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -16,13 +15,10 @@ from typing import Any
 import llvmlite.binding as llvm
 import numpy as np
 
+from scripts.kernel_build import ir, python_module
 from shared import exports, kernels
 
 ROOT = Path(__file__).parent.parent.parent
-sys.path.append(str(ROOT / "scripts"))
-
-import _kernel_ir  # noqa: E402
-import _kernel_python  # noqa: E402
 
 ABI = 3
 
@@ -32,17 +28,15 @@ def loaded() -> tuple[ModuleType, Any]:
     llvm.initialize_native_target()
     llvm.initialize_native_asmprinter()
     names = {**exports.functions(), "built_from": exports.NUMBER}
-    machine = _kernel_ir.Machine(llvm.get_process_triple(), llvm.get_host_cpu_name())
-    sources = _kernel_ir.numba_sources(ROOT, bounds=True)
-    module, target_machine = _kernel_ir.linked(
-        sources, 0, machine, _kernel_python.module(names), (_kernel_python.INIT,)
-    )
+    machine = ir.Machine(llvm.get_process_triple(), llvm.get_host_cpu_name())
+    sources = ir.numba_sources(ROOT, bounds=True)
+    module, target_machine = ir.linked(sources, 0, machine, python_module.module(names), (python_module.INIT,))
     engine = llvm.create_mcjit_compiler(module, target_machine)
     engine.finalize_object()
-    definition = ctypes.PYFUNCTYPE(ctypes.c_void_p)(engine.get_function_address(_kernel_python.INIT))()
+    definition = ctypes.PYFUNCTYPE(ctypes.c_void_p)(engine.get_function_address(python_module.INIT))()
     make = ctypes.pythonapi.PyModule_FromDefAndSpec2
     make.restype, make.argtypes = ctypes.py_object, (ctypes.c_void_p, ctypes.py_object, ctypes.c_int)
-    made: ModuleType = make(definition, importlib.machinery.ModuleSpec(_kernel_python.MODULE, None), ABI)
+    made: ModuleType = make(definition, importlib.machinery.ModuleSpec(python_module.MODULE, None), ABI)
     return made, engine
 
 

@@ -81,7 +81,7 @@ def test_a_library_needs_python_or_a_memory_and_nothing_else(
 @pytest.mark.skipif(not kernels.numba_installed(), reason="Numba is not installed")
 def test_a_second_build_gives_the_same_bytes(tmp_path: Path) -> None:
     """Up to the linker, which `scripts/kernels --check` includes: it is no part of the environment of the tests."""
-    build = (sys.executable, str(ROOT / "scripts" / "_kernel_build.py"), str(tmp_path), "--objects", *AGAIN)
+    build = (sys.executable, "-m", "scripts.kernel_build.build", str(tmp_path), "--objects", *AGAIN)
     subprocess.run(build, cwd=tmp_path, env=os.environ | {"PYTHONHASHSEED": "7"}, check=True)
     again, made = json.loads((tmp_path / kernels.MANIFEST).read_text("utf-8")), manifest()
     if again["made_with"] != made["made_with"]:

@@ -1,16 +1,13 @@
 """The benchmarks of bytes and of memory, in short, and what they promise."""
 
 import itertools
-import sys
 import tracemalloc
-from pathlib import Path
 
 import pytest
 
-sys.path.insert(0, str(Path(__file__).parents[2] / "scripts"))
-import _bench_bytes as wire
-import _bench_entities as entities
-import _bench_memory as memory
+from scripts import _bench_bytes as wire
+from scripts import _bench_entities as entities
+from scripts import _bench_memory as memory
 
 
 @pytest.mark.parametrize(("motion", "most"), [("wander", 7_500), ("run-and-jump", 9_500), ("restless", 21_000)])

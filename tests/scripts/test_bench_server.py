@@ -2,17 +2,14 @@
 
 import sys
 import tomllib
-from pathlib import Path
 from typing import Any, cast
 
 import pytest
 
+from scripts import _bench_jitter as jitter
+from scripts import _bench_rss as rss
+from scripts import _bench_server as bench
 from shared.scene import Scene
-
-sys.path.insert(0, str(Path(__file__).parents[2] / "scripts"))
-import _bench_jitter as jitter
-import _bench_rss as rss
-import _bench_server as bench
 
 needs_linux = pytest.mark.skipif(sys.platform != "linux", reason="the generator polls with epoll")
 

@@ -1,26 +1,26 @@
-"""What the scripts say when they set up their environment; nothing is installed here."""
+"""Tests of the environment's set-up, and of how commands start; nothing is installed here."""
 
-import importlib
+import os
+import shutil
+import subprocess
 import sys
 from pathlib import Path
 from types import ModuleType
 
 import pytest
 
-ROOT = Path(__file__).resolve().parents[2]
-sys.path.insert(0, str(ROOT / "scripts"))
+from scripts import environment
 
 
 @pytest.fixture
 def env(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> ModuleType:
-    """`scripts/_env.py` with an environment of its own, for which every command succeeds."""
-    module = importlib.import_module("_env")
+    """The module with an environment of its own, for which every command succeeds."""
     venv = tmp_path / ".venv"
     venv.mkdir()
     for name, value in {"VENV": venv, "PYTHON": venv / "python", "STAMP": venv / "stamp"}.items():
-        monkeypatch.setattr(module, name, value)
-    monkeypatch.setattr(module, "_must", lambda *command: (venv / "python").touch())
-    return module
+        monkeypatch.setattr(environment, name, value)
+    monkeypatch.setattr(environment, "_must", lambda *command: (venv / "python").touch())
+    return environment
 
 
 def test_a_set_up_says_where_with_what_and_how_long(env: ModuleType, capsys: pytest.CaptureFixture[str]) -> None:
@@ -50,3 +50,45 @@ def test_an_interrupted_set_up_is_begun_anew(
     capsys.readouterr()
     env.ensure(env.DEV)
     assert "done in" in capsys.readouterr().out
+
+
+def command(folder: Path) -> Path:
+    """Writes a checkout with a command whose package prints the arguments and a flag. Returns the command's path."""
+    scripts = folder / "scripts"
+    (scripts / "tool").mkdir(parents=True)
+    shutil.copy(environment.__file__, scripts)
+    (scripts / "__init__.py").touch()
+    (scripts / "tool" / "app.py").write_text("import sys\nprint(sys.argv[1:], sys.flags.optimize)\n", "utf-8")
+    (scripts / "use.py").write_text("from environment import enter\nenter()\nimport scripts.tool.app\n", "utf-8")
+    return scripts / "use.py"
+
+
+@pytest.mark.parametrize("name", ["plain", "with a space"])
+def test_a_command_runs_in_an_interpreter_that_has_the_checkout_on_its_path(tmp_path: Path, name: str) -> None:
+    tool = command(tmp_path / name)
+    here = {"PYTHONPATH": str(tmp_path / name)}
+    done = subprocess.run(
+        [sys.executable, "-O", tool, "--a", "b"], env=os.environ | here, capture_output=True, text=True, check=False
+    )
+    assert (done.stdout, done.stderr) == ("['--a', 'b'] 1\n", "")
+    assert not (tmp_path / name / ".venv").exists()
+
+
+@pytest.mark.parametrize(("pinned", "importable", "again"), [(False, True, 0), (False, False, 1), (True, True, 1)])
+def test_a_command_starts_again_in_the_environment_if_it_must(
+    env: ModuleType, monkeypatch: pytest.MonkeyPatch, pinned: bool, importable: bool, again: int
+) -> None:
+    started: list[tuple[object, ...]] = []
+    monkeypatch.setattr(env, "become", lambda *command: started.append(command))
+    monkeypatch.setattr(env, "_can_import", lambda: importable)
+    env.enter(pinned=pinned)
+    assert started == [(env.PYTHON, *sys.argv)] * again
+    monkeypatch.setattr(sys, "executable", str(env.PYTHON))
+    env.enter(pinned=pinned)
+    assert len(started) == again, "a command never starts again within the environment"
+
+
+def test_another_checkout_is_not_this_one(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    assert environment._can_import()
+    monkeypatch.setattr(environment, "ROOT", tmp_path)
+    assert not environment._can_import()

@@ -1,13 +1,10 @@
 """The fuzzer: a short run of it, that it is the same again from the same seed, and that it finds what there is."""
 
-import sys
 from pathlib import Path
 
 import pytest
 
-sys.path.insert(0, str(Path(__file__).parents[2] / "scripts"))
-import _targets
-import fuzz
+from scripts import _targets, fuzz
 
 INPUTS = {"client": 20_000, "server": 10_000, "value": 10_000, "edit": 10_000, "session": 8_000, "settings": 150}
 SEED = 7

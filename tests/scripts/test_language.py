@@ -1,12 +1,10 @@
 """The language check: a text that breaks a rule is found at its line, and a plain text is not."""
 
-import sys
 from pathlib import Path
 
 import pytest
 
-sys.path.insert(0, str(Path(__file__).parents[2] / "scripts"))
-import _language
+from scripts.checks import language
 
 # The bad texts of this file are put together from pieces, so that the check passes on the file itself.
 BAD_WORDS = "who what whoever whose whom that those so and or each how why where when which see".split()
@@ -27,7 +25,7 @@ CONSTANTS = ('A = 1\n"""{}"""', 'class A:\n    a: int = 1\n    """{}"""', 'def f
 
 def lines(source: str, path: str = "a.py") -> list[int]:
     """Returns the lines of all findings in a text."""
-    return [finding.line for finding in _language.findings(path, source)]
+    return [finding.line for finding in language.findings(path, source)]
 
 
 @pytest.mark.parametrize("place", PLACES)
@@ -93,7 +91,7 @@ def test_similar_words_are_not_found(text: str) -> None:
 
 
 def test_a_finding_names_place_rule_and_text() -> None:
-    (finding,) = _language.findings("server/a.py", 'A = 1\n"""Those\n\n  of the ' + "x" * 200 + '."""')
+    (finding,) = language.findings("server/a.py", 'A = 1\n"""Those\n\n  of the ' + "x" * 200 + '."""')
     assert str(finding).startswith(
         "server/a.py:2: begin with a verb in the third person or a noun phrase, not with 'Th"
     )
@@ -101,8 +99,8 @@ def test_a_finding_names_place_rule_and_text() -> None:
 
 
 def test_all_listed_places_comply(capsys: pytest.CaptureFixture[str]) -> None:
-    assert all((_language.ROOT / name).exists() for name in _language.COMPLIANT)
-    assert _language.main([]) == 0, capsys.readouterr().out
+    assert all((language.ROOT / name).exists() for name in language.COMPLIANT)
+    assert language.main([]) == 0, capsys.readouterr().out
 
 
 def test_files_are_found_by_suffix_or_first_line(
@@ -114,9 +112,9 @@ def test_files_are_found_by_suffix_or_first_line(
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).write_text("#!/usr/bin/env python3\n" * (name == "b/run") + bad)
     (tmp_path / "picture").write_bytes(b"\x89PNG")
-    monkeypatch.setattr(_language, "ROOT", tmp_path)
-    assert [path.relative_to(tmp_path).as_posix() for path in _language.files(tmp_path)] == list(checked)
-    assert _language.main([str(tmp_path)]) == 1
+    monkeypatch.setattr(language, "ROOT", tmp_path)
+    assert [path.relative_to(tmp_path).as_posix() for path in language.files(tmp_path)] == list(checked)
+    assert language.main([str(tmp_path)]) == 1
     *found, last = capsys.readouterr().out.splitlines()
     assert {line.partition(":")[0] for line in found} == set(checked)
     assert last == "5 findings in 3 files"

@@ -1,23 +1,19 @@
 """Tests that the soak sees players who get nowhere although snapshots come."""
 
-import sys
 from collections.abc import Callable
-from pathlib import Path
 from random import Random
 
 import pytest
 
 from client_sdk.core import Core
 from client_sdk.linked import LinkedCore
+from scripts._progress import Progress
+from scripts._walkers import LOOK_S, Walker, walk
 from shared.inputs import Input
 from shared.messages import Inputs, decode_from_client
 from shared.scene import load_scene
 from sovereign_netcode.playtest import Match
 from sovereign_netcode.playtest import Path as Line
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "scripts"))
-from _progress import Progress
-from _walkers import LOOK_S, Walker, walk
 
 HZ = 32
 

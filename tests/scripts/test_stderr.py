@@ -9,13 +9,12 @@ from pathlib import Path
 
 import pytest
 
+from scripts import _bench_server as bench
 from sovereign_netcode.loadtest.processes import CannotStartError, cause, child, own_server
 from sovereign_netcode.play import own_server as play
 from sovereign_netcode.stderr import Stderr
 
 ROOT = Path(__file__).resolve().parents[2]
-sys.path.insert(0, str(ROOT / "scripts"))
-import _bench_server as bench  # noqa: E402
 
 MISSING = "import no_such_library"
 
@@ -105,14 +104,17 @@ def test_the_benchmark_names_what_is_missing(
 def test_a_benchmark_that_fails_says_so_in_a_line(tmp_path: Path) -> None:
     """The environment is the one of `scripts/demo` alone, which has neither picows nor matplotlib."""
     without = (
-        "import sys; sys.modules.update(picows=None, matplotlib=None); sys.path.insert(0, 'scripts');"
+        "import sys; sys.modules.update(picows=None, matplotlib=None);"
         "import importlib.util as u; real = u.find_spec;"
         "u.find_spec = lambda name: None if name in ('picows', 'matplotlib') else real(name);"
     )
     for program, expected in (
-        ("import accuracy; sys.exit(accuracy.main(['--plot', 'x.png']))", "error: --plot: matplotlib is not installed"),
         (
-            "import _env; sys.exit(_env.lacking('picows'))",
+            "from scripts import accuracy; sys.exit(accuracy.main(['--plot', 'x.png']))",
+            "error: --plot: matplotlib is not installed",
+        ),
+        (
+            "from scripts.environment import lacking; sys.exit(lacking('picows'))",
             "picows is not installed here; `python scripts/test --version`",
         ),
     ):

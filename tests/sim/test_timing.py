@@ -5,22 +5,18 @@ beforehand (see `scripts/league.py`). The runs have no physics, so they are quic
 """
 
 import random
-import sys
 from collections.abc import Iterator
 from functools import cache
-from pathlib import Path as File
 
 import pytest
 
 from client_sdk.clock import PricedLead
 from client_sdk.core import Core
 from client_sdk.links import PRESETS
+from scripts import league
 from shared.inputs import Input
 from shared.scene import load_scene
 from tests.match import Match
-
-sys.path.insert(0, str(File(__file__).parents[2] / "scripts"))
-import league
 
 SEEDS = (11,)
 MORE = (12, 13)

@@ -1,6 +1,8 @@
 """The repository's own `.venv`, made from hashed pins. This file needs only the standard library.
 
-Interpreters older than the supported ones must be able to run this file, because it looks for a newer one.
+Interpreters older than the supported ones must be able to run this file, because it looks for a newer one. The commands
+in this folder import it as `environment`, because Python finds the modules beside a command. Everything else imports
+`scripts.environment`.
 """
 
 from __future__ import annotations
@@ -13,7 +15,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, NoReturn
 
 RUNTIME = "requirements.txt"
 DEV = "requirements-dev.txt"
@@ -59,6 +61,27 @@ def ensure(requirements: str) -> Path:
     return PYTHON
 
 
+def enter(*, pinned: bool = False) -> None:
+    """Continues a command in an interpreter that can import the packages of this checkout.
+
+    Returns if this interpreter can, or else starts the command again in `.venv`, with everything for development.
+
+    Args:
+        pinned: whether only `.venv` will do, because the command depends on the exact versions.
+    """
+    if pinned or not _can_import():
+        python = ensure(DEV)
+        if Path(sys.executable) != python:
+            become(python, *sys.argv)
+
+
+def become(python: Path, *args: str) -> NoReturn:
+    """Replaces this process by a run of `python` with `args`, so that a signal to it reaches the new program."""
+    if os.name == "nt":  # exec would return to the shell at once
+        sys.exit(subprocess.run([str(python), *args], check=False).returncode)
+    os.execv(python, [str(python), *args])
+
+
 def run(title: str, *args: str) -> Step:
     """Runs the environment's Python with `args` in the repository's root. Its output is not captured."""
     print(f"\n== {title}", flush=True)
@@ -72,6 +95,12 @@ def lacking(module: str) -> str:
     if importlib.util.find_spec(module) is not None:
         return ""
     return f"{module} is not installed here; `python scripts/test --version` installs everything for development"
+
+
+def _can_import() -> bool:
+    """Returns whether this interpreter is new enough, and finds the package `scripts` of this checkout."""
+    found = importlib.util.find_spec("scripts") if sys.version_info >= (3, 11) else None
+    return found is not None and Path(found.origin or "").resolve() == ROOT / "scripts" / "__init__.py"
 
 
 def _read_stamp() -> tuple[str, str, str]:

@@ -9,7 +9,7 @@ because no call takes as long as a thread's turn (5 ms).
 
 from __future__ import annotations
 
-from _kernel_ir import FAILED
+from scripts.kernel_build.ir import FAILED
 from shared import exports
 
 MODULE = "sovereign_kernel"

@@ -1,6 +1,6 @@
 """A check of the language of texts: docstrings and comments in plain English, by rules that a machine can hold.
 
-    python scripts/_language.py [PATH ...]      checks the given files and folders, or else those of `COMPLIANT`
+    python -m scripts.checks.language [PATH ...]      checks the given files and folders, or else those of `COMPLIANT`
 
 Prints `file:line: rule: text` for each finding. Exits with 1 if there is a finding.
 """
@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, NamedTuple
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-ROOT = Path(__file__).resolve().parent.parent
+ROOT = Path(__file__).resolve().parents[2]
 COMPLIANT = (
     "ARCHITECTURE.md",
     "CHANGELOG.md",
@@ -31,7 +31,7 @@ COMPLIANT = (
     "docs/protocol.md",
     "docs/server.md",
     "hatch_build.py",
-    "scripts/_language.py",
+    "scripts/checks",
     "server/__init__.py",
     "server/__main__.py",
     "server/access.py",

@@ -1,8 +1,10 @@
-"""Builds the kernel for every target: `_kernel_build.py OUT [--objects TARGET ...]`. `scripts/kernels` runs it.
+"""Builds the kernel for every target. `scripts/kernels` runs this module in a process of its own.
 
-LLVM makes an object file for each target from one IR (`_kernel_ir`). LLD, from the package `ziglang`, links it to a
-library. Both are pinned. The bytes of the result depend only on the sources and on the versions that the manifest
-names.
+    python -m scripts.kernel_build.build OUT [--objects TARGET ...]
+
+LLVM makes an object file for each target from one IR (`scripts.kernel_build.ir`). LLD, from the package `ziglang`,
+links it to a library. Both are pinned. The bytes of the result depend only on the sources and on the versions that the
+manifest names.
 """
 
 from __future__ import annotations
@@ -21,7 +23,8 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-ROOT = Path(__file__).resolve().parent.parent
+from scripts.environment import ROOT
+
 LINKER = ROOT / "build" / "linker"
 """Folder in which `scripts/kernels` installs the linker."""
 OBJECT, STUBS, DEFINITION = "kernel.o", "python3.lib", "python3.def"
@@ -36,7 +39,7 @@ class Target:
     """A library to build.
 
     Attributes:
-        triple, cpu, features: the machine (`_kernel_ir.Machine`).
+        triple, cpu, features: the machine (`scripts.kernel_build.ir.Machine`).
         link: command lines of the linker's tools, in order; {exports} stands for an `--export=NAME` for each function,
             {init} for the export of the Python module.
         python: whether the library is a Python module; otherwise it exports the functions themselves.
@@ -98,24 +101,23 @@ def build(out: Path, targets: Sequence[str] = tuple(TARGETS), *, link: bool = Tr
     """
     import llvmlite.binding as llvm
 
-    import _kernel_ir
-    import _kernel_python
+    from scripts.kernel_build import ir, python_module
     from shared import exports, freshness, kernels
 
     llvm.initialize_all_targets()
     llvm.initialize_all_asmprinters()
     print("compiling with Numba ...", flush=True)
-    sources = _kernel_ir.numba_sources(ROOT)
+    sources = ir.numba_sources(ROOT)
     texts = freshness.sources(Path(source.__file__ or "") for source in kernels.SOURCES)
     code_crc = freshness.code_crc(texts)
-    python = _kernel_python.module({**exports.functions(), "built_from": exports.NUMBER})
+    python = python_module.module({**exports.functions(), "built_from": exports.NUMBER})
     files: dict[str, dict[str, Any]] = {}
     for name in targets:
         target = TARGETS[name]
         print(f"{name} ...", flush=True)
-        machine = _kernel_ir.Machine(target.triple, target.cpu, target.features)
-        more, visible = (python, (_kernel_python.INIT,)) if target.python else ("", ())
-        module, target_machine = _kernel_ir.linked(sources, code_crc, machine, more, visible)
+        machine = ir.Machine(target.triple, target.cpu, target.features)
+        more, visible = (python, (python_module.INIT,)) if target.python else ("", ())
+        module, target_machine = ir.linked(sources, code_crc, machine, more, visible)
         code = target_machine.emit_object(module)
         files[name] = {"object": _sha256(code)}
         if link:
@@ -141,7 +143,7 @@ def made_with() -> dict[str, str]:
 
 def _linked(name: str, code: bytes, functions: list[str]) -> bytes:
     """Returns the library that is linked from an object file."""
-    from _kernel_python import INIT, PYTHON
+    from scripts.kernel_build.python_module import INIT, PYTHON
 
     shown = " ".join(f"--export={each}" for each in (*functions, "built_from"))
     with tempfile.TemporaryDirectory() as folder:
@@ -183,6 +185,6 @@ def main() -> None:
 
 if __name__ == "__main__":
     if any(os.environ.get(name) != value for name, value in BUILDING.items()):
-        sys.exit(subprocess.run((sys.executable, *sys.argv), env=os.environ | BUILDING, check=False).returncode)
-    sys.path.insert(0, str(ROOT))
+        command = (sys.executable, "-P", "-m", "scripts.kernel_build.build", *sys.argv[1:])
+        sys.exit(subprocess.run(command, env=os.environ | BUILDING, check=False).returncode)
     main()

@@ -1,4 +1,7 @@
-"""Compiles modules of the current folder in place, for `native.py`: `_native_build.py LEVEL shared/ring.py ...`."""
+"""Compiles modules of the current folder in place, for `scripts/native.py`.
+
+python -m scripts.native_build.compile LEVEL shared/ring.py ...
+"""
 
 import sys
 

@@ -1,0 +1,1 @@
+"""Commands of this repository, and the packages behind them. Nothing of it is installed with the product."""
