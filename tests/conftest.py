@@ -9,9 +9,12 @@ import pytest
 from hypothesis import HealthCheck, settings
 
 from shared import kernels
+from tests.lengths import EXAMPLES
 
-settings.register_profile("same", derandomize=True, deadline=None, suppress_health_check=[HealthCheck.too_slow])
-settings.load_profile("same")
+SAME = settings(derandomize=True, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+settings.register_profile("short", SAME, max_examples=EXAMPLES // 4)
+settings.register_profile("long", SAME, max_examples=EXAMPLES)
+settings.load_profile("short")  # or the one that --hypothesis-profile names
 
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     # A script has started the tests in the background. What they start in turn shall be as on a terminal.

@@ -100,6 +100,7 @@ def test_small_messages_are_not_held_back(url: str) -> None:
         assert raw_socket(client).gettimeout() == 0.0
 
 
+@pytest.mark.alone
 def test_an_idle_poll_costs_microseconds() -> None:
     with silent_server() as url, Client.connect(url) as client:
         best = float("inf")

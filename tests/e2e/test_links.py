@@ -27,7 +27,7 @@ from tests.client_sdk.servers import real_server
 from tests.match import Match
 from tests.proxy import HIDDEN_BYTES, PACKET_BYTES, Proxy
 
-pytestmark = pytest.mark.e2e
+pytestmark = [pytest.mark.e2e, pytest.mark.alone]
 
 CLIENTS = 5
 SETTLED_S = 3.0

@@ -13,6 +13,7 @@ import pytest
 
 from tests.client_sdk.servers import real_server
 from tests.e2e.processes import inheriting
+from tests.lengths import long
 
 pytestmark = pytest.mark.e2e
 needs_linux = pytest.mark.skipif(sys.platform != "linux", reason="looks for processes in /proc")
@@ -28,6 +29,7 @@ def loadtest(*flags: str) -> "subprocess.CompletedProcess[str]":
     return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=120, check=False)
 
 
+@pytest.mark.alone
 def test_all_clients_play_and_the_figures_are_there(tmp_path: Path) -> None:
     out = tmp_path / "out.json"
     done = loadtest("--clients", "10", "--seconds", "3", "--processes", "2", "--json", str(out), "--verdict")
@@ -61,6 +63,7 @@ def test_it_takes_a_server_that_runs_already(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.alone
 def test_memory_of_the_server_is_flat_under_sixty_clients(tmp_path: Path) -> None:
     out = tmp_path / "out.json"
     done = loadtest("--clients", "60", "--seconds", "20", "--policy", "dig-and-place", "--json", str(out))
@@ -114,10 +117,17 @@ def playing(request: pytest.FixtureRequest) -> Iterator[tuple["subprocess.Popen[
 
 
 @needs_linux
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-@pytest.mark.parametrize("playing", [(), (signal.SIGINT,)], ids=["", "in a script's background"], indirect=True)
+@pytest.mark.parametrize(
+    ("number", "playing"),
+    [
+        (signal.SIGTERM, ()),
+        (signal.SIGINT, (signal.SIGINT,)),  # as a script's background job
+        *long((signal.SIGINT, ()), (signal.SIGTERM, (signal.SIGINT,))),
+    ],
+    indirect=["playing"],
+)
 def test_a_signal_leaves_nothing_behind(
-    playing: tuple["subprocess.Popen[str]", dict[int, str]], number: signal.Signals
+    number: signal.Signals, playing: tuple["subprocess.Popen[str]", dict[int, str]]
 ) -> None:
     process, _ = playing
     process.send_signal(number)

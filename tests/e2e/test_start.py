@@ -20,6 +20,7 @@ from client_sdk.client import Client
 from server.process import COMPILING, announce_compiling
 from shared import kernels
 from tests.e2e.processes import ROOT, START_S, other, page, running, stats, until
+from tests.lengths import long
 
 pytestmark = pytest.mark.e2e
 
@@ -74,13 +75,15 @@ def test_a_terminal_gets_plain_text_and_anything_else_a_line_of_the_log(caplog: 
 
 PAGE_IS = [
     ((), "http://127.0.0.1:{port}/"),
-    (("--host", "localhost"), "http://localhost:{port}/"),
-    (("--host", "0.0.0.0", "--auth", "none"), "http://127.0.0.1:{port}/"),
-    (("--host", "0.0.0.0", "--auth", "none", "--figures", "loopback"), "http://127.0.0.1:{port}/"),
-    (("--host", "::", "--auth", "none"), "http://127.0.0.1:{port}/"),
     (("--host", "::1"), "http://[::1]:{port}/"),
     (("--page", "false"), None),
-    (("--figures", "none"), None),
+    *long(
+        (("--host", "localhost"), "http://localhost:{port}/"),
+        (("--host", "0.0.0.0", "--auth", "none"), "http://127.0.0.1:{port}/"),
+        (("--host", "0.0.0.0", "--auth", "none", "--figures", "loopback"), "http://127.0.0.1:{port}/"),
+        (("--host", "::", "--auth", "none"), "http://127.0.0.1:{port}/"),
+        (("--figures", "none"), None),
+    ),
 ]
 
 

@@ -22,6 +22,7 @@ from tests.e2e.processes import END_S, ROOT, ServerProcess, running, stats, unti
 
 pytestmark = [
     pytest.mark.e2e,
+    pytest.mark.alone,
     pytest.mark.slow,
     pytest.mark.skipif(sys.platform != "linux", reason="the generator polls with epoll"),
 ]

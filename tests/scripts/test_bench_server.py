@@ -58,6 +58,7 @@ def test_every_player_has_a_spawn_and_a_segment_as_many_as_it_should(players: in
 @needs_linux
 @pytest.mark.slow
 @pytest.mark.e2e
+@pytest.mark.alone
 @pytest.mark.parametrize("kind", ["echo", bench.ECHO_PICOWS, "game", "profile"])
 def test_each_kind_of_server_holds_a_few_players(kind: str) -> None:
     more = ("1000",) if kind.startswith("echo") else ()
@@ -78,6 +79,7 @@ def test_each_kind_of_server_holds_a_few_players(kind: str) -> None:
 @needs_linux
 @pytest.mark.slow
 @pytest.mark.e2e
+@pytest.mark.alone
 @pytest.mark.parametrize("kind", jitter.VARIANTS)
 def test_each_variant_of_the_product_differs_in_what_it_says_only(kind: str) -> None:
     uvloop = pytest.importorskip("uvloop")
@@ -106,6 +108,7 @@ def test_a_variants_quantiles_are_of_all_its_rounds_together() -> None:
 @needs_linux
 @pytest.mark.slow
 @pytest.mark.e2e
+@pytest.mark.alone
 def test_churn_over_sockets_leaves_nothing_behind(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(rss, "SETTLE_S", 18.0)  # who says no goodbye is kept for 15 s
     told: list[bench.Figures] = []

@@ -5,14 +5,16 @@ from pathlib import Path
 import pytest
 
 from scripts import _targets, fuzz
+from tests.lengths import long
 
 INPUTS = {"client": 20_000, "server": 10_000, "value": 10_000, "edit": 10_000, "session": 8_000, "settings": 150}
 SEED = 7
 
 
+@pytest.mark.parametrize("share", [0.2, *long(1.0)])
 @pytest.mark.parametrize("name", sorted(_targets.TARGETS))
-def test_a_short_run_from_the_corpus_that_is_kept(name: str) -> None:
-    found = fuzz.fuzz(name, INPUTS[name], SEED)
+def test_a_short_run_from_the_corpus_that_is_kept(name: str, share: float) -> None:
+    found = fuzz.fuzz(name, round(share * INPUTS[name]), SEED)
     assert found["failure"] == ""
     assert found["corpus"] > 0
     assert found["outcomes"] > 1

@@ -36,6 +36,7 @@ from shared.messages import (
     encode,
 )
 from shared.units import BLOCK
+from tests.lengths import examples
 from tests.server.test_commands import verdicts
 from tests.tables import HELLO, FakeLink, Table, order
 
@@ -455,7 +456,7 @@ ACTS = st.one_of(
 )
 
 
-@settings(max_examples=60)
+@settings(max_examples=examples(60))
 @given(st.lists(ACTS, max_size=60))
 def test_any_schedule_comes_to_an_honest_path(schedule: list[tuple[str, int, bytes]]) -> None:
     cheat = Cheat(plain())

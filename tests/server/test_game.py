@@ -20,6 +20,7 @@ from shared.messages import (
     Terrain,
     encode,
 )
+from tests.lengths import examples
 from tests.tables import HELLO, FakeLink, Table, gone, ids, order
 from tests.worlds import EAST, STEP
 
@@ -224,7 +225,7 @@ ACTS = st.one_of(
 )
 
 
-@settings(max_examples=60)
+@settings(max_examples=examples(60))
 @given(st.lists(ACTS, max_size=30))
 def test_nothing_that_clients_do_raises_or_stops_the_tick(acts: list[tuple[str, int, Any]]) -> None:
     table = Table(Limits(clients_max=3, hello_s=2.0, silence_s=3.0, stalled_s=2.0))

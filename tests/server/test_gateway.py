@@ -23,6 +23,7 @@ from server.gateway import Connection, Gateway
 from server.limits import Limits
 from server.pages import Pages, json_page
 from shared.messages import CLIENT_MESSAGE_MAX
+from tests.lengths import examples
 
 UPGRADE = (
     b"GET / HTTP/1.1\r\nHost: x\r\nConnection: Upgrade\r\nUpgrade: websocket\r\n"
@@ -545,7 +546,7 @@ def outcome(chunks: list[bytes], *, plain: bool) -> tuple[list[bytes], list[int]
     return notes.messages, notes.lost_sessions, bytes(wire.written)
 
 
-@settings(max_examples=300)
+@settings(max_examples=examples(300))
 @given(st.lists(st.one_of(DATA, DATA, CONTROL, ODD), max_size=12), st.lists(st.integers(0, 2000), max_size=8))
 def test_cut_here_or_parsed_by_websockets_comes_to_the_same(frames: list[bytes | int], cuts: list[int]) -> None:
     whole = [binary(bytes(frame)) if isinstance(frame, int) else frame for frame in frames]

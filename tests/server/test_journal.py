@@ -19,6 +19,7 @@ from server.recorder import Pen, RecordedWorld
 from shared.inputs import Input
 from shared.world import OverlapError, World
 from tests import worlds
+from tests.lengths import examples
 
 FORMER = Path(__file__).parent.parent / "golden" / "former"
 """What the program of 2db46f5 has written: a recording in format 2, and a saved world in schema version 2."""
@@ -282,7 +283,7 @@ WORLD.end_recording()
 DATA = FILE.getvalue()
 
 
-@settings(max_examples=300)
+@settings(max_examples=examples(300))
 @given(at=st.integers(0, len(DATA) * 8 - 1))
 def test_a_flipped_bit_is_found_wherever_it_is(at: int) -> None:
     data = bytearray(DATA)
@@ -312,7 +313,7 @@ def test_a_number_that_no_world_can_hold_is_no_recording(record: list[Any], why:
         read(start + length + checks + payload)
 
 
-@settings(max_examples=50)
+@settings(max_examples=examples(50))
 @given(st.data())
 def test_a_record_left_out_doubled_or_exchanged_is_found(draw: st.DataObject) -> None:
     records, at = [], len(MAGIC) + 2

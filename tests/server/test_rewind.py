@@ -22,6 +22,7 @@ from shared.layout import Int64s
 from shared.scene import load_scene
 from shared.world import World
 from tests import worlds
+from tests.lengths import examples, long
 from tests.match import Match, Path, Player
 
 FLOOR = [worlds.floor(0)]
@@ -73,8 +74,8 @@ def _ids(world: World) -> list[int]:
     return world.entities["id"].tolist()  # type: ignore[no-any-return]
 
 
-@pytest.mark.parametrize("seed", range(4))
-def test_every_tick_of_the_window_is_as_it_was_with_its_blocks(seed: int, compiled: bool) -> None:
+@pytest.mark.parametrize(("seed", "ticks"), [(0, 25), *long((0, 60), (1, 60), (2, 60), (3, 60))])
+def test_every_tick_of_the_window_is_as_it_was_with_its_blocks(seed: int, ticks: int, compiled: bool) -> None:
     then: list[World] = []
 
     def check(world: World, rewind: Rewind) -> None:
@@ -93,7 +94,7 @@ def test_every_tick_of_the_window_is_as_it_was_with_its_blocks(seed: int, compil
             for cell in itertools.product(range(-25, 25, 3), range(-25, 25), (-1, 7)):
                 assert past.block(*cell) == old.blocks.get(*cell)
 
-    crowd(seed, 60, compiled, check)
+    crowd(seed, ticks, compiled, check)
 
 
 @pytest.mark.parametrize("skips", [0.0, 0.5, 0.8])
@@ -231,7 +232,7 @@ def through(ray: Ray, low: tuple[float, ...], high: tuple[float, ...]) -> Fracti
     return first if first < last and ray.distance(first) <= ray.length else None
 
 
-@settings(max_examples=300)
+@settings(max_examples=examples(300))
 @given(VEC, DIRECTION, st.floats(0, 9), VEC, st.tuples(*[st.integers(1, 40).map(lambda n: n / 16)] * 3))
 def test_a_box_is_hit_where_brute_force_says(origin: Vec, way: Vec, length: float, low: Vec, size: Vec) -> None:
     ray = Ray(origin, way, length)
@@ -239,7 +240,7 @@ def test_a_box_is_hit_where_brute_force_says(origin: Vec, way: Vec, length: floa
     assert ray.enters(low, high) == through(ray, low, high)
 
 
-@settings(max_examples=150)
+@settings(max_examples=examples(150))
 @given(VEC, DIRECTION, st.floats(0, 4), st.randoms(use_true_random=False))
 def test_the_first_block_is_the_one_that_brute_force_finds(
     origin: Vec, way: Vec, length: float, rng: random.Random
@@ -332,7 +333,7 @@ def test_what_is_not_loaded_stops_a_ray_and_the_void_does_not() -> None:
     assert past.ray((31.5, 0.5, -3.5), (0, 0, -1), 99) == []
 
 
-@settings(max_examples=100)
+@settings(max_examples=examples(100))
 @given(VEC, DIRECTION, st.integers(0, 1 << 30))
 def test_all_hits_are_those_of_brute_force(origin: Vec, way: Vec, seed: int) -> None:
     rng = random.Random(seed)

@@ -42,6 +42,7 @@ from shared.messages import (
     encode,
     join_snapshot,
 )
+from tests.lengths import examples
 
 PART = [0, -1, 2, 7, bytes(33), bytes(4), bytes(3), 0, [1, {"name": "Ann"}]]
 BLANK = Snapshot(0, 0, b"", 0, b"", b"", b"", ())
@@ -303,7 +304,7 @@ def mutated(draw: st.DrawFn) -> bytes:
     return bytes(data)
 
 
-@settings(max_examples=300)
+@settings(max_examples=examples(300))
 @given(st.one_of(st.binary(max_size=300), (structures | near_misses).map(msgpack.packb), mutated()))
 def test_any_bytes_are_a_message_or_a_protocol_error(data: bytes) -> None:
     for decode in (decode_from_client, decode_from_server):
@@ -321,7 +322,7 @@ def outcome(decode: Callable[[], Message]) -> Message | str:
         return str(error)
 
 
-@settings(max_examples=300)
+@settings(max_examples=examples(300))
 @given(mutated())
 def test_the_short_ways_decide_as_the_long_one(data: bytes) -> None:
     by_client = outcome(lambda: messages.decode(data, CLIENT_KINDS, CLIENT_MESSAGE_MAX, CLIENT_LIST_MAX))

@@ -15,6 +15,7 @@ from shared.layout import FALLING
 from shared.scene import Template
 from shared.units import BLOCK, SPEED
 from shared.world import OverlapError, World
+from tests.lengths import examples
 from tests.worlds import around, box, build, states, wake_all
 
 SIDE = 5
@@ -69,8 +70,8 @@ plays = st.builds(
     st.sampled_from([0.0, 16.0, 18.0]),
 )
 
-examples = settings(
-    max_examples=60,
+some = settings(
+    max_examples=examples(60),
     database=None,
     suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow, HealthCheck.data_too_large],
 )
@@ -132,7 +133,7 @@ def solid_overlaps(world: World) -> set[tuple[object, object]]:
     return found
 
 
-@examples
+@some
 @given(play=plays)
 def test_nobody_ends_inside_of_what_he_was_not_in_before(compiled: bool, play: Play) -> None:
     world = stage(play, compiled)
@@ -148,7 +149,7 @@ def test_nobody_ends_inside_of_what_he_was_not_in_before(compiled: bool, play: P
         inside = after
 
 
-@examples
+@some
 @given(play=plays, east=st.sampled_from([1, -1]), north=st.sampled_from([1, -1]))
 def test_a_mirrored_world_moves_mirrored(compiled: bool, play: Play, east: int, north: int) -> None:
     def mirror(actor: Actor) -> Actor:
@@ -169,7 +170,7 @@ def test_a_mirrored_world_moves_mirrored(compiled: bool, play: Play, east: int, 
             assert a[:9] == (entity, kind, flags, east * x, north * y, z, east * vx, north * vy, vz)
 
 
-@examples
+@some
 @given(play=plays, quarter=st.booleans())
 def test_a_world_turned_by_a_quarter_moves_turned(compiled: bool, play: Play, quarter: bool) -> None:
     """One entity that moves along one axis (and falls): it cuts no corner, so the order of axes cannot show."""
@@ -198,7 +199,7 @@ def test_a_world_turned_by_a_quarter_moves_turned(compiled: bool, play: Play, qu
             assert b[:9] == (*a[:3], -y, x, z, -vy, vx, vz)
 
 
-@examples
+@some
 @given(
     play=plays,
     shift=st.tuples(*[st.sampled_from([0, 1, -1, 7, 31, 32, -33, 1000, 10**6, -(10**7), (1 << 27) - 50])] * 3),
@@ -215,7 +216,7 @@ def test_translation_by_whole_blocks_changes_nothing(compiled: bool, play: Play,
             assert a == (entity, kind, flags, x - x0, y - y0, z - z0, *rest)
 
 
-@examples
+@some
 @given(play=plays, data=st.data())
 def test_ids_decide_and_neither_order_of_entry_nor_rows(compiled: bool, play: Play, data: st.DataObject) -> None:
     """Told in another order, in rows used before by others, blocks in another order: the same hash."""
@@ -238,7 +239,7 @@ def test_ids_decide_and_neither_order_of_entry_nor_rows(compiled: bool, play: Pl
         empty.step(dict(reversed(inputs.items())))
 
 
-@examples
+@some
 @given(play=plays, data=st.data())
 def test_sleep_does_not_show(compiled: bool, play: Play, data: st.DataObject) -> None:
     """A world in which everybody is woken for every tick has the same hash, through edits, removals and teleports."""
@@ -269,7 +270,7 @@ def test_sleep_does_not_show(compiled: bool, play: Play, data: st.DataObject) ->
         assert world.state_hash() == restless.state_hash()
 
 
-@examples
+@some
 @given(play=plays)
 def test_nothing_moves_further_than_its_speed(compiled: bool, play: Play) -> None:
     """Per axis and tick at most the velocity (of z: the faster of the old and the new one), rounded once."""
@@ -296,7 +297,7 @@ def walk(template: Template, move: int) -> int:
     return round(template.walk_speed * SPEED * move / 127)
 
 
-@examples
+@some
 @given(play=plays, rate=st.sampled_from([32, 64, 128]))
 def test_energy_never_rises_under_the_default_integrator(compiled: bool, play: Play, rate: int) -> None:
     """v^2 / 2 + g z of a ballistic entity, in exact whole numbers, at tick rates whose ticks are not rounded.
@@ -322,7 +323,7 @@ def test_energy_never_rises_under_the_default_integrator(compiled: bool, play: P
             energies[state[0]] = energy(state)
 
 
-@examples
+@some
 @given(play=plays, at=st.integers(0, TICKS - 1), data=st.data())
 def test_a_copy_or_restore_at_any_tick_goes_on_alike(compiled: bool, play: Play, at: int, data: st.DataObject) -> None:
     """Also into a world that has gone another way: other wishes, other entities, other blocks."""
@@ -345,7 +346,7 @@ def test_a_copy_or_restore_at_any_tick_goes_on_alike(compiled: bool, play: Play,
         assert world.state_hash() == other.state_hash() == copied.state_hash()
 
 
-@examples
+@some
 @given(play=plays)
 def test_flags_say_what_they_mean(compiled: bool, play: Play) -> None:
     """A sleeper has no velocity and no flag, and is supported where there is gravity: another turn changes nothing."""

@@ -11,6 +11,7 @@ from shared import edits
 from shared.inputs import Input
 from shared.messages import Command, decode_from_client
 from shared.scene import load_scene
+from tests.lengths import long
 from tests.match import Match, Path, Player
 
 
@@ -42,9 +43,13 @@ def ordered(player: Player) -> list[int]:
     return numbers
 
 
-@pytest.mark.parametrize("scene", ["flat", "hills"])
-@pytest.mark.parametrize("path", [Path(0.001), Path(0.05, 0.01, 0.01)], ids=["lan", "typical"])
-def test_builders_do_not_diverge_and_hear_of_every_edit(scene: str, path: Path) -> None:
+LAN, TYPICAL = Path(0.001), Path(0.05, 0.01, 0.01)
+
+
+@pytest.mark.parametrize(
+    ("path", "scene"), [(TYPICAL, "hills"), *long((TYPICAL, "flat"), (LAN, "flat"), (LAN, "hills"))]
+)
+def test_builders_do_not_diverge_and_hear_of_every_edit(path: Path, scene: str) -> None:
     match = Match(load_scene(scene), 12)
     policies = [Building(seed) for seed in range(5)]
     players = [match.join(policy, path) for policy in policies]

@@ -13,6 +13,7 @@ from server.limits import Limits
 from shared import messages
 from shared.messages import Bye, encode
 from shared.scene import load_scene
+from tests.lengths import long
 from tests.match import Match, Player, wander
 
 
@@ -25,7 +26,7 @@ def told(player: Player, *kinds: type) -> list[object]:
 
 
 @pytest.mark.parametrize("preset", ["lan", "typical", "far"])
-@pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.parametrize("seed", [1, *long(2)])
 def test_who_is_cut_off_goes_on_with_the_same_entity(preset: str, seed: int) -> None:
     match = Match(load_scene("hills"), seed)
     player = match.join(wander, PRESETS[preset], Core("Ann", patience_s=10))

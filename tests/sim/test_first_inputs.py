@@ -10,6 +10,7 @@ from client_sdk.events import Corrected
 from client_sdk.links import PRESETS
 from shared.inputs import Input
 from shared.scene import load_scene
+from tests.lengths import long
 from tests.match import Match, Path
 
 
@@ -38,10 +39,11 @@ def test_first_inputs_that_come_late_are_the_cause_of_what_they_cause(seed: int)
     assert player.core.stats.divergences == 0
 
 
-def test_keys_that_are_held_while_joining_over_bad_lines_are_explained() -> None:
+@pytest.mark.parametrize("players", [5, *long(20)])
+def test_keys_that_are_held_while_joining_over_bad_lines_are_explained(players: int) -> None:
     for preset in ("typical", "far"):
         match = Match(load_scene("flat"), 1)
-        for _ in range(20):
+        for _ in range(players):
             player = match.join(walking, PRESETS[preset])
             player.core.set_input(Input(127, 0, 0))
             match.run(0.137)

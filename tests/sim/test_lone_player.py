@@ -10,9 +10,8 @@ from shared.inputs import JUMP, Input
 from shared.scene import load_scene
 from shared.units import BLOCK
 from shared.world import World
+from tests.lengths import long
 from tests.match import Match, Path, Player
-
-TICKS = 20_000
 
 
 class Tour:
@@ -46,18 +45,21 @@ def play(scene: str, path: Path, ticks: int, seed: int = 1) -> tuple[Match, Play
     return match, player, tour
 
 
-@pytest.mark.parametrize("latency_ms", [0, 50, 150, 300])
-def test_no_correction_in_20000_ticks_under_latency_and_jitter(latency_ms: int) -> None:
+@pytest.mark.parametrize(
+    ("latency_ms", "ticks", "least"),
+    [(0, 4_000, 50), (150, 4_000, 50), *long(*((latency_ms, 20_000, 500) for latency_ms in (0, 50, 150, 300)))],
+)
+def test_no_correction_under_latency_and_jitter(latency_ms: int, ticks: int, least: int) -> None:
     path = Path(delay_s=latency_ms / 2000, jitter_s=0.040)
-    _, player, tour = play("arena", path, TICKS)
+    _, player, tour = play("arena", path, ticks)
     stats = player.core.stats
     assert stats.corrections == 0
     assert stats.resyncs == 0
-    assert stats.inputs_sent >= TICKS - 20
-    assert stats.snapshots >= TICKS - 20
-    assert len(tour.cells) > 500
-    assert tour.pressed > 500
-    assert tour.jumped > 500
+    assert stats.inputs_sent >= ticks - 20
+    assert stats.snapshots >= ticks - 20
+    assert len(tour.cells) > least
+    assert tour.pressed > least
+    assert tour.jumped > least
     assert player.closed is None
 
 

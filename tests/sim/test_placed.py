@@ -15,6 +15,7 @@ from server.session import Player as Shooter
 from shared.checks import Vec
 from shared.inputs import NEUTRAL, Input
 from shared.scene import Scene, load_scene
+from tests.lengths import long
 from tests.match import Match, Path, Player
 
 FLAT = load_scene("flat")
@@ -117,7 +118,7 @@ def test_an_entity_that_is_placed_is_never_drawn_elsewhere(far: float, rate: int
     assert drawn == {"one": {70.0, 70.0 + far}, "steps": {79.0, 82.0, 85.0}}
 
 
-@pytest.mark.parametrize("rate", [32, 128])
+@pytest.mark.parametrize("rate", [32, *long(128)])
 @pytest.mark.parametrize(
     "path", [Path(), Path(0.02), Path(0.01, loss=0.01), *[PRESETS[name] for name in ("lan", "regional", "wifi")]]
 )

@@ -11,6 +11,7 @@ from shared.bounds import UPDATE_S
 from shared.inputs import JUMP, Input
 from shared.messages import Command, decode_from_client
 from shared.scene import load_scene
+from tests.lengths import long
 from tests.match import Match, Path, Player, wander
 
 
@@ -180,7 +181,7 @@ def crowd(size: int, seconds: float, neighbours: bool, seed: int = 7) -> tuple[M
     return match, players
 
 
-@pytest.mark.parametrize(("size", "seconds"), [(12, 10), pytest.param(30, 30, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(("size", "seconds"), [(8, 6), *long((12, 10), (30, 30))])
 def test_a_crowd_has_no_nondeterminism_and_predicting_neighbours_pays(size: int, seconds: float) -> None:
     corrections = {}
     for neighbours in (True, False):

@@ -14,6 +14,7 @@ from shared.inputs import Input
 from shared.scene import load_scene
 from shared.world import World
 from tests.kernels import chains
+from tests.lengths import long
 
 ROOT = Path(__file__).parent.parent.parent
 TICKS = chains.TICKS
@@ -41,23 +42,23 @@ def inputs(seed: int) -> Iterator[dict[int, Input]]:
 
 
 @pytest.mark.parametrize(
-    "scene", [chains.SCENES[0], *(pytest.param(s, marks=pytest.mark.slow) for s in chains.SCENES[1:])]
+    ("scene", "ticks"), [(chains.SCENES[0], 2_000), *long(*((scene, TICKS) for scene in chains.SCENES))]
 )
-def test_two_processes_compiled_and_plain_agree_at_every_tick(scene: str) -> None:
-    other = other_chain(scene, kernels.PLAIN)
-    assert f"{kernels.PLAIN} {chains.chain(scene, TICKS, compiled=True)}" == other
+def test_two_processes_compiled_and_plain_agree_at_every_tick(scene: str, ticks: int) -> None:
+    other = other_chain(scene, kernels.PLAIN, ticks)
+    assert f"{kernels.PLAIN} {chains.chain(scene, ticks, compiled=True)}" == other
 
 
 @pytest.mark.slow
 @pytest.mark.skipif(not kernels.numba_installed(), reason="Numba is not installed")
 def test_two_processes_of_which_numba_compiles_one_agree_at_every_tick() -> None:
-    other = other_chain("hills", kernels.NUMBA)
+    other = other_chain("hills", kernels.NUMBA, TICKS)
     assert f"{kernels.NUMBA} {chains.chain('hills', TICKS, compiled=True)}" == other
 
 
-def other_chain(scene: str, form: str) -> str:
+def other_chain(scene: str, form: str, ticks: int) -> str:
     """The form, and what another process makes of a scene with it."""
-    command = (sys.executable, "-m", "tests.kernels.chains", scene, str(TICKS))
+    command = (sys.executable, "-m", "tests.kernels.chains", scene, str(ticks))
     environment = os.environ | {kernels.VARIABLE: form}
     return subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, check=True).stdout.strip()
 

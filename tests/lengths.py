@@ -1,0 +1,28 @@
+"""The long forms of tests, which `scripts/test --long` runs."""
+
+from collections.abc import Collection, Iterable
+from typing import Any
+
+import pytest
+from hypothesis import settings
+
+EXAMPLES = 100
+"""The examples of a property test in a long run, unless it names a number (`examples`)."""
+
+
+def long(*values: Any) -> list[Any]:
+    """Returns parameters of a test that make a long run of it. A tuple has the values of several parameters."""
+    every = [value if isinstance(value, tuple) else (value,) for value in values]
+    return [pytest.param(*value, marks=pytest.mark.slow) for value in every]
+
+
+def long_but(short: Collection[Any], every: Iterable[Any]) -> list[Any]:
+    """Returns the parameters `every` of a test. All but `short` make a long run of it."""
+    found = list(every)
+    assert all(value in found for value in short)
+    return [parameter for value in found for parameter in ([value] if value in short else long(value))]
+
+
+def examples(most: int) -> int:
+    """Returns the number of examples of a property test: `most` in a long run, a quarter of it in a short one."""
+    return most * settings().max_examples // EXAMPLES
