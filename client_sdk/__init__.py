@@ -6,6 +6,7 @@
 events (`client_sdk.events`), and a `View` of `Figure`s, one per entity to draw.
 """
 
+from client_sdk.async_client import AsyncClient
 from client_sdk.client import Client
 from client_sdk.events import (
     Answered,
@@ -21,12 +22,11 @@ from client_sdk.events import (
     Resynchronised,
     SegmentLoaded,
 )
-from client_sdk.links import Path
-from client_sdk.picture import Figure, View
+from client_sdk.loopback import Loopback
+from client_sdk.netsim.links import Path
 from client_sdk.stats import Stats
-from client_sdk.transports.aio import AsyncClient
 from client_sdk.transports.connection import ConnectError
-from client_sdk.transports.loopback import Loopback
+from client_sdk.view import Figure, View
 from shared.inputs import Input, make_input
 
 __all__ = [

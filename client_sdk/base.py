@@ -3,8 +3,8 @@
 from collections.abc import Mapping
 from typing import Any
 
-from client_sdk.linked import LinkedCore
-from client_sdk.links import Path
+from client_sdk.netsim.linked import LinkedCore
+from client_sdk.netsim.links import Path
 from client_sdk.stats import Stats
 from shared.inputs import make_input
 
@@ -69,7 +69,7 @@ class BaseClient:
     def link(self) -> Path | None:
         """The simulated link on top of the real connection, to try a bad network: `client.link = "wifi"`.
 
-        It may be set at any time, to the name of a preset of `client_sdk.links`, to a `Path`, or to None for no link.
+        It may be set at any time, to the name of a preset of `client_sdk.netsim.links`, to a `Path`, or to None for no link.
 
         Raises:
             ValueError: no preset has that name.

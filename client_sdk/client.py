@@ -17,11 +17,11 @@ from typing import Any, Protocol
 from client_sdk.base import BaseClient
 from client_sdk.compiling import COMPILER
 from client_sdk.events import Event
-from client_sdk.linked import LinkedCore
-from client_sdk.links import Path
-from client_sdk.picture import View
+from client_sdk.netsim.linked import LinkedCore
+from client_sdk.netsim.links import Path
 from client_sdk.transports.connection import Connection, checked_tls
 from client_sdk.transports.polling import PollingTransport
+from client_sdk.view import View
 from shared.checks import duration, finite
 from shared.scene import Scene
 

@@ -16,8 +16,7 @@ from collections import deque
 from typing import Any, SupportsIndex
 
 from client_sdk.advice import advised
-from client_sdk.clock import ServerClock, Timeline
-from client_sdk.comeback import Comeback
+from client_sdk.commands import Orders
 from client_sdk.controls import Controls
 from client_sdk.events import (
     Disconnected,
@@ -29,13 +28,14 @@ from client_sdk.events import (
     Resumed,
     SegmentLoaded,
 )
-from client_sdk.orders import Orders
+from client_sdk.input_loop import RECONNECTED, Play
 from client_sdk.pending_events import PendingEvents
-from client_sdk.picture import NOTHING, View
-from client_sdk.play import RECONNECTED, Play
-from client_sdk.prediction import Prediction
+from client_sdk.prediction.prediction import Prediction
+from client_sdk.reconnect import Comeback
 from client_sdk.replica import Replica
 from client_sdk.stats import Stats
+from client_sdk.timing.clock import ServerClock, Timeline
+from client_sdk.view import NOTHING, View
 from shared import edits, kernels, messages
 from shared.checks import SceneError, duration, shown, text, whole
 from shared.inputs import Input, checked_input, clamp

@@ -7,10 +7,10 @@ is complete (`complete`), it takes over the inputs and edits of the first (`take
 welcome agrees with it within `CLOCK_S` seconds: then the client's timeline goes on.
 """
 
-from client_sdk.clock import ServerClock
-from client_sdk.confirmed import Confirmed
-from client_sdk.picture import Picture
-from client_sdk.prediction import Prediction
+from client_sdk.prediction.confirmed import Confirmed
+from client_sdk.prediction.prediction import Prediction
+from client_sdk.timing.clock import ServerClock
+from client_sdk.view import Picture
 from shared.blocks import unpack
 from shared.checks import Cell
 from shared.kernels import Kernel

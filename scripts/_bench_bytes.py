@@ -99,7 +99,7 @@ class Scenery:
 
     def seen(self, rows: Int64s) -> Int64s:
         """Returns the rows that lie in the segments which the client sees."""
-        sees: set[Cell] = self.session.sight.sees
+        sees: set[Cell] = self.session.stream.sight.sees
         cells = (rows[:, X : X + 3] >> TO_SEGMENT).tolist()
         seen: Int64s = rows[np.array([tuple(cell) in sees for cell in cells], bool)]
         return seen

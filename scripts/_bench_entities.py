@@ -14,7 +14,7 @@ import numpy as np
 
 from scripts._bench_memory import Sink
 from server.game import Game
-from server.session import Session
+from server.game.session import Session
 from shared import messages
 from shared.inputs import make_input
 from shared.messages import Hello, Inputs, encode

@@ -16,7 +16,7 @@ from rich.console import Console
 from rich.table import Table
 
 from scripts import _bench_server as server
-from server.histogram import between
+from server.observability.histogram import between
 
 VARIANTS = {
     "product": "product",

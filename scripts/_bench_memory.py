@@ -9,9 +9,9 @@ import tracemalloc
 from collections.abc import Callable
 from typing import Any
 
+from server.config.limits import Limits
 from server.game import Game
-from server.limits import Limits
-from server.session import Session
+from server.game.session import Session
 from shared import messages
 from shared.checks import Cell
 from shared.messages import Hello, Inputs, encode

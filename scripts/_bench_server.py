@@ -23,7 +23,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-from server.histogram import between
+from server.observability.histogram import between
 from sovereign_netcode.stderr import Stderr
 
 ROOT = Path(__file__).resolve().parent.parent

@@ -25,19 +25,21 @@ from typing import Any, cast
 
 import msgpack
 
-from server import app, log, process
-from server.delivery import Delivery
-from server.faults import Faults
+from server import app
+from server.config.settings import Settings
 from server.game import Game
-from server.gateway import Connection
-from server.histogram import Histogram
-from server.replication import ChangeLog
+from server.game.session import Session
+from server.net.websocket import Connection
+from server.observability.errors import Faults
+from server.observability.histogram import Histogram
+from server.replication.change_log import ChangeLog
+from server.replication.client_stream import Link
+from server.replication.sender import Delivery
 from server.rewind import Rewind
 from server.rules import Rules
-from server.session import Link, Session
-from server.settings import Settings
-from server.ticker import Ticker
-from server.warmup import warm_up
+from server.runtime import event_loop, log
+from server.runtime.ticker import Ticker
+from server.runtime.warmup import warm_up
 from shared.checks import Cell
 from shared.inputs import Input
 from shared.layout import X
@@ -222,7 +224,7 @@ class Stopwatch:
 VARIANTS: dict[str, tuple[ModuleType, str, Callable[[], Any]]] = {
     "default": (app, "freeze", lambda: None),
     "off": (app, "freeze", gc.disable),
-    "asyncio": (process, "loop_factory", lambda: asyncio.new_event_loop),
+    "asyncio": (event_loop, "loop_factory", lambda: asyncio.new_event_loop),
 }
 """Function of the product that a variant replaces (module and name), and the replacement."""
 
@@ -231,7 +233,7 @@ def in_view(game: Game) -> float:
     """Returns the average number of entities in the segments that a client sees."""
     cells = game.world.states()[:, X : X + 3] >> TO_SEGMENT
     inhabitants = collections.Counter(map(tuple, cells.tolist()))
-    views = [sum(inhabitants[segment] for segment in session.sight.sees) for session in game.sessions]
+    views = [sum(inhabitants[segment] for segment in session.stream.sight.sees) for session in game.sessions]
     return sum(views) / max(len(views), 1)
 
 
@@ -250,7 +252,7 @@ def serve(served: Game, *more: Callable[[], dict[str, Any]]) -> None:
     """Runs the server as `python -m server` does, on a free port, with more figures in /stats."""
     settings = Settings(port=0, page=False, log_level="warning")
     log.set_up(settings.log_level, settings.log_format, sys.stderr)
-    with asyncio.Runner(loop_factory=process.loop_factory()) as runner:
+    with asyncio.Runner(loop_factory=event_loop.loop_factory()) as runner:
         runner.run(Measured(settings, served, more).serve())
 
 

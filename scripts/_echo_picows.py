@@ -26,8 +26,8 @@ from picows import (
 )
 
 from scripts._busy_server import Echo
-from server import process
-from server.ticker import Ticker, best_alarm
+from server.runtime import event_loop
+from server.runtime.ticker import Ticker, best_alarm
 
 BINARY = WSMsgType.BINARY
 
@@ -66,7 +66,7 @@ async def serve(echo: Echo) -> None:
     ticker = Ticker(echo.scene.tick_rate, echo.tick, loop.stop, lambda ring: best_alarm(loop, ring))
 
     def page() -> WSUpgradeResponseWithListener:
-        clocks = {"uptime_s": time.monotonic() - started, "cpu_s": time.process_time(), "rss_mb": process.rss_mb()}
+        clocks = {"uptime_s": time.monotonic() - started, "cpu_s": time.process_time(), "rss_mb": event_loop.rss_mb()}
         figures: dict[str, Any] = echo.stats() | ticker.stats() | clocks
         response = WSUpgradeResponse()
         response.version, response.status, response.headers = b"HTTP/1.1", HTTPStatus.OK, CIMultiDict()
@@ -77,11 +77,11 @@ async def serve(echo: Echo) -> None:
         return Listener(echo) if "upgrade" in request.headers else page()
 
     server = await ws_create_server(accept, "127.0.0.1", 0)
-    process.freeze()
+    event_loop.freeze()
     print(f"listening on ws://127.0.0.1:{server.sockets[0].getsockname()[1]}", flush=True)
     await server.serve_forever()
 
 
 if __name__ == "__main__":
-    with asyncio.Runner(loop_factory=process.loop_factory()) as runner:
+    with asyncio.Runner(loop_factory=event_loop.loop_factory()) as runner:
         runner.run(serve(Echo(sys.argv[1], int(sys.argv[2]))))

@@ -28,7 +28,7 @@ from typing import Any
 
 from websockets.speedups import apply_mask
 
-from server.histogram import between
+from server.observability.histogram import between
 from shared import messages
 from shared.messages import Bye, Hello, Inputs, Ping, decode_from_server, encode
 

@@ -3,10 +3,11 @@
 import random
 from typing import Any
 
+from server.config.limits import Limits
 from server.game import Game
-from server.limits import Limits
+from server.game.session import Session
+from server.players.player import Player
 from server.rules import Rules
-from server.session import Player, Session
 from shared import edits, messages
 from shared.bounds import bounds
 from shared.messages import (

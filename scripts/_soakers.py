@@ -13,7 +13,7 @@ from typing import Any
 import msgpack
 import numpy as np
 
-from client_sdk.confirmed import Confirmed
+from client_sdk.prediction.confirmed import Confirmed
 from client_sdk.replica import check_scene
 from scripts._generator import REQUEST, frame
 from scripts._progress import Progress

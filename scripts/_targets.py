@@ -13,8 +13,8 @@ from collections.abc import Callable
 from pathlib import Path
 
 from scripts._house import House
-from server.kinds import SettingsError
-from server.settings import KINDS, Settings, parse
+from server.config.options import SettingsError
+from server.config.settings import KINDS, Settings, parse
 from shared import edits
 from shared.layout import STOP_X, TOLD, WHOLE
 from shared.messages import (

@@ -7,7 +7,6 @@ from collections import Counter
 
 from client_sdk.core import Core
 from client_sdk.events import Diverged, Left
-from client_sdk.transports.aio import AsyncClient
 from client_sdk.transports.connection import ConnectError
 from scripts._progress import Progress
 from shared.inputs import make_input

@@ -28,9 +28,9 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
+from server.config.limits import Limits
 from server.game import Game
-from server.limits import Limits
-from server.store import Store
+from server.persistence.store import Store
 from shared import edits, messages
 from shared.inputs import Input
 from shared.messages import Command, Hello, Inputs, Snapshot, decode_from_server, encode

@@ -38,8 +38,8 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from client_sdk.clock import PRICE_S, SAFETY_S, STALL_S, LeadController, PricedLead, ServerClock, Timeline
-from client_sdk.links import PRESETS, Weather, Wire
+from client_sdk.timing.clock import PRICE_S, SAFETY_S, STALL_S, LeadController, PricedLead, ServerClock, Timeline
+from client_sdk.netsim.links import PRESETS, Weather, Wire
 from scripts.controllers import RIVALS, Rival
 
 RATE = 32
@@ -67,7 +67,7 @@ class Trial:
     """One controller on one link.
 
     Args:
-        preset: a name in `client_sdk.links.PRESETS`.
+        preset: a name in `client_sdk.netsim.links.PRESETS`.
         lead: the controller; a `Rival` also gets the results of pings and the ticks of snapshots.
         seed: source of everything random, which does not depend on the controller.
     """
@@ -103,7 +103,7 @@ class Trial:
         self._next_ping = 0.0
 
     def at(self, when: float, act: Callable[[], None]) -> None:
-        """Schedules a call for a time (`client_sdk.links.Scheduler`)."""
+        """Schedules a call for a time (`client_sdk.netsim.links.Scheduler`)."""
         heapq.heappush(self._queue, (when, next(self._number), act))
 
     def run(self, seconds: float) -> None:

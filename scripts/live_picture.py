@@ -7,7 +7,6 @@ import sys
 from pathlib import Path
 
 from client_sdk.bots import POLICIES, Bot
-from client_sdk.transports.aio import AsyncClient
 from sovereign_netcode.loadtest.processes import own_server
 from tests.chromium import chromium, installed
 

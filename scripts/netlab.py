@@ -3,9 +3,9 @@
 
     python scripts/netlab.py [--preset wifi] [--clients 10] [--minutes 10] [--seed 1] [--json OUT] [--plot OUT.png]
 
-The real server core and real SDK cores play over simulated TCP connections (`client_sdk/links.py`). All players wander
-on `hills`, where they sometimes meet. Late inputs are a share of all inputs. Snapshot age is the age of the newest
-snapshot, sampled once per tick. Lead is the time by which the player's own tick is ahead of the server.
+The real server core and real SDK cores play over simulated TCP connections (`client_sdk/netsim/links.py`). All players
+wander on `hills`, where they sometimes meet. Late inputs are a share of all inputs. Snapshot age is the age of the
+newest snapshot, sampled once per tick. Lead is the time by which the player's own tick is ahead of the server.
 """
 
 import argparse
@@ -24,7 +24,7 @@ from rich.progress import Progress
 from rich.table import Table
 
 from client_sdk.events import Corrected
-from client_sdk.links import PRESETS
+from client_sdk.netsim.links import PRESETS
 from client_sdk.stats import Stats
 from scripts import league
 from scripts.environment import lacking

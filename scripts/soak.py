@@ -34,7 +34,7 @@ from rich.progress import Progress
 
 from scripts._soakers import Cells, Honest
 from scripts._walkers import Walker
-from server.store import Store
+from server.persistence.store import Store
 from shared.scene import load_scene
 from shared.world import World
 from sovereign_netcode.loadtest.processes import CannotStartError, stats

@@ -16,13 +16,14 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from server.config.limits import Limits
 from server.extras import install
 from server.game import Game
-from server.limits import Limits
-from server.recorder import RecordedWorld
+from server.game.session import Session
+from server.game_api.api import Stage
+from server.journal.recorded_world import RecordedWorld
+from server.players.input_queue import InputQueue
 from server.rules import Rules, prepared
-from server.session import InputQueue, Session
-from server.stage import Stage
 from shared.checks import finite, text, whole
 from shared.inputs import MOVE_MAX, NEUTRAL, Input, clamp
 from shared.layout import FALLING, FLAGS, ID, TEMPLATE, VX, Int64s, X

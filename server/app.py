@@ -15,33 +15,34 @@ from typing import Any
 
 import structlog
 
-from server import check, log, tokens
-from server.access import authenticator, tls_context
-from server.database import StoreError
-from server.door import Door
+from server.auth import tokens
+from server.auth.access import authenticator, tls_context
+from server.config.options import SettingsError, nearest
+from server.config.settings import Settings, parse
 from server.game import Game
-from server.gateway import Gateway
-from server.histogram import Histogram
-from server.kinds import SettingsError, nearest
-from server.listening import bracketed, reachable
-from server.live import Live
-from server.metrics import metrics_page
-from server.pages import Pages, json_page, ready_page
-from server.process import announce_compiling, freeze, leave, loop_factory, on_signals, rss_mb, signals
-from server.recorder import RecordedWorld
+from server.journal.recorded_world import RecordedWorld
+from server.net.addresses import bracketed, reachable
+from server.net.admission import Door
+from server.net.websocket import Gateway
+from server.observability.histogram import Histogram
+from server.observability.live import Live
+from server.observability.metrics import metrics_page
+from server.observability.pages import Pages, json_page, ready_page
+from server.persistence.database import StoreError
+from server.persistence.store import Store
 from server.rules import Rules, RulesError, load_rules, prepared
-from server.settings import Settings, parse
-from server.store import Store
-from server.ticker import Ticker, best_alarm
-from server.warmup import warm_up
-from server.watchdog import Watchdog
+from server.runtime import healthcheck, log
+from server.runtime.event_loop import announce_compiling, freeze, leave, loop_factory, on_signals, rss_mb, signals
+from server.runtime.ticker import Ticker, best_alarm
+from server.runtime.warmup import warm_up
+from server.runtime.watchdog import Watchdog
 from shared import kernels
 from shared.checks import SceneError
 from shared.scene import Scene, load_scene
 
 READY_S = 1.0
 """Seconds. The server is ready if a tick began within this time."""
-COMMANDS = {"token": tokens.main, "check": check.main}
+COMMANDS = {"token": tokens.main, "check": healthcheck.main}
 """Functions of the other commands of `sovereign-server`, by name."""
 STOP_S = 1.5
 """Seconds that the shutdown waits for peers to finish closing. With the wait for the disk it takes less than 5 s."""

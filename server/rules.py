@@ -11,7 +11,7 @@ The server calls all hooks within a tick, before the step, in this order: `on_st
 raises, the exception is logged and counted, and the game goes on. A hook is a plain function and must not wait. Code
 that waits runs in a task or a thread of its own and hands its result back with `game.soon`.
 
-Hooks read and change the game through `self.game`, a `server.stage.Stage`. Decisions about the world must use nothing
+Hooks read and change the game through `self.game`, a `server.game_api.api.Stage`. Decisions about the world must use nothing
 else: `self.game.random` gives the same numbers when a game is computed again, but a clock or the order of a set does
 not.
 """
@@ -22,13 +22,13 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from server.kinds import nearest
-from server.session import Player
+from server.config.options import nearest
+from server.players.player import Player
 from shared.checks import SceneError, shown
 from shared.scene import Scene
 
 if TYPE_CHECKING:
-    from server.stage import Stage
+    from server.game_api.api import Stage
 
 
 class RulesError(ValueError):

@@ -12,14 +12,13 @@ RULES = '''\
 
     sovereign-server --game {name}:{title}
 
-`sovereign_netcode.server.rules` describes all hooks. `sovereign_netcode.server.stage` describes what the hooks can do
-with the game (`self.game`).
+`sovereign_netcode.server.rules` describes all hooks. `sovereign_netcode.server.game_api.api` describes what the hooks
+can do with the game (`self.game`).
 """
 
 from typing import Any
 
-from sovereign_netcode.server.rules import Rules
-from sovereign_netcode.server.session import Player
+from sovereign_netcode.server import Player, Rules
 from sovereign_netcode.shared.scene import Scene
 
 

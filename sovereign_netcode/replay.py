@@ -16,7 +16,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
-from server.journal import (
+from server.journal.records import (
     FILL,
     LOAD,
     NOTE,

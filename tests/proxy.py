@@ -1,4 +1,4 @@
-"""A TCP proxy on loopback that is as bad as a path of `client_sdk.links`, in real time.
+"""A TCP proxy on loopback that is as bad as a path of `client_sdk.netsim.links`, in real time.
 
 Theory of operation. Each direction of each connection is a line: what it reads is a packet, which takes its time on
 the line (`rate`), then flies (`delay`, jitter, the weather), in order. While the line is busy nothing is read: what
@@ -15,7 +15,7 @@ import struct
 import time
 from types import TracebackType
 
-from client_sdk.links import HEADER_BYTES, TIMER_S, Path, Weather
+from client_sdk.netsim.links import HEADER_BYTES, TIMER_S, Path, Weather
 
 PACKET_BYTES = 536
 """The least that every path carries."""

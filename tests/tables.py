@@ -5,11 +5,11 @@ from typing import Any
 
 import numpy as np
 
+from server.config.limits import Limits
 from server.game import Game
-from server.limits import Limits
-from server.recorder import Saves
+from server.game.session import Session
+from server.journal.recorded_world import Saves
 from server.rules import Rules
-from server.session import Session
 from shared import edits, messages
 from shared.edits import Edit
 from shared.messages import (
@@ -51,7 +51,7 @@ class FakeLink:
     @waiting.setter
     def waiting(self, n: int) -> None:
         self._waiting = n
-        self.session.pacing.look()
+        self.session.stream.pacing.look()
 
     def outstanding(self) -> int | None:
         return self._waiting

@@ -1,5 +1,4 @@
-from sovereign_netcode.server.rules import Rules
-from sovereign_netcode.server.session import Player
+from sovereign_netcode.server import Player, Rules
 from sovereign_netcode.shared.scene import Scene
 
 

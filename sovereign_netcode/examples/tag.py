@@ -9,8 +9,7 @@ template (clients predict its speed), scores are attributes, and the end of the 
 import contextlib
 
 from sovereign_netcode.examples.tag_brain import wish
-from sovereign_netcode.server.rules import Rules
-from sovereign_netcode.server.session import Player
+from sovereign_netcode.server import Player, Rules
 from sovereign_netcode.shared.scene import Scene
 from sovereign_netcode.shared.units import SEGMENT
 from sovereign_netcode.shared.world import OverlapError

@@ -4,8 +4,8 @@ from collections import Counter
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
-from client_sdk.prediction import NONDETERMINISM
-from server.histogram import between
+from client_sdk.prediction.prediction import NONDETERMINISM
+from server.observability.histogram import between
 from shared.messages import MALFORMED
 
 SNAPSHOTS_SHARE_MIN = 0.95

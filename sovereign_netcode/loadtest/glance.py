@@ -7,7 +7,7 @@ from rich.live import Live
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
-from server.histogram import between
+from server.observability.histogram import between
 from sovereign_netcode.loadtest.figures import LATENESS, Figures
 
 Row = tuple[str, str]

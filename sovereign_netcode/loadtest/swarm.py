@@ -20,12 +20,12 @@ import time
 from dataclasses import dataclass, field
 from typing import Any
 
+from client_sdk.async_client import AsyncClient
 from client_sdk.bots import POLICIES, Bot
 from client_sdk.events import Left
 from client_sdk.stats import Stats
-from client_sdk.transports.aio import AsyncClient
 from client_sdk.transports.connection import ConnectError
-from server.histogram import Histogram
+from server.observability.histogram import Histogram
 from shared import kernels
 
 REPORT_S = 0.2

@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import pygame
 
-from client_sdk.picture import Figure
+from client_sdk.view import Figure
 from shared.checks import Vec
 from sovereign_netcode.play.iso import HALF, QUARTER, RISE, Colour, Ground, Point, mixed, project
 

@@ -10,9 +10,9 @@ import sys
 import threading
 from collections.abc import Callable, Iterator
 
+from client_sdk.async_client import AsyncClient
 from client_sdk.bots import Bot, Wander
 from client_sdk.core import Core
-from client_sdk.transports.aio import AsyncClient
 from client_sdk.transports.connection import ConnectError
 from sovereign_netcode.examples.tag_brain import TagPlayer
 from sovereign_netcode.stderr import Stderr

@@ -3,7 +3,7 @@
 import math
 
 from client_sdk.events import Answered, Happened
-from client_sdk.picture import View
+from client_sdk.view import View
 from shared.checks import Cell
 from shared.inputs import JUMP, MOVE_MAX
 from sovereign_netcode.examples.tag_brain import TagPlayer

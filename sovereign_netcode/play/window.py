@@ -9,8 +9,8 @@ import pygame
 
 from client_sdk.client import Client
 from client_sdk.events import Answered, Disconnected, Diverged, Event, Happened, Left, Resumed
-from client_sdk.links import Path
-from client_sdk.picture import Figure, View
+from client_sdk.netsim.links import Path
+from client_sdk.view import Figure, View
 from shared.checks import Cell, Vec
 from sovereign_netcode.play.figures import INK, OWN, TONES, WHITE, Actor, draw_ghost, label, screen
 from sovereign_netcode.play.hud import Hud

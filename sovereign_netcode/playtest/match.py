@@ -1,7 +1,7 @@
 """A match in simulated time: the real server core and real SDK cores, one `now`, one seed.
 
 Nothing sleeps, and the result does not depend on the machine. Every delivery, tick and frame is an entry in one queue,
-ordered by simulated time. The wires (`client_sdk.links`) model TCP: a message may be late, but is not lost or
+ordered by simulated time. The wires (`client_sdk.netsim.links`) model TCP: a message may be late, but is not lost or
 reordered.
 """
 
@@ -14,12 +14,12 @@ from itertools import count
 from client_sdk import bots
 from client_sdk.core import Core
 from client_sdk.events import Event
-from client_sdk.links import Path as Path
-from client_sdk.links import Weather, Wire
+from client_sdk.netsim.links import Path as Path
+from client_sdk.netsim.links import Weather, Wire
+from server.config.limits import Limits
 from server.game import Game
-from server.limits import Limits
+from server.game.session import Session
 from server.rules import Rules, prepared
-from server.session import Session
 from shared.inputs import Input
 from shared.scene import Scene
 

@@ -10,11 +10,11 @@ from typing import Any
 
 import pytest
 
+from client_sdk.async_client import AsyncClient
 from client_sdk.bots import Bot, Wander
 from client_sdk.core import Core
 from client_sdk.events import Answered, Event, Joined, Left
 from client_sdk.transports import connection
-from client_sdk.transports.aio import AsyncClient
 from client_sdk.transports.connection import ConnectError
 from shared import messages
 from tests.client_sdk.servers import accept, real_server, scripted_server, silent_server

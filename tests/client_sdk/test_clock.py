@@ -6,7 +6,7 @@ from itertools import pairwise
 
 import pytest
 
-from client_sdk.clock import (
+from client_sdk.timing.clock import (
     CALM_S,
     FASTER,
     FIRST_INPUTS_S,

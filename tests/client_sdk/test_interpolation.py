@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from client_sdk.interpolation import (
+from client_sdk.interpolation import Interpolation
+from client_sdk.interpolation.interpolation import (
     CALM_S,
     EXTRAPOLATE_S,
     FALL_S_PER_S,
@@ -12,7 +13,6 @@ from client_sdk.interpolation import (
     LONG_FALL,
     LONG_S,
     LONG_SHARE,
-    Interpolation,
 )
 from shared.layout import TEMPLATE, VX, Int64s
 from shared.units import BLOCK, SPEED

@@ -7,12 +7,12 @@ from collections.abc import Callable
 
 import pytest
 
+from client_sdk.async_client import AsyncClient
 from client_sdk.client import Client
 from client_sdk.core import READ_BYTES
 from client_sdk.events import Happened, Joined, Left
-from client_sdk.linked import SLOW_READ_BYTES, LinkedCore
-from client_sdk.links import PRESETS, Path
-from client_sdk.transports.aio import AsyncClient
+from client_sdk.netsim.linked import SLOW_READ_BYTES, LinkedCore
+from client_sdk.netsim.links import PRESETS, Path
 from shared import messages
 from shared.messages import Bye, Hello, Inputs, Ping, decode_from_client, encode
 from shared.scene import load_scene

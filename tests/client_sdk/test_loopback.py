@@ -4,11 +4,11 @@ import pytest
 
 from client_sdk.client import Client
 from client_sdk.events import Answered, Disconnected, Event, Happened, Joined, Left, Resumed
-from client_sdk.links import PRESETS
-from client_sdk.transports.loopback import LEAP_S, Loopback
-from server.auth import AuthError
+from client_sdk.loopback import LEAP_S, Loopback
+from client_sdk.netsim.links import PRESETS
+from server.auth.identity import AuthError
+from server.config.limits import Limits
 from server.game import Game
-from server.limits import Limits
 from shared import messages
 from shared.scene import load_scene
 from sovereign_netcode.examples.freeze import Freeze

@@ -9,7 +9,7 @@ import pytest
 
 from client_sdk.client import Client
 from client_sdk.events import Answered, Event, Joined, Left
-from client_sdk.linked import LinkedCore
+from client_sdk.netsim.linked import LinkedCore
 from client_sdk.transports import connection
 from client_sdk.transports.connection import UNSENT_MAX, ConnectError, Connection
 from client_sdk.transports.polling import PollingTransport

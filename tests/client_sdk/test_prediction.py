@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from client_sdk.confirmed import Confirmed
-from client_sdk.prediction import NONDETERMINISM, Prediction
+from client_sdk.prediction.confirmed import Confirmed
+from client_sdk.prediction.prediction import NONDETERMINISM, Prediction
 from client_sdk.replica import check_scene
 from shared.checks import Cell
 from shared.edits import Edit

@@ -2,7 +2,7 @@
 
 import pytest
 
-from client_sdk.smoothing import HALF_LIFE_S, TELEPORT_BLOCKS, Smoothing
+from client_sdk.interpolation.smoothing import HALF_LIFE_S, TELEPORT_BLOCKS, Smoothing
 
 
 def test_without_a_correction_there_is_no_offset() -> None:

@@ -3,10 +3,10 @@
 import pytest
 
 from client_sdk.events import Corrected
-from client_sdk.linked import LinkedCore
-from client_sdk.links import Path
+from client_sdk.loopback import Loopback
+from client_sdk.netsim.linked import LinkedCore
+from client_sdk.netsim.links import Path
 from client_sdk.stats import Stats
-from client_sdk.transports.loopback import Loopback
 from server.game import Game
 from shared import kernels
 from shared.scene import load_scene

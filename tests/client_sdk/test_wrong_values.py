@@ -10,7 +10,7 @@ import pytest
 
 from client_sdk import AsyncClient, Client, Loopback
 from client_sdk.core import Core
-from client_sdk.links import Path
+from client_sdk.netsim.links import Path
 from client_sdk.transports.connection import ConnectError
 from server.game import Game
 from shared.inputs import Input

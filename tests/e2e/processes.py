@@ -18,7 +18,7 @@ from typing import Any
 
 from client_sdk.client import Client
 from client_sdk.events import Event
-from server.process import COMPILING
+from server.runtime.event_loop import COMPILING
 from shared.checks import Vec
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -15,8 +15,8 @@ from typing import NamedTuple
 import pytest
 from websockets.frames import Frame, Opcode
 
+from client_sdk.async_client import AsyncClient
 from client_sdk.bots import Bot, Wander
-from client_sdk.transports.aio import AsyncClient
 from shared.messages import (
     CLIENT_MESSAGE_MAX,
     MALFORMED,

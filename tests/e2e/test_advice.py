@@ -9,10 +9,10 @@ import pytest
 import trustme
 
 from client_sdk import AsyncClient, Client, ConnectError, Event, Joined, Left, Loopback
-from server.auth import AuthError
+from server.auth.identity import AuthError
+from server.auth.tokens import Tokens
+from server.config.limits import Limits
 from server.game import Game
-from server.limits import Limits
-from server.tokens import Tokens
 from shared import messages
 from shared.scene import load_scene
 from tests.client_sdk.servers import scripted_server

@@ -16,9 +16,9 @@ import pytest
 from websockets.asyncio.client import ClientConnection, connect
 from websockets.exceptions import ConnectionClosed
 
-from server.database import read
-from server.journal import replay
-from server.store import Store
+from server.journal.records import replay
+from server.persistence.database import read
+from server.persistence.store import Store
 from shared import edits, messages
 from shared.layout import ID, X
 from shared.messages import VERSION, Command, Hello, Inputs, Snapshot, Welcome, decode_from_server, encode

@@ -14,12 +14,12 @@ from dataclasses import dataclass, field, replace
 
 import pytest
 
+from client_sdk.async_client import AsyncClient
 from client_sdk.bots import Bot, Policy, Wander
 from client_sdk.core import Core
 from client_sdk.events import Diverged, Event, Left
-from client_sdk.links import HEADER_BYTES, PRESETS, Path, path
+from client_sdk.netsim.links import HEADER_BYTES, PRESETS, Path, path
 from client_sdk.stats import Stats
-from client_sdk.transports.aio import AsyncClient
 from shared.inputs import Input
 from shared.scene import load_scene
 from shared.world import World

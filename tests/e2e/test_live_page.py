@@ -9,8 +9,8 @@ from typing import Any
 
 import pytest
 
+from client_sdk.async_client import AsyncClient
 from client_sdk.bots import Bot, RunAndJump
-from client_sdk.transports.aio import AsyncClient
 from tests.chromium import chromium, installed
 from tests.client_sdk.servers import ROOT, real_server
 

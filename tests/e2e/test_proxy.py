@@ -8,7 +8,7 @@ from contextlib import asynccontextmanager, suppress
 
 import pytest
 
-from client_sdk.links import Path
+from client_sdk.netsim.links import Path
 from tests.proxy import Proxy
 
 pytestmark = pytest.mark.e2e

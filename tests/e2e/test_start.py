@@ -17,7 +17,7 @@ from pathlib import Path
 import pytest
 
 from client_sdk.client import Client
-from server.process import COMPILING, announce_compiling
+from server.runtime.event_loop import COMPILING, announce_compiling
 from shared import kernels
 from tests.e2e.processes import ROOT, START_S, other, page, running, stats, until
 from tests.lengths import long

@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 import trustme
 
+from client_sdk.async_client import AsyncClient
 from client_sdk.client import Client
-from client_sdk.transports.aio import AsyncClient
 from client_sdk.transports.connection import ConnectError
 from tests.e2e.processes import END_S, ServerProcess, running, until
 

@@ -16,8 +16,8 @@ from typing import Any
 
 import pytest
 
-from server.histogram import between
-from server.settings import KINDS
+from server.config.settings import KINDS
+from server.observability.histogram import between
 from tests.e2e.processes import END_S, ROOT, ServerProcess, running, stats, until
 
 pytestmark = [

@@ -18,7 +18,7 @@ def run(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
 
 
 def test_a_module_is_one_object_under_both_names() -> None:
-    assert "client_sdk.transports.aio" in MODULES
+    assert "client_sdk.async_client" in MODULES
     for name in MODULES:
         module = importlib.import_module(f"sovereign_netcode.{name}")
         assert module is importlib.import_module(name)
@@ -100,6 +100,6 @@ def test_type_checkers_see_through_the_alias(tmp_path: Path) -> None:
     )
     done = run(tmp_path, "-m", "mypy", "--strict", "--cache-dir", str(tmp_path / "cache"), "mine.py")
     assert 'mine.py:5: error: Return type "int" of "on_start" incompatible with return type "None"' in done.stdout
-    assert 'mine.py:7: note: Revealed type is "client_sdk.picture.View"' in done.stdout
+    assert 'mine.py:7: note: Revealed type is "client_sdk.view.View"' in done.stdout
     assert 'mine.py:8: note: Revealed type is "int"' in done.stdout
     assert "Found 1 error" in done.stdout

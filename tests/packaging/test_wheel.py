@@ -253,5 +253,5 @@ def test_types_are_checked(installed: Installed) -> None:
     )
     said = done.stdout.splitlines()
     assert said[0].startswith('mine.py:6: error: Return type "int" of "on_start" incompatible with return type "None"')
-    assert 'mine.py:8: note: Revealed type is "sovereign_netcode.client_sdk.picture.View"' in said
+    assert 'mine.py:8: note: Revealed type is "sovereign_netcode.client_sdk.view.View"' in said
     assert said[-1] == "Found 1 error in 1 file (checked 1 source file)"

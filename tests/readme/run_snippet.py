@@ -16,10 +16,8 @@ from types import SimpleNamespace
 from typing import Any
 
 from sovereign_netcode.client_sdk import AsyncClient, Client, Loopback, View, client
-from sovereign_netcode.server.game import Game
-from sovereign_netcode.server.rules import Rules
-from sovereign_netcode.server.session import Player
-from sovereign_netcode.server.settings import Settings
+from sovereign_netcode.server import Game, Player, Rules
+from sovereign_netcode.server.config.settings import Settings
 from sovereign_netcode.shared.scene import load_scene
 from tests.readme import engines
 from tests.readme.pages import programs

@@ -7,8 +7,8 @@ from dataclasses import fields
 from typing import get_args
 
 from client_sdk import events
+from server.game_api.api import Stage
 from server.rules import Rules
-from server.stage import Stage
 from shared.scene import Template
 from tests.readme.pages import ROOT, section
 

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 from rich.console import Console
 
-from server.histogram import Histogram, between
+from server.observability.histogram import Histogram, between
 from sovereign_netcode.loadtest import figures, glance
 
 Figures = dict[str, Any]

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from client_sdk.client import Client
-from client_sdk.linked import LinkedCore
+from client_sdk.netsim.linked import LinkedCore
 from server.rules import Rules
 from shared import kernels
 from shared.blocks import Blocks

@@ -6,7 +6,7 @@ from random import Random
 import pytest
 
 from client_sdk.core import Core
-from client_sdk.linked import LinkedCore
+from client_sdk.netsim.linked import LinkedCore
 from scripts._progress import Progress
 from scripts._walkers import LOOK_S, Walker, walk
 from shared.inputs import Input

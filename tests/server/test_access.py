@@ -2,10 +2,10 @@
 
 import pytest
 
-from server.access import authenticator, tls_context
-from server.kinds import SettingsError
-from server.settings import Settings
-from server.tokens import Tokens, issue
+from server.auth.access import authenticator, tls_context
+from server.auth.tokens import Tokens, issue
+from server.config.options import SettingsError
+from server.config.settings import Settings
 
 
 def check_of_ones_own(token: str) -> str:

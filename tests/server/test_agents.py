@@ -15,12 +15,12 @@ pytest.importorskip("pettingzoo", reason="needs the extra [agents]")
 with warnings.catch_warnings(action="ignore", category=DeprecationWarning):  # of its own examples
     from pettingzoo.test import parallel_api_test, parallel_seed_test
 
+from client_sdk.async_client import AsyncClient
 from client_sdk.bots import POLICIES, Bot, Builder, Policy, Wander
 from client_sdk.core import Core
-from client_sdk.transports.aio import AsyncClient
 from server.agents import NO_BLOCK, OTHERS, Arena, Observation
+from server.players.player import Player
 from server.rules import Rules
-from server.session import Player
 from shared.messages import DONE, OUT_OF_REACH
 from sovereign_netcode.examples.tag import Tag
 from tests.client_sdk.servers import real_server

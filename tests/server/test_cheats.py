@@ -12,10 +12,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from server.limits import Limits
-from server.rewind import WINDOW_S
+from server.config.limits import Limits
+from server.players.player import Player
+from server.rewind.history import WINDOW_S
 from server.rules import Rules
-from server.session import Player
 from shared import edits, messages
 from shared.bounds import bounds
 from shared.inputs import Input, clamp

@@ -2,8 +2,8 @@
 
 import pytest
 
-from server import check
-from server.kinds import SettingsError
+from server.config.options import SettingsError
+from server.runtime import healthcheck
 
 
 @pytest.mark.parametrize(
@@ -17,13 +17,13 @@ from server.kinds import SettingsError
     ],
 )
 def test_it_asks_whether_the_server_is_ready_where_no_page_is_named(url: str, page: str) -> None:
-    assert check.page(url) == page
+    assert healthcheck.page(url) == page
 
 
 @pytest.mark.parametrize("url", ["", "127.0.0.1:8765", "ftp://x", "http://", "http:///readyz", "ws:/x"])
 def test_what_is_no_address(url: str) -> None:
     with pytest.raises(SettingsError) as error:
-        check.main(["--url", url], {})
+        healthcheck.main(["--url", url], {})
     assert str(error.value) == f"url = {url!r}: must be like ws://HOST:PORT, wss://, http:// or https://"
 
 
@@ -44,5 +44,5 @@ def test_it_asks_where_the_server_of_the_same_environment_listens(
 ) -> None:
     environment = {"SOVEREIGN_PORT": "9000", **({} if host is None else {"SOVEREIGN_HOST": host})}
     with pytest.raises(SystemExit):
-        check.main(["--help"], environment)
+        healthcheck.main(["--help"], environment)
     assert f"(default: http://{asked}:9000/readyz)" in " ".join(capsys.readouterr().out.split())

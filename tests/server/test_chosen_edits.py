@@ -6,10 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from server import former
-from server.checkpoint import Copy, generated, restored, saved_of
-from server.live import Relief
-from server.replication import ChangeLog
+from server.journal import former
+from server.observability.live import Relief
+from server.persistence.checkpoint import Copy, generated, restored, saved_of
+from server.replication.change_log import ChangeLog
 from shared import messages
 from shared.blocks import offset_of
 from shared.edits import Edit

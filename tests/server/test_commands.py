@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 
-from server.limits import Limits
+from server.config.limits import Limits
 from shared import edits, messages
 from shared.messages import Command, Inputs, Snapshot, Welcome
 from tests.tables import FakeLink, Table, order

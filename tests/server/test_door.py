@@ -2,9 +2,10 @@
 
 import pytest
 
-from server.door import SPARE, SPARE_PER_ADDRESS, Door, Request, is_loopback, network_of
-from server.limits import Limits
-from server.pages import Page, Pages
+from server.config.hosts import is_loopback, network_of
+from server.config.limits import Limits
+from server.net.admission import SPARE, SPARE_PER_ADDRESS, Door, Request
+from server.observability.pages import Page, Pages
 
 JOIN = Request("GET", "/", "play.example:8765", None, upgrade=True)
 HEALTH = Request("GET", "/healthz", "127.0.0.1:8765", None, upgrade=False)

@@ -8,13 +8,13 @@ from typing import Any
 
 import pytest
 
-from server import game as games
-from server import store as stores
-from server.checkpoint import Copy
-from server.database import read
-from server.roster import Roster
-from server.stage import Stage
-from server.store import Store
+from server.game import game as games
+from server.game.roster import Roster
+from server.game_api.api import Stage
+from server.persistence import store as stores
+from server.persistence.checkpoint import Copy
+from server.persistence.database import read
+from server.persistence.store import Store
 from shared import messages
 from shared.messages import Hello, Snapshot, Welcome
 from tests.server.test_keeping import Stored

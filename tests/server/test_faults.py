@@ -5,9 +5,9 @@ from typing import Any
 
 import pytest
 
-from server.faults import Faults
-from server.limits import Limits
-from server.pacing import SAMPLE_S
+from server.config.limits import Limits
+from server.observability.errors import Faults
+from server.replication.flow_control import SAMPLE_S
 from shared import edits, messages
 from shared.checks import Cell
 from shared.messages import Bye, Inputs, Ping, Pong, Snapshot

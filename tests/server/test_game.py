@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from server.limits import Limits
+from server.config.limits import Limits
 from shared import messages
 from shared.bounds import bounds
 from shared.messages import (

@@ -17,11 +17,11 @@ from hypothesis import strategies as st
 from websockets.frames import Frame, Opcode
 from websockets.utils import apply_mask
 
-from server import gateway as module
-from server.door import SPARE_PER_ADDRESS, Door
-from server.gateway import Connection, Gateway
-from server.limits import Limits
-from server.pages import Pages, json_page
+from server.config.limits import Limits
+from server.net import websocket as module
+from server.net.admission import SPARE_PER_ADDRESS, Door
+from server.net.websocket import Connection, Gateway
+from server.observability.pages import Pages, json_page
 from shared.messages import CLIENT_MESSAGE_MAX
 from tests.lengths import examples
 

@@ -2,7 +2,7 @@
 
 import pytest
 
-from server.limits import Limits
+from server.config.limits import Limits
 from shared import messages
 from shared.messages import (
     Bye,

@@ -9,10 +9,10 @@ import pytest
 import pytest_asyncio
 import trustme
 
-from server import handshakes
-from server.door import SPARE_PER_ADDRESS, Door
-from server.gateway import Gateway
-from server.limits import Limits
+from server.config.limits import Limits
+from server.net import tls_accept
+from server.net.admission import SPARE_PER_ADDRESS, Door
+from server.net.websocket import Gateway
 
 TIME_OUT_S = 30.0
 ALLOWED = 3
@@ -153,7 +153,7 @@ async def test_many_who_come_at_once_are_accepted_one_in_a_pass_of_the_loop(
 async def test_trouble_in_accepting_is_told_and_passes(
     gateway: Gateway, context: ssl.SSLContext, trust: ssl.SSLContext, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(handshakes, "AGAIN_S", 0.0)
+    monkeypatch.setattr(tls_accept, "AGAIN_S", 0.0)
     loop, told = asyncio.get_running_loop(), list[str]()
     loop.set_exception_handler(lambda _, context: told.append(context["message"]))
     real, failures = loop.sock_accept, [OSError(24, "Too many open files"), ConnectionAbortedError()]

@@ -5,7 +5,7 @@ import random
 
 import pytest
 
-from server.histogram import BUCKETS, Histogram, _bucket, _upper_us, between
+from server.observability.histogram import BUCKETS, Histogram, _bucket, _upper_us, between
 
 
 def test_buckets_are_contiguous_and_narrow() -> None:

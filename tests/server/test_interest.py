@@ -2,7 +2,7 @@
 
 import random
 
-from server.interest import around, distance, update
+from server.replication.interest import around, distance, update
 from shared.checks import Cell
 
 EVERYWHERE = lambda segment: True  # noqa: E731

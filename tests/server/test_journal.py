@@ -12,10 +12,23 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from server import app, former
-from server.journal import FILL, MAGIC, NOTE, PUT, REMOVE, DivergedError, JournalError, Moment, Recording, redo, replay
-from server.kinds import SettingsError
-from server.recorder import Pen, RecordedWorld
+from server import app
+from server.config.options import SettingsError
+from server.journal import former
+from server.journal.recorded_world import Pen, RecordedWorld
+from server.journal.records import (
+    FILL,
+    MAGIC,
+    NOTE,
+    PUT,
+    REMOVE,
+    DivergedError,
+    JournalError,
+    Moment,
+    Recording,
+    redo,
+    replay,
+)
 from shared.inputs import Input
 from shared.world import OverlapError, World
 from tests import worlds

@@ -3,11 +3,11 @@
 from pathlib import Path
 from typing import Any
 
+from server.config.limits import Limits
 from server.game import Game
-from server.keeping import restored, whole
-from server.limits import Limits
+from server.persistence.store import Store
+from server.players.persisted_state import restored, whole
 from server.rules import Rules
-from server.store import Store
 from shared import messages
 from shared.messages import Hello, Inputs, Shared, Welcome
 from tests.server.test_rules import Told, attributes

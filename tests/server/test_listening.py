@@ -9,8 +9,8 @@ from typing import Any
 
 import pytest
 
-from server import listening
-from server.listening import listeners
+from server.net import addresses
+from server.net.addresses import listeners
 
 BACKLOG = 8
 
@@ -134,7 +134,7 @@ async def test_another_port_is_picked_where_the_first_is_taken_on_another_addres
 @needs_ipv6
 async def test_the_search_for_a_port_ends(monkeypatch: pytest.MonkeyPatch) -> None:
     named(monkeypatch, "127.0.0.1", "::1")
-    Failing(monkeypatch, [errno.EADDRINUSE] * listening.TRIES)
+    Failing(monkeypatch, [errno.EADDRINUSE] * addresses.TRIES)
     with pytest.raises(OSError, match="told to fail"):
         await listeners("play.example", 0, BACKLOG)
 

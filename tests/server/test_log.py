@@ -8,8 +8,9 @@ from collections.abc import Iterator
 import pytest
 import structlog
 
-from server import log
-from server.tokens import issue
+from server.auth.tokens import issue
+from server.config.settings import LOG_FORMATS
+from server.runtime import log
 
 TOKEN = issue(b"k" * 32, "ann", 3600, 1.8e9)
 
@@ -34,7 +35,7 @@ def lines(form: str, level: str = "info") -> io.StringIO:
 def test_both_kinds_of_loggers_give_one_line_of_json_each() -> None:
     stream = lines("json")
     structlog.stdlib.get_logger("server").info("started", scene="flat", tick_rate=32)
-    logging.getLogger("server.gateway").warning("internal error in %s", "open")
+    logging.getLogger("server.net.websocket").warning("internal error in %s", "open")
     logging.getLogger("server").debug("not this")
     first, second = map(json.loads, stream.getvalue().splitlines())
     assert first.pop("timestamp").endswith("Z")
@@ -65,7 +66,7 @@ def test_people_read_the_same() -> None:
     assert "cannot read" in second
 
 
-@pytest.mark.parametrize("form", log.FORMATS)
+@pytest.mark.parametrize("form", LOG_FORMATS)
 def test_no_token_is_in_any_line(form: str) -> None:
     stream = lines(form)
     logger = structlog.stdlib.get_logger("server")

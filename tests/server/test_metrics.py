@@ -4,9 +4,9 @@ from typing import Any
 
 from prometheus_client.parser import text_string_to_metric_families
 
-from server.counters import Counters
-from server.histogram import Histogram
-from server.metrics import BOUNDS_S, COUNTERS, GAUGES, LABELLED, metrics_page
+from server.observability.counters import Counters
+from server.observability.histogram import Histogram
+from server.observability.metrics import BOUNDS_S, COUNTERS, GAUGES, LABELLED, metrics_page
 from tests.tables import HELLO, Table
 
 

@@ -4,7 +4,7 @@ import random
 
 import pytest
 
-from server.outbox import Outbox
+from server.players.outbox import Outbox
 from shared.messages import Happened, NextHappened, decode_from_server, encode
 
 ALL = 1 << 20

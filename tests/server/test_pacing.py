@@ -1,6 +1,6 @@
 """How much may be on the way: by hand-made paths."""
 
-from server.pacing import HOLD_S_MAX, LEAST_BYTES, NARROW_S, RTT_WINDOW_S, SAMPLE_S, Pacing
+from server.replication.flow_control import HOLD_S_MAX, LEAST_BYTES, NARROW_S, RTT_WINDOW_S, SAMPLE_S, Pacing
 
 TICK_S = 1 / 32
 

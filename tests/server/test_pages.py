@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from server.pages import Page, Pages, json_page, ready_page
+from server.observability.pages import Page, Pages, json_page, ready_page
 
 
 def test_pages_by_path_and_method() -> None:

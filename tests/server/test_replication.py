@@ -6,10 +6,10 @@ import msgpack
 import numpy as np
 import pytest
 
+from server.config.limits import Limits
 from server.game import Game
-from server.limits import Limits
-from server.replication import PACKS_PER_TICK, ChangeLog
-from server.session import Session
+from server.game.session import Session
+from server.replication.change_log import PACKS_PER_TICK, ChangeLog
 from shared.blocks import Kinds, unpack
 from shared.bounds import bounds
 from shared.checks import Cell
@@ -435,13 +435,13 @@ class Told:
         """The client has just what the server has in the segments it sees."""
         game, model, session = self.game, self.model, self.session
         assert model.tick == game.world.tick
-        sees = session.sight.sees
+        sees = session.stream.sight.sees
         here = [entity for entity in game.world.entities["id"].tolist() if game.log.segment(entity) in sees]
         assert model.world.states().tolist() == [list(game.world.state(entity)) for entity in here]
         assert session.entity in model.world
-        under_way = {*session.terrain_due, session.terrain_now[0] if session.terrain_now else None}
-        assert set(model.blocks) - session.sight.sees == set()
-        for segment in session.sight.sees - under_way:
+        under_way = {*session.stream.terrain_due, session.stream.terrain_now[0] if session.stream.terrain_now else None}
+        assert set(model.blocks) - session.stream.sight.sees == set()
+        for segment in session.stream.sight.sees - under_way:
             if segment in game.world.blocks:
                 assert (model.blocks[segment] == game.world.blocks.segment(segment).reshape(-1)).all()
 
@@ -455,15 +455,15 @@ def test_a_client_has_what_the_server_has_whatever_it_skipped_and_wherever_it_lo
         told.stir()
         told.stall()
         told.tick()
-        if not told.model.stuck and told.session.sight.complete:
+        if not told.model.stuck and told.session.stream.sight.complete:
             told.check()
             checks += 1
     told.model.stuck = False
     for _ in range(60):
         told.tick()
     told.check()
-    assert told.session.sight.complete
+    assert told.session.stream.sight.complete
     assert checks > 50
     assert told.model.told > 10
-    assert not told.session.terrain_due
+    assert not told.session.stream.terrain_due
     assert told.game.counters.snapshots_skipped > 50

@@ -2,9 +2,9 @@
 
 import pytest
 
-from server.limits import Limits
-from server.roster import UNHEARD_S
-from server.session import SETTLED_MAX
+from server.config.limits import Limits
+from server.game.roster import UNHEARD_S
+from server.players.player import SETTLED_MAX
 from shared import messages
 from shared.messages import Bye, Hello, Inputs, Snapshot, Welcome
 from tests.server.test_commands import verdicts

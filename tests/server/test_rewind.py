@@ -12,10 +12,11 @@ from hypothesis import strategies as st
 
 from client_sdk.core import Core
 from client_sdk.interpolation import Interpolation
+from server.config.limits import Limits
 from server.game import Game
-from server.limits import Limits
-from server.rays import Ray
-from server.rewind import WINDOW_S, Hit, Past, Rewind
+from server.rewind import Rewind
+from server.rewind.history import WINDOW_S, Hit, Past
+from server.rewind.rays import Ray
 from shared.checks import Cell, SceneError, Vec
 from shared.inputs import Input
 from shared.layout import Int64s

@@ -5,11 +5,11 @@ from typing import Any
 import msgpack
 import pytest
 
-from server.limits import Limits
-from server.pacing import Pacing
+from server.config.limits import Limits
+from server.game_api.api import ATTRIBUTES_MAX
+from server.players.player import Player
+from server.replication.flow_control import Pacing
 from server.rules import Rules, RulesError, load_rules
-from server.session import Player
-from server.stage import ATTRIBUTES_MAX
 from shared import messages
 from shared.checks import SceneError
 from shared.inputs import NEUTRAL

@@ -4,7 +4,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from server.session import InputQueue, Session
+from server.game.session import Session
+from server.players.input_queue import InputQueue
 from shared.bounds import bounds
 from shared.inputs import NEUTRAL, Input, clamp
 from shared.messages import (

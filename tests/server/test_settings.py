@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from server.kinds import SettingsError, checked
-from server.limits import Limits
-from server.settings import GROUPS, KINDS, SECTIONS, Settings, load, parse
+from server.config.limits import Limits
+from server.config.options import SettingsError, checked
+from server.config.settings import GROUPS, KINDS, SECTIONS, Settings, load, parse
 from shared import kernels
 
 

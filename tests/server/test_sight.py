@@ -4,7 +4,7 @@ from itertools import groupby
 
 import pytest
 
-from server.sight import Sight
+from server.replication.client_view import Sight
 from shared.bounds import bounds
 from shared.checks import Cell
 from shared.snapshot import KEYFRAME

@@ -2,7 +2,7 @@
 
 import pytest
 
-from server.spawning import OFFSETS, Spawns
+from server.game.spawning import OFFSETS, Spawns
 from shared.world import OverlapError, World
 from tests.worlds import build, floor
 

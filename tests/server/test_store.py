@@ -12,10 +12,10 @@ import msgpack
 import numpy as np
 import pytest
 
-from server import database
-from server import store as stores
-from server.database import StoreError
-from server.store import Store
+from server.persistence import database
+from server.persistence import store as stores
+from server.persistence.database import StoreError
+from server.persistence.store import Store
 from shared.blocks import pack
 from shared.inputs import Input
 from shared.world import World

@@ -10,9 +10,9 @@ from pathlib import Path
 
 import pytest
 
-from server import mark
-from server.database import StoreError
-from server.store import Store
+from server.persistence import mark
+from server.persistence.database import StoreError
+from server.persistence.store import Store
 from tests.server.test_store import SCENE, altered, keep, refused
 from tests.server.test_store_faults import HEAD, Torn, damaged_copy, found_in
 

@@ -11,10 +11,10 @@ from typing import Any
 
 import pytest
 
-from server import database
-from server import store as stores
-from server.database import Database, StoreError
-from server.store import Store
+from server.persistence import database
+from server.persistence import store as stores
+from server.persistence.database import Database, StoreError
+from server.persistence.store import Store
 from tests.server.test_store import SCENE, copied, crashed, keep, play, until
 
 HEAD = 32

@@ -12,15 +12,15 @@ import pytest
 
 from client_sdk import AsyncClient, Client, Loopback
 from client_sdk.core import Core
-from server import access, tokens
 from server.agents import Arena
-from server.auth import AuthError
+from server.auth import access, tokens
+from server.auth.identity import AuthError
+from server.config.options import SettingsError
+from server.config.settings import Settings, load
 from server.game import Game
-from server.kinds import SettingsError
+from server.game_api.api import Stage
+from server.persistence.store import Store
 from server.rules import Rules
-from server.settings import Settings, load
-from server.stage import Stage
-from server.store import Store
 from shared import messages
 from shared.checks import SceneError
 from shared.messages import Hello, Welcome

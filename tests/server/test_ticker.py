@@ -7,8 +7,8 @@ from collections.abc import Callable
 
 import pytest
 
-from server.limits import catch_up_ticks
-from server.ticker import FAILURES_MAX, Alarm, LoopAlarm, Schedule, Ticker, TimerfdAlarm, best_alarm
+from server.config.limits import catch_up_ticks
+from server.runtime.ticker import FAILURES_MAX, Alarm, LoopAlarm, Schedule, Ticker, TimerfdAlarm, best_alarm
 
 RATE = 32  # a power of two: every deadline below is exact
 PERIOD = 1 / RATE

@@ -10,10 +10,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from server import tokens
-from server.auth import SUBJECT_MAX, AuthError
-from server.kinds import SettingsError
-from server.tokens import LEEWAY_S, Tokens, issue, read_key
+from server.auth import tokens
+from server.auth.identity import SUBJECT_MAX, AuthError
+from server.auth.tokens import LEEWAY_S, Tokens, issue, read_key
+from server.config.options import SettingsError
 
 KEY, OTHER = b"k" * 32, b"o" * 32
 NOW = 1_800_000_000.0

@@ -10,10 +10,10 @@ from typing import Any
 import pytest
 
 from server.game import Game
+from server.game_api.api import SOON_MAX
+from server.game_api.turn import OutOfTurnError
+from server.players.player import Player
 from server.rules import HOOKS, Rules, RulesError, check_rules, load_rules, prepared
-from server.session import Player
-from server.stage import SOON_MAX
-from server.turn import OutOfTurnError
 from shared.checks import SceneError
 from shared.scene import Scene, load_scene
 from sovereign_netcode.playtest import Match

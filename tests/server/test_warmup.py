@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 
-from server.warmup import warm_up
+from server.runtime.warmup import warm_up
 from shared import kernels
 from shared.checks import SceneError
 from shared.scene import load_scene

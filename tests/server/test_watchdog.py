@@ -7,8 +7,8 @@ from typing import Any
 
 import pytest
 
-from server import watchdog as module
-from server.watchdog import Watchdog
+from server.runtime import watchdog as module
+from server.runtime.watchdog import Watchdog
 
 TIME_OUT_S = 10.0
 STALL_S = 0.02

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from server.agents import Arena
+from server.config.limits import Limits
 from server.game import Game
-from server.limits import Limits
-from server.recorder import RecordedWorld
+from server.game_api.api import Stage
+from server.journal.recorded_world import RecordedWorld
+from server.players.player import Player
 from server.rules import Rules, RulesError
-from server.session import Player
-from server.stage import Stage
 from shared.checks import MissingError, SceneError
 from shared.scene import load_scene
 from tests.shared.test_wrong_values import ENTITY, NUMBER, TEMPLATE, THREE, WHOLE, Calls

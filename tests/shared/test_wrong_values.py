@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from server.recorder import Pen, RecordedWorld
+from server.journal.recorded_world import Pen, RecordedWorld
 from shared.checks import MissingError, SceneError
 from shared.inputs import Input, make_input
 from shared.scene import Scene, Template, load_scene

@@ -5,11 +5,11 @@ import math
 
 import pytest
 
-from client_sdk.comeback import Comeback
 from client_sdk.core import Core
 from client_sdk.events import Answered, Corrected, Disconnected, Joined, Left, Resumed
-from client_sdk.links import PRESETS, Path
-from server.limits import Limits
+from client_sdk.netsim.links import PRESETS, Path
+from client_sdk.reconnect import Comeback
+from server.config.limits import Limits
 from shared import messages
 from shared.messages import Bye, encode
 from shared.scene import load_scene

@@ -8,10 +8,10 @@ import pytest
 
 from client_sdk.core import Core
 from client_sdk.events import Answered, Event, EventsDropped, Happened, Joined, Left, Resumed, SegmentLoaded
-from client_sdk.links import PRESETS
-from server.limits import Limits
+from client_sdk.netsim.links import PRESETS
+from server.config.limits import Limits
+from server.players.player import Player as Seat
 from server.rules import Rules
-from server.session import Player as Seat
 from shared.inputs import NEUTRAL, Input
 from shared.scene import Scene, load_scene
 from tests.match import Match, Path, Player, wander
@@ -99,7 +99,7 @@ def test_an_entity_is_there_when_an_event_tells_of_it_where_not_all_fits_into_a_
     for _ in range(40 * 32):
         match.run(1 / 32)
         assert player.session is not None
-        behind += not player.session.sight.complete
+        behind += not player.session.stream.sight.complete
     assert behind > 400, "the line is narrow enough"
     assert core.named > 100
     assert core.unknown == 0

@@ -3,8 +3,8 @@
 import pytest
 
 from client_sdk.events import Corrected
-from client_sdk.links import PRESETS
-from server.pacing import Pacing
+from client_sdk.netsim.links import PRESETS
+from server.replication.flow_control import Pacing
 from shared.inputs import JUMP, Input
 from shared.scene import load_scene
 from tests.lengths import long
@@ -123,7 +123,7 @@ def test_on_a_thin_link_nobody_is_starved() -> None:
     def look() -> None:
         for player in players:
             assert player.session is not None
-            waits.append(player.session.sight.waits(match.game.world.tick))
+            waits.append(player.session.stream.sight.waits(match.game.world.tick))
 
     match.on_tick.append(look)
     match.run(20)

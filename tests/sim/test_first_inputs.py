@@ -7,7 +7,7 @@ import pytest
 
 from client_sdk.core import Core
 from client_sdk.events import Corrected
-from client_sdk.links import PRESETS
+from client_sdk.netsim.links import PRESETS
 from shared.inputs import Input
 from shared.scene import load_scene
 from tests.lengths import long

@@ -7,7 +7,7 @@ from itertools import count
 
 import pytest
 
-from client_sdk.links import PRESETS, Path, Weather, Wire
+from client_sdk.netsim.links import PRESETS, Path, Weather, Wire
 
 
 class Time:

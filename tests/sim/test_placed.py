@@ -8,10 +8,10 @@ import pytest
 
 from client_sdk import Loopback
 from client_sdk.core import Core
-from client_sdk.links import PRESETS
+from client_sdk.netsim.links import PRESETS
 from server.game import Game
+from server.players.player import Player as Shooter
 from server.rules import Rules
-from server.session import Player as Shooter
 from shared.checks import Vec
 from shared.inputs import NEUTRAL, Input
 from shared.scene import Scene, load_scene

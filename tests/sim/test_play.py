@@ -6,7 +6,7 @@ import pytest
 
 from client_sdk.core import Core
 from client_sdk.events import Diverged, Left, Resynchronised, SegmentLoaded
-from client_sdk.links import PRESETS
+from client_sdk.netsim.links import PRESETS
 from shared.bounds import UPDATE_S
 from shared.inputs import JUMP, Input
 from shared.messages import Command, decode_from_client

@@ -9,7 +9,7 @@ import pytest
 
 from client_sdk import Client, Loopback
 from client_sdk.core import Core
-from client_sdk.links import PRESETS
+from client_sdk.netsim.links import PRESETS
 from server.game import Game
 from shared.inputs import JUMP, Input
 from shared.messages import Inputs, decode_from_client

@@ -8,9 +8,9 @@ import pytest
 
 from client_sdk.core import Core
 from server.game import Game
-from server.journal import FILL, JournalError, Recording
-from server.limits import Limits
-from server.recorder import RecordedWorld
+from server.journal.records import FILL, JournalError, Recording
+from server.config.limits import Limits
+from server.journal.recorded_world import RecordedWorld
 from shared.inputs import Input
 from shared.scene import load_scene
 from shared.world import World

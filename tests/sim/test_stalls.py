@@ -6,9 +6,9 @@ from itertools import product
 import pytest
 
 from client_sdk.events import Corrected, Diverged, Resynchronised
-from client_sdk.links import PRESETS
-from client_sdk.play import AHEAD, BEHIND, PATH
-from server.session import InputQueue
+from client_sdk.input_loop import AHEAD, BEHIND, PATH
+from client_sdk.netsim.links import PRESETS
+from server.players.input_queue import InputQueue
 from shared.bounds import UNCONFIRMED_S
 from shared.inputs import Input
 from shared.scene import load_scene

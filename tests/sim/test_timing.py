@@ -10,9 +10,8 @@ from functools import cache
 
 import pytest
 
-from client_sdk.clock import PricedLead
 from client_sdk.core import Core
-from client_sdk.links import PRESETS
+from client_sdk.netsim.links import PRESETS
 from scripts import league
 from shared.inputs import Input
 from shared.scene import load_scene

@@ -1,0 +1,354 @@
+"""The client for asyncio: no task per connection, one timer, and one call per chunk of bytes.
+
+    client = await AsyncClient.connect("ws://localhost:8765", name="Ann")
+    async for event in client:
+        ...
+
+Time is `time.monotonic()`: an event loop's own clock may be as coarse as a millisecond.
+"""
+
+import asyncio
+import socket
+import ssl
+import time
+from collections.abc import Callable
+from types import TracebackType
+from typing import Any, cast
+
+from client_sdk.base import BaseClient
+from client_sdk.compiling import COMPILER
+from client_sdk.core import READ_BYTES, Core
+from client_sdk.events import Event
+from client_sdk.netsim.linked import LinkedCore
+from client_sdk.netsim.links import Path
+from client_sdk.pending_events import PendingEvents
+from client_sdk.transports.connection import (
+    CLOSE_S,
+    UNSENT_MAX,
+    ConnectError,
+    Connection,
+    checked_tls,
+    insecure,
+    stalled,
+    unreachable,
+)
+from client_sdk.view import View
+from shared.checks import duration
+from shared.scene import Scene
+
+TIMEOUT_S = 5.0
+"""Time that a handshake may take, in seconds."""
+WAIT_S_MIN = 0.001
+"""Shortest time to the next update, in seconds: timers are no finer."""
+WAIT_S_MAX = 1.0
+"""Longest time to the next update, in seconds: `Connection.look` has to be called about once per second."""
+
+
+class AsyncClient(BaseClient):
+    """A player on a server, for an event loop: the client predicts and sends by itself.
+
+    Create it with `AsyncClient.connect`. `async for event in client` returns its events and ends after `Left`. If more
+    than 10,000 events wait, the oldest are dropped, and `EventsDropped` counts them.
+
+    Args:
+        core: the client's state machine.
+        url: address of the server.
+        before_update: called with the core before each update while the client plays, so that it can set the input.
+        tls: certificates to trust for wss://; None: those that the system trusts.
+    """
+
+    def __init__(
+        self,
+        core: LinkedCore,
+        url: str,
+        before_update: Callable[[Core], None] | None = None,
+        tls: ssl.SSLContext | None = None,
+    ) -> None:
+        self._tls = tls
+        self._redialing: asyncio.Task[None] | None = None
+        super().__init__(core)
+        self._connection = Connection(url, core)
+        self._before_update = before_update
+        self._loop = asyncio.get_running_loop()
+        self._transport: asyncio.Transport | None = None
+        self._timer: asyncio.TimerHandle | None = None
+        self._due = 0.0
+        self._state = self.core.state
+        self._events = PendingEvents()
+        self._news = asyncio.Event()
+        self._answered: asyncio.Future[None] = self._loop.create_future()
+        self._gone: asyncio.Future[None] = self._loop.create_future()
+
+    @classmethod
+    async def connect(
+        cls,
+        url: str,
+        *,
+        name: str = "",
+        scene: Scene | None = None,
+        token: str = "",
+        patience_s: float = 30.0,
+        timeout: float = TIMEOUT_S,
+        tls: ssl.SSLContext | None = None,
+        link: str | Path | None = None,
+        before_update: Callable[[Core], None] | None = None,
+    ) -> "AsyncClient":
+        """Connects to a server. Returns as soon as the server has answered; the client then joins by itself.
+
+        Args:
+            url: address of the server, like ws://localhost:8765.
+            name: the player's name, shown to others, up to 32 characters.
+            scene: the scene that this program was built for. If the server plays another one, the client gets `Left`.
+                None: the client accepts the server's scene.
+            token: proves the client's identity, if the server asks for it.
+            patience_s: the client tries to reconnect for this long after a lost connection, in seconds; 0: it does not
+                reconnect.
+            timeout: the longest time to wait for the server's answer, in seconds.
+            tls: certificates to trust for wss://; None: those that the system trusts.
+            link: a simulated link: the name of a preset, or a `Path`; None: none.
+            before_update: called with the core before each update while the client plays, so that it can set the input.
+
+        Raises:
+            ValueError: an argument is not valid.
+            ConnectError: there is no connection; the text says why, and what to do.
+        """
+        COMPILER.begin()
+        core = LinkedCore(name, scene, token=token, patience_s=patience_s)
+        core.link = link
+        client = cls(core, url, before_update, checked_tls(tls))
+        connection = client._connection
+        try:
+            await client._dial(duration(timeout, "timeout"))
+        except BaseException as error:
+            client._drop()
+            if isinstance(error, ssl.SSLError):
+                raise insecure(connection, error) from error
+            if isinstance(error, OSError) and not isinstance(error, ConnectError):  # a TimeoutError is one
+                raise unreachable(connection, error) from error
+            raise
+        return client
+
+    def edit(self, x: int, y: int, z: int, kind: int) -> int:
+        """Places or removes one block with the next tick. The client predicts the change and shows it at once.
+
+        Args:
+            x: east, in blocks.
+            y: north, in blocks.
+            z: up, in blocks.
+            kind: the block to place, 1 to 255; 0 removes the block.
+
+        Returns:
+            The number of the edit. The event `Answered` with this number brings the result.
+
+        Raises:
+            RuntimeError: the client has not joined.
+            TypeError: an argument is not a whole number.
+            ValueError: an argument is out of range.
+        """
+        number = self.core.edit(x, y, z, kind)
+        self._pump(time.monotonic())
+        return number
+
+    def command(self, name: str, data: Any = None) -> int:
+        """Sends a request to the rules of the game, which define what `name` and `data` mean.
+
+        Args:
+            name: name of the command, up to 32 characters.
+            data: any value that MessagePack can hold, up to 1,024 bytes when packed.
+
+        Returns:
+            The number of the command. The event `Answered` with this number brings the result.
+
+        Raises:
+            RuntimeError: the client has not joined.
+            ValueError: the name or the data are too long, or MessagePack cannot hold the data.
+        """
+        number = self.core.command(name, data)
+        self._pump(time.monotonic())
+        return number
+
+    def view(self) -> View:
+        """Returns what to draw now; positions in blocks, velocities in blocks/s."""
+        return self.core.view(time.monotonic())
+
+    async def close(self, timeout: float = 1.0) -> None:
+        """Leaves the game, and waits at most `timeout` seconds until the server closes. A second call does nothing."""
+        self.core.close()
+        if self._redialing is not None:
+            self._redialing.cancel()
+        self._pump(time.monotonic())
+        if self._transport is not None:
+            await asyncio.wait((self._gone,), timeout=timeout)
+        self._drop()
+
+    def __aiter__(self) -> "AsyncClient":
+        return self
+
+    async def __anext__(self) -> Event:
+        while not self._events:
+            if self.core.state == "closed":
+                raise StopAsyncIteration
+            self._news.clear()
+            await self._news.wait()
+        return self._events.next()
+
+    async def __aenter__(self) -> "AsyncClient":
+        return self
+
+    async def __aexit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        await self.close()
+
+    # -- called by the stream and the timer ------------------------------------------------------------------
+
+    def _made(self, transport: asyncio.Transport) -> None:
+        self._transport = transport
+        transport.set_write_buffer_limits(UNSENT_MAX)
+        if self.core.appetite < READ_BYTES:  # with a slow simulated link, unread bytes wait at the server
+            transport.get_extra_info("socket").setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 0)
+        self._pump(time.monotonic())
+
+    def _received(self, data: bytes) -> None:
+        now = time.monotonic()
+        self._connection.receive(data, now)
+        self._read_on()
+        self._pump(now)
+        if self.core.next_update(now) < self._due - WAIT_S_MIN:
+            self._schedule(now)
+
+    def _read_on(self) -> None:
+        """Pauses reading while the core's `appetite` is 0, and resumes it afterwards."""
+        transport, hungry = self._transport, self.core.appetite > 0
+        if transport is None or hungry == transport.is_reading():
+            return
+        if hungry:
+            transport.resume_reading()
+        else:
+            transport.pause_reading()
+
+    async def _dial(self, timeout: float) -> None:
+        """Connects, and waits at most `timeout` seconds until the server has answered."""
+        connection, uri = self._connection, self._connection.uri
+        async with asyncio.timeout(timeout):
+            await self._loop.create_connection(
+                lambda: _Stream(self, connection), uri.host, uri.port, ssl=(self._tls or True) if uri.secure else None
+            )
+            await self._answered
+
+    async def _redial(self) -> None:
+        """Reconnects once. After a failure, the core decides when to try again."""
+        connection = self._connection = Connection(self._connection.url, self.core)
+        self._answered, self._gone = self._loop.create_future(), self._loop.create_future()
+        try:
+            await self._dial(TIMEOUT_S)
+        except OSError as error:  # includes ConnectError, SSLError and TimeoutError
+            if connection.refused is None:
+                connection.broke(f"no connection ({str(error) or 'no answer in time'})", time.monotonic())
+            self._drop()
+            self._pump(time.monotonic())
+            self._schedule(time.monotonic())
+
+    def _ended(self, error: Exception | None) -> None:
+        now = time.monotonic()
+        if error is None:
+            self._connection.receive_eof(now)
+        else:
+            self._connection.broke(f"the connection broke off ({error})", now)
+        self._transport = None
+        self._pump(now)
+        self._gone.set_result(None)
+        self._schedule(now)
+
+    def _stalled(self) -> None:
+        now = time.monotonic()
+        stalled(self._connection, now)
+        self._drop()
+        self._pump(now)
+
+    def _update(self) -> None:
+        now = time.monotonic()
+        core = self.core
+        try:
+            if self._before_update is not None and core.state == "playing":
+                self._before_update(core)
+        finally:  # asyncio reports an exception of `before_update`; the client goes on
+            self._advance(now)
+
+    def _advance(self, now: float) -> None:
+        core = self.core
+        if self._transport is not None:
+            self._connection.look(now)
+        core.update(now)
+        self._read_on()
+        if core.state == "away" and self._transport is None and now >= core.comeback.retry_at:
+            core.comeback.trying()
+            self._redialing = self._loop.create_task(self._redial())
+        self._pump(now)
+        self._schedule(now)
+
+    def _schedule(self, now: float) -> None:
+        """Sets the timer for the next update."""
+        if self._state != "closed":
+            self._due = now + min(max(self.core.next_update(now) - now, WAIT_S_MIN), WAIT_S_MAX)
+            self._set_timer(self._due - now, self._update)
+
+    def _pump(self, now: float) -> None:
+        """Writes what waits, passes events on, and acts on a change of state."""
+        connection, core = self._connection, self.core
+        data = connection.data_to_send(now)
+        if self._transport is not None and data:
+            self._transport.write(data)
+        for event in core.events():
+            self._events.append(event)
+            self._news.set()
+        if not self._answered.done():
+            if connection.refused is not None:
+                self._answered.set_exception(connection.refused)
+            elif connection.opened:
+                self._answered.set_result(None)
+                self._schedule(now)
+        if core.state != self._state:
+            self._state = core.state
+            if core.state == "closed":
+                self._set_timer(CLOSE_S, self._drop)
+        if connection.done(now):
+            self._drop()
+
+    def _set_timer(self, seconds: float, call: Callable[[], None]) -> None:
+        if self._timer is not None:
+            self._timer.cancel()
+        self._timer = self._loop.call_later(seconds, call)
+
+    def _drop(self) -> None:
+        if self._timer is not None:
+            self._timer.cancel()
+        if self._transport is not None:
+            self._transport.abort()
+            self._transport = None
+
+
+class _Stream(asyncio.Protocol):
+    """The asyncio protocol of one connection of a client. It ignores calls after the client has reconnected."""
+
+    def __init__(self, client: AsyncClient, connection: Connection) -> None:
+        self._client, self._connection = client, connection
+
+    @property
+    def _current(self) -> bool:
+        return self._client._connection is self._connection
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        self._client._made(cast("asyncio.Transport", transport))  # a transport of uvloop is not a subclass of it
+
+    def data_received(self, data: bytes) -> None:
+        if self._current:
+            self._client._received(data)
+
+    def connection_lost(self, error: Exception | None) -> None:
+        if self._current:
+            self._client._ended(error)
+
+    def pause_writing(self) -> None:
+        if self._current:
+            self._client._stalled()

@@ -1,0 +1,1 @@
+"""The predicted world, and its reconciliation with the server's."""

@@ -1,0 +1,283 @@
+"""Prediction and reconciliation: the confirmed and the predicted world of a client.
+
+Theory of operation. The *confirmed* world is the server's world as of the newest snapshot, as far as this client sees
+it (`client_sdk.prediction.confirmed`). The *predicted* world is the confirmed one plus a replay: the function that steps the
+server's world steps it with the own inputs, while other entities go on with their latest known inputs. The states of
+every predicted tick are kept. When the snapshot for tick T arrives, it is compared with the prediction for T, bit by
+bit for every entity:
+
+    equal       the prediction stays, and nothing is done. This also holds if only entities differ that are too far
+                away to be met before the next replay, and are not drawn as predicted; that replay corrects them.
+    different   predicted = confirmed, and the inputs for T+1 .. now are replayed
+
+Edits are predicted, too: they are applied at their tick by the rule that the server uses, and forgotten when the
+server's verdict arrives. So a replay undoes an edit that was refused.
+
+A difference in the own entity is a *correction*; one in other entities only is a *reprediction* (another player pressed
+a key, for example). Both are counted. There is no tolerance: the physics is exact, so a player who meets no others is
+never corrected as long as inputs arrive in time.
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from client_sdk.events import Corrected
+from client_sdk.prediction.confirmed import Confirmed
+from shared import edits
+from shared.bounds import bounds
+from shared.edits import Edit
+from shared.inputs import NEUTRAL, Input, row
+from shared.layout import COLUMNS, ID, Int64s, X
+from shared.ring import Ring
+from shared.units import BLOCK
+from shared.world import World
+
+MEET_BLOCKS = 12
+"""Distance in blocks beyond which another entity cannot be met before the next replay, at walking speeds."""
+
+NONDETERMINISM = "nondeterminism"
+"""Cause of a correction that must never occur: both sides knew the same and computed different results."""
+
+LOOK_BACK = 4
+"""Number of ticks to search back for a kept state before a drawn moment; skipped snapshots leave gaps."""
+
+Place = tuple[float, float, float]
+State = tuple[int, ...]
+
+
+@dataclass(frozen=True)
+class Reconciled:
+    """The result of comparing a snapshot with the prediction; `replayed` is the number of replayed ticks."""
+
+    correction: Corrected | None
+    repredicted: bool
+    replayed: int
+    offsets: dict[int, Place]
+    """Old minus new position of each predicted entity that the replay moved, in blocks."""
+    acted: frozenset[int]
+    """Entities on which the server's rules have acted: they are drawn at their new place at once."""
+    placed: frozenset[int] = frozenset()
+    """Entities that the server's rules have placed: the smoothing of earlier corrections ends, too."""
+
+
+NOTHING = Reconciled(None, False, 0, {}, frozenset())
+"""The result if nothing was replayed and no entity was placed."""
+
+
+class Prediction:
+    """The confirmed and the predicted world of one client.
+
+    Args:
+        known: the confirmed world, which snapshots write.
+        neighbours: whether the predicted world has other entities, so that blocking each other is predicted; otherwise
+            it has the own entity only.
+    """
+
+    def __init__(self, known: Confirmed, *, neighbours: bool = True) -> None:
+        self.known = known
+        self.entity = known.entity
+        self.neighbours = neighbours
+        self.ahead = 0
+        """Input delay in ticks: inputs are filed this far ahead of the predicted world."""
+        self.confirmed = known.world
+        self.predicted = World(known.world.scene, compiled=known.world.compiled)
+        self.attributes = known.attributes
+        """Attributes of the entities that the client sees, by entity and name."""
+        self.begun = False
+        limits = bounds(known.world.scene.tick_rate)
+        self._repeats = limits.repeats
+        self._inputs: Ring[Input] = Ring(limits.predicted)
+        self._states: Ring[Int64s] = Ring(limits.predicted)
+        templates = known.world.scene.templates
+        self._shown_ahead = np.array([template.shown == "predicted" for template in templates], np.int64)
+        self._edits: dict[int, tuple[int, Edit]] = {}  # edits without a verdict, with their ticks, by number
+        self._refused = False  # whether an edit that the last replay applied was refused since
+        self._compared = -1
+
+    def begin(self, tick: int) -> None:
+        """Starts the prediction at `tick`, or starts it again: replays the filed inputs from the confirmed world."""
+        self._replay(tick)
+        self.begun = True
+
+    def adopt(self, old: "Prediction") -> None:
+        """Takes over the inputs and the edits without a verdict from an earlier prediction of the same entity."""
+        self._inputs, self._edits = old._inputs, old._edits
+
+    def rows_since(self, tick: int, to: int) -> bytes:
+        """Returns the own inputs after `tick`, up to `to`, packed as `Inputs.rows`.
+
+        For a tick without an input, the row is the substitute that the server would use.
+        """
+        return b"".join(row(self._wish(at)) for at in range(tick + 1, to + 1))
+
+    def file(self, tick: int, wish: Input) -> None:
+        """Files the own input for a future tick."""
+        self._inputs.put(tick, wish)
+
+    def step(self) -> None:
+        """Predicts one tick."""
+        world = self.predicted
+        tick = world.tick + 1
+        for due, edit in self._edits.values():
+            # An earlier edit without a verdict is not in the confirmed world: the first tick of a replay applies it.
+            if due == tick or (due < tick and tick == self.confirmed.tick + 1):
+                edits.apply(world, self.entity, edit)
+        world.step({self.entity: self._wish(tick)} if self.entity in world else None)
+        self._states.put(tick, world.states())
+
+    def _wish(self, tick: int) -> Input:
+        """Returns the own input of a tick, or the substitute that the server uses if none was sent."""
+        for before in range(tick, tick - self._repeats - 1, -1):
+            wish = self._inputs.get(before)
+            if wish is not None:
+                return wish
+        return NEUTRAL
+
+    @property
+    def next_order(self) -> int:
+        """The next tick that has no input yet, at which a command or edit of now is carried out."""
+        return self.predicted.tick + self.ahead + 1
+
+    def edit(self, number: int, edit: Edit) -> int:
+        """Files an edit for the next tick that has no input yet. Returns that tick."""
+        self._edits[number] = (self.next_order, edit)
+        return self.next_order
+
+    def settle(self, number: int, done: bool) -> None:
+        """Takes the server's verdict on an edit; one that was not `done` is undone by the next replay."""
+        if self._edits.pop(number, None) is not None and not done:
+            self._refused = True
+
+    def reconcile(self, late: bool) -> Reconciled:
+        """Compares the newest confirmed tick with the prediction for it, and replays if they differ.
+
+        Args:
+            late: whether the server lacked an input in time for a tick since the last comparison.
+        """
+        known, tick = self.known, self.confirmed.tick
+        if tick == self._compared:
+            return NOTHING
+        skipped = tick - self._compared > 1
+        acted = known.take_acted()
+        placed = self._placed(self._compared, tick)
+        self._compared = tick
+        if not self.begun:
+            return NOTHING
+        if tick > self.predicted.tick:  # the snapshot overtook the prediction: nothing to compare
+            self._replay(tick)
+            return Reconciled(None, False, 0, {}, acted, placed) if placed else NOTHING
+        guess, truth = self._states.get(tick), self._truth()
+        changed = known.terrain_changed or self._refused
+        if guess is not None and not changed and self._near_equal(guess, truth):
+            return NOTHING
+        correction = None
+        if guess is not None and (mine := self._difference(guess, truth)):
+            others = len(self.confirmed) > 1
+            causes = (
+                (late, "late input"),
+                (self.entity in acted, "server act"),
+                (known.edited_near, "unknown edit"),
+                (others and (skipped or not self.neighbours), "other entity"),
+                (others and self._others_differ(guess, truth), "other entity"),
+                (not known.grounded(), "missing terrain"),
+            )
+            cause = next((cause for holds, cause in causes if holds), NONDETERMINISM)
+            correction = Corrected(tick, *mine, self.predicted.tick - tick, cause)
+        before, now = self.predicted.states(), self.predicted.tick
+        self._replay(now)
+        offsets = _offsets(before, self.predicted.states())
+        return Reconciled(correction, correction is None, now - tick, offsets, acted, placed)
+
+    def around(self, entity: int, at: float) -> tuple[State, State, float]:
+        """Returns the states to draw an entity between, at a moment up to the newest predicted tick.
+
+        Args:
+            entity: number of the entity.
+            at: the moment, in ticks.
+
+        Returns:
+            The states before and after the moment, and the share of the way between them, 0 to 1. Both states are one
+            and the same if the entity is drawn standing: before the tick in which the rules placed it, or if no
+            earlier state is kept.
+
+        Raises:
+            KeyError: the entity is not predicted.
+        """
+        newest = self.predicted.tick
+        tick = min(math.floor(at), newest - 1)
+        last, after = newest, self.predicted.state(entity)
+        for later in range(max(tick + 1, newest - self._states.size), newest):
+            if (state := self._state(entity, later)) is not None:
+                last, after = later, state
+                break
+        for first in range(tick, tick - LOOK_BACK, -1):
+            if (before := self._state(entity, first)) is not None:
+                if entity in self._placed(first, last):
+                    return before, before, 0.0
+                return before, after, min(max((at - first) / (last - first), 0.0), 1.0)
+        return after, after, 0.0
+
+    def _placed(self, since: int, to: int) -> frozenset[int]:
+        """Returns the entities that the server's rules placed after the tick `since`, up to `to`."""
+        ticks = range(max(since, to - self.known.follow_max) + 1, to + 1)
+        return frozenset().union(*(ids for tick in ticks if (ids := self.known.placed.get(tick))))
+
+    def _state(self, entity: int, tick: int) -> State | None:
+        """Returns the kept state of an entity at the end of a tick; None if none is kept."""
+        states = self._states.get(tick)
+        if states is None:
+            return None
+        mine = states[states[:, ID] == entity]
+        return tuple(mine[0].tolist()) if len(mine) else None
+
+    def rehearse(self) -> None:
+        """Runs the sync test: replays everything since the confirmed world. Changes nothing unless state is hidden."""
+        self._replay(self.predicted.tick)
+
+    def _truth(self) -> Int64s:
+        states = self.known.states
+        return states if self.neighbours else states[states[:, ID] == self.entity]
+
+    def _replay(self, to: int) -> None:
+        self.predicted.restore(self.confirmed)
+        self.known.terrain_changed = self.known.edited_near = self._refused = False
+        if not self.neighbours:
+            for entity in self.predicted.states()[:, ID].tolist():
+                if entity != self.entity:
+                    self.predicted.remove(entity)
+        self._states.put(self.confirmed.tick, self._truth())
+        while self.predicted.tick < to:
+            self.step()
+
+    def _near_equal(self, guess: Int64s, truth: Int64s) -> bool:
+        """Returns whether all entities are as predicted that could meet the own one, or are drawn as predicted."""
+        if guess.tobytes() == truth.tobytes():
+            return True
+        kernel, reach = self.confirmed.kernel, MEET_BLOCKS * BLOCK
+        a, b, always = map(kernel.lent, (guess, truth, self._shown_ahead))
+        return bool(kernel.alike(a, len(guess), b, len(truth), self.entity, reach, always))
+
+    def _difference(self, guess: Int64s, truth: Int64s) -> tuple[tuple[str, ...], float] | None:
+        """Returns the fields and the distance (blocks) by which the own entity differs; None if it does not."""
+        was, mine = guess[guess[:, ID] == self.entity], truth[truth[:, ID] == self.entity]
+        if not len(mine) or not len(was) or np.array_equal(mine, was):
+            return None
+        way = (mine[0, X : X + 3] - was[0, X : X + 3]) / BLOCK
+        return tuple(COLUMNS[k] for k in np.flatnonzero(mine[0] != was[0])), float(np.sqrt((way * way).sum()))
+
+    def _others_differ(self, guess: Int64s, truth: Int64s) -> bool:
+        return not np.array_equal(guess[guess[:, ID] != self.entity], truth[truth[:, ID] != self.entity])
+
+
+def _offsets(before: Int64s, after: Int64s) -> dict[int, Place]:
+    """Returns old minus new position of each entity that is in both and has moved, in blocks."""
+    was = dict(zip(before[:, ID].tolist(), before[:, X : X + 3].tolist(), strict=True))
+    offsets: dict[int, Place] = {}
+    for entity, place in zip(after[:, ID].tolist(), after[:, X : X + 3].tolist(), strict=True):
+        old = was.get(entity, place)
+        if old != place:
+            x, y, z = ((a - b) / BLOCK for a, b in zip(old, place, strict=True))
+            offsets[entity] = (x, y, z)
+    return offsets

@@ -1,0 +1,131 @@
+"""The view: the own entity as predicted, all others a little in the past, corrections smoothed.
+
+Other entities are drawn as predicted, too, if their template is shown so (`shown = "predicted"` in the scene).
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+
+from client_sdk.interpolation import Interpolation
+from client_sdk.interpolation.smoothing import Smoothing
+from client_sdk.prediction.prediction import Prediction, Reconciled
+from client_sdk.timing.clock import ServerClock, Timeline
+from shared.checks import Vec
+from shared.layout import ID, TEMPLATE, VX, X
+from shared.scene import Scene
+from shared.units import BLOCK, SPEED
+
+
+@dataclass(frozen=True)
+class Figure:
+    """One entity to draw: its number, position in blocks, velocity in blocks/s, and the name of its template.
+
+    `attributes` are the named values that the rules of the game gave to the entity, for example "name".
+    """
+
+    entity: int
+    template: str
+    position: Vec
+    velocity: Vec
+    attributes: Mapping[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class View:
+    """Everything to draw at one moment.
+
+    `me` is the own entity at `tick`; None before there is one. `others` are all other entities, ascending by number.
+    `seen` is the view tick: the server time at which the others are drawn, in ticks. Commands carry it, so that the
+    server can judge a shot by what the player saw (`game.rewound`).
+    """
+
+    tick: float
+    me: Figure | None
+    others: list[Figure]
+    seen: float = 0.0
+
+    @property
+    def figures(self) -> list[Figure]:
+        """All entities of the view, the own one last."""
+        return self.others if self.me is None else [*self.others, self.me]
+
+
+NOTHING = View(0.0, None, [])
+"""The view before the client has joined."""
+NONE_SAID: Mapping[str, Any] = MappingProxyType({})
+"""Attributes of an entity that has none."""
+
+
+class Picture:
+    """Makes views from predicted, interpolated and smoothed positions."""
+
+    def __init__(self, scene: Scene, prediction: Prediction) -> None:
+        self.interpolation = Interpolation(scene.tick_rate)
+        self._prediction = prediction
+        self._templates = [template.name for template in scene.templates]
+        self._predicted = {i for i, template in enumerate(scene.templates) if template.shown == "predicted"}
+        self._smoothing: dict[int, Smoothing] = {}
+        self._delay = 0.0  # the input delay of the latest view, in ticks
+        self._viewed = -math.inf  # the timeline's tick of the latest view
+
+    def advance(self, server_tick: float, now: float) -> float:
+        """Adapts the interpolation delay of the others. Returns the tick at which they are drawn."""
+        self.interpolation.advance(server_tick, now)
+        return self.interpolation.shown(server_tick)
+
+    def smooth(self, done: Reconciled, now: float) -> None:
+        """Starts to fade out the jumps that a replay made. Entities that the rules acted on jump at once."""
+        for entity in done.placed:
+            self._smoothing.pop(entity, None)
+        if not done.replayed:
+            return
+        if self._smoothing:
+            known = self._prediction.predicted
+            self._smoothing = {entity: old for entity, old in self._smoothing.items() if entity in known}
+        for entity, offset in done.offsets.items():
+            if entity not in done.acted:
+                self._smoothing.setdefault(entity, Smoothing()).add(offset, now)
+
+    def view(self, timeline: Timeline, clock: ServerClock, now: float) -> View:
+        """Returns the view at `now`."""
+        prediction = self._prediction
+        tick, server_tick = timeline.tick(now), clock.tick(now)
+        # The drawn delay grows no faster than time passes: after a longer input delay is set, the own entity stands
+        # for as many ticks, and is never drawn further back than before.
+        self._delay = min(prediction.ahead, self._delay + max(tick - self._viewed, 0.0))
+        self._viewed = tick
+        states, places = self.interpolation.sample(server_tick)
+        others = []
+        for state, place in zip(states.tolist(), places.tolist(), strict=True):
+            entity = state[ID]
+            if entity == prediction.entity:
+                continue
+            ahead = self._ahead(entity, tick, now) if state[TEMPLATE] in self._predicted else None
+            others.append(ahead or self._figure(state, place))
+        return View(tick, self._ahead(prediction.entity, tick, now), others, self.interpolation.shown(server_tick))
+
+    def _ahead(self, entity: int, tick: float, now: float) -> Figure | None:
+        """Returns a predicted entity to draw, one tick before `tick` and with smoothing; None if it is not predicted.
+
+        One tick back, the position lies between two predicted states.
+        """
+        prediction = self._prediction
+        if entity not in prediction.predicted:
+            return None
+        before, after, share = prediction.around(entity, tick - self._delay - 1)
+        old, new = np.array(before[X : X + 3]) / BLOCK, np.array(after[X : X + 3]) / BLOCK
+        smoothing = self._smoothing.get(entity)
+        place = old + (new - old) * share + (smoothing.offset(now) if smoothing else 0.0)
+        return self._figure(after, place.tolist())
+
+    def _figure(self, state: Sequence[int], place: list[float]) -> Figure:
+        """Returns the entity view of a state, drawn at `place` (in blocks)."""
+        x, y, z = place
+        vx, vy, vz = (part / SPEED for part in state[VX : VX + 3])
+        said = self._prediction.attributes.get(state[ID], NONE_SAID)
+        return Figure(state[ID], self._templates[state[TEMPLATE]], (x, y, z), (vx, vy, vz), said)

@@ -1,0 +1,1 @@
+"""Identity of clients: tokens and other authenticators."""

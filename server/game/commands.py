@@ -1,0 +1,104 @@
+"""Commands of players: filed as they come, carried out in their tick, answered when no crash can undo it any more."""
+
+from collections import deque
+from collections.abc import Iterator
+from typing import Any
+
+from server.config.limits import Limits
+from server.game_api.api import Stage
+from server.journal.recorded_world import RecordedWorld, Saves
+from server.observability.errors import Faults
+from server.players import persisted_state
+from server.players.player import Player
+from shared import edits, messages
+from shared.bounds import bounds
+from shared.messages import Command
+
+
+class Orders:
+    """All commands of one game.
+
+    Args:
+        saves: where the world is saved, if it is.
+    """
+
+    def __init__(
+        self, world: RecordedWorld, stage: Stage, limits: Limits, faults: Faults, saves: Saves | None = None
+    ) -> None:
+        self._world, self._stage, self._limits, self._faults, self._saves = world, stage, limits, faults, saves
+        self._ahead = bounds(world.scene.tick_rate).ahead
+        self._unanswered: deque[tuple[int, Player, int, int]] = deque()
+        """Verdicts that are not on disk yet: tick, player, number, verdict."""
+
+    @property
+    def trouble(self) -> bool:
+        """Whether nothing can be saved just now."""
+        return self._saves is not None and bool(self._saves.trouble)
+
+    @property
+    def durable_tick(self) -> int:
+        """The newest tick that no crash can undo any more."""
+        return self._world.tick if self._saves is None else self._saves.durable_tick
+
+    def file(self, player: Player, command: Command) -> None:
+        """A command has come; one that is known already is answered again, if it has been answered."""
+        if command.number <= player.command:
+            if command.number in player.settled:  # asked again after a lost connection
+                player.verdicts.append((command.number, player.settled[command.number]))
+            return
+        player.command = command.number
+        if len(player.commands) >= self._limits.commands_waiting_max or command.tick > self._world.tick + self._ahead:
+            player.settle(command.number, messages.TOO_MANY)
+        else:
+            player.commands.append(command)
+
+    def carry_out(self) -> None:
+        """What players do at the start of this tick, in the order in which they joined."""
+        tick = self._world.tick + 1
+        rate = self._limits.edits_per_s
+        for player in tuple(self._stage.players.values()):
+            if player.edits_left != 2 * rate:
+                player.edits_left = min(player.edits_left + rate / self._world.scene.tick_rate, 2 * rate)
+            while player.commands and player.commands[0].tick <= tick:
+                if player.session is not None and player.session.closed:
+                    break
+                command = player.commands.popleft()
+                if self.trouble:
+                    player.settle(command.number, messages.UNSAVED)
+                    continue
+                try:
+                    verdict = self._verdict(player, command)
+                except Exception:
+                    self._faults.report("a command")
+                    verdict = messages.FAILED
+                self._unanswered.append((tick, player, command.number, verdict))
+                self._world.note([persisted_state.ANSWERED, player.entity, command.number, verdict])
+
+    def answer(self) -> None:
+        """Tells the verdicts that will last."""
+        durable = self.durable_tick
+        while self._unanswered and self._unanswered[0][0] <= durable:
+            _, player, number, verdict = self._unanswered.popleft()
+            player.settle(number, verdict)
+
+    def notes(self) -> Iterator[list[Any]]:
+        """The verdicts that wait, as notes."""
+        for _, player, number, verdict in self._unanswered:
+            if player.entity in self._stage.players:
+                yield [persisted_state.ANSWERED, player.entity, number, verdict]
+
+    def _verdict(self, player: Player, command: Command) -> int:
+        if command.name != edits.NAME:
+            return self._stage.command(player, command)
+        edit = edits.unpack(command.payload)
+        if edit is None:
+            return messages.INVALID
+        if player.edits_left < 1:
+            return messages.TOO_MANY
+        player.edits_left -= 1
+        if not self._stage.may_edit(player, edit):
+            return messages.FORBIDDEN
+        verdict = edits.apply(self._world, player.entity, edit)
+        if verdict == messages.DONE:
+            self._stage.log.note_edit(*edit[:3])
+        return verdict

@@ -1,0 +1,1 @@
+"""What the rules of a game call: `self.game`."""

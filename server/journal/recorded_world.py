@@ -1,0 +1,306 @@
+"""A world that tells what happens to it: to recordings (`server.journal` draws their format) and to a store."""
+
+import math
+import struct
+import zlib
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
+from typing import Any, Protocol
+
+import msgpack
+import numpy as np
+import numpy.typing as npt
+
+from server.journal.records import (
+    FILL,
+    HASH_TICKS,
+    LOAD,
+    MAGIC,
+    NOTE,
+    PUT,
+    REBASE,
+    REMOVE,
+    UNLOAD,
+    VERSION,
+    WRITE,
+    Call,
+    JournalError,
+    mark,
+)
+from shared import terrain
+from shared.blocks import Kinds, pack, segment_of
+from shared.checks import Cell, SceneError
+from shared.inputs import Input
+from shared.layout import FALLING, FLAGS, ID, Int64s
+from shared.states import STATES
+from shared.world import OverlapError, World
+
+FRESHENED_PER_TICK = 1
+"""Digests of changed segments that are computed after each step, so that no later tick has to compute many at once."""
+
+
+class Sink(Protocol):
+    """Where a recording goes: a binary file."""
+
+    def write(self, data: bytes, /) -> object:
+        """Takes all of `data`."""
+
+    def flush(self) -> object:
+        """Hands what was written to the system."""
+
+
+class Saves(Protocol):
+    """What a game needs to know of where its world is saved (`server.persistence.store`)."""
+
+    kept: Any
+    """What the game's `keep()` returned for the checkpoint that was loaded; None for a new world."""
+    trouble: str
+    """Why nothing can be saved just now; empty if all is well. Commands are refused while it lasts."""
+
+    @property
+    def notes(self) -> Sequence[tuple[int, Any]]:
+        """What was noted since then, in order, each with the tick that came next."""
+        ...
+
+    @property
+    def durable_tick(self) -> int:
+        """Verdicts on what was done in this tick and before may be told."""
+        ...
+
+
+class Pen:
+    """Takes down what happens to a world: the calls since the last tick, and the inputs that differ from those held.
+
+    Args:
+        first: what was written ahead of the first tick may be among its changes without a call, so it has no mark.
+        hashed_max: no hash of a world with more entities (it takes the step 2 ms with 10,000); every tick has its mark.
+        stale_max: nor of one in which more segments wait for their digests (40 us each).
+    """
+
+    def __init__(self, *, first: bool = True, hashed_max: float = math.inf, stale_max: float = math.inf) -> None:
+        self.calls: list[Call] = []
+        self._held: dict[int, Input] = {}
+        self._first = first
+        self._hashed_max, self._stale_max = hashed_max, stale_max
+
+    def forget(self, entities: list[int]) -> None:
+        """The inputs of these entities are not known any more."""
+        for entity in entities:
+            self._held.pop(entity, None)
+
+    def touch(self, segment: Cell) -> None:
+        """The blocks of a segment may be about to change."""
+
+    def tick(self, world: World, inputs: Mapping[int, Input]) -> None:
+        """The world has been stepped with `inputs`."""
+        raise NotImplementedError
+
+    def taken(self, world: World, inputs: Mapping[int, Input]) -> list[Any]:
+        """The record of a tick: `[inputs, calls, mark]`, and the hash where one is due."""
+        calls, self.calls = self.calls, []
+        held = self._held
+        news: list[int] = []
+        for entity, wish in inputs.items():
+            if held.get(entity) != wish:
+                held[entity] = wish
+                news += map(int, (entity, *wish))
+        first, self._first = self._first, False
+        parts: list[Any] = [news, calls, None if first else mark(world)]
+        due = world.tick % HASH_TICKS == 0 and len(world) <= self._hashed_max
+        if first or (due and world.blocks.stale <= self._stale_max):
+            parts.append(world.state_hash())
+        return parts
+
+
+class RecordedWorld(World):
+    """A world with pens on it. While there are none, a call costs one comparison more."""
+
+    _pens: tuple[Pen, ...] = ()
+    _inside = 0
+
+    def attach(self, pen: Pen) -> None:
+        """Has a pen take down everything from now on."""
+        self._pens = (*self._pens, pen)
+
+    def detach(self, pen: Pen) -> None:
+        """Does nothing if the pen is not on it."""
+        self._pens = tuple(each for each in self._pens if each is not pen)
+
+    def record(self, file: Sink, failed: Callable[[OSError], None] | None = None) -> None:
+        """Records from now on, into a file opened for writing bytes.
+
+        Args:
+            file: gets the start state at once, and one record per tick.
+            failed: called with the error when the file can take no more; recording ends, the world goes on.
+
+        Raises:
+            JournalError: it is being recorded already.
+        """
+        if any(isinstance(pen, _FilePen) for pen in self._pens):
+            raise JournalError("this world is being recorded already")
+        pen = _FilePen(file, self, failed or _reraise)
+        self.attach(pen)
+        pen.begin()
+
+    def end_recording(self) -> None:
+        """Writes the last hash; the file can be closed. Does nothing if there is no recording."""
+        for pen in self._pens:
+            if isinstance(pen, _FilePen):
+                pen.end()
+                self.detach(pen)
+
+    def note(self, value: Any) -> None:
+        """Takes down something that is not in the world, in order among the calls ahead of the coming tick.
+
+        Args:
+            value: whatever MessagePack can hold; it is packed at once.
+
+        Raises:
+            TypeError, ValueError, OverflowError: it cannot hold that.
+        """
+        if self._pens:
+            self._call([NOTE, msgpack.packb(value)])
+
+    # -- what changes a world --------------------------------------------------------------------------------
+
+    def _put(self, states: Iterable[tuple[int, ...]] | Int64s) -> None:
+        if self._pens and not self._inside:
+            states = states if isinstance(states, np.ndarray) else list(states)
+            rows = np.array(states, np.int64).reshape(-1, STATES)
+            self._forget(rows[:, ID].tolist())
+            self._call([PUT, *rows.ravel().tolist()])
+        super()._put(states)
+
+    def spawn_many(self, template: str, positions: npt.ArrayLike) -> range:
+        self._inside += 1  # if it fails, it removes what it has put, and nothing has happened
+        try:
+            ids = super().spawn_many(template, positions)
+        finally:
+            self._inside -= 1
+        if self._pens and ids:
+            states = self.rows(ids)[:, :STATES]
+            states[:, FLAGS] &= FALLING
+            self._call([PUT, *states.ravel().tolist()])
+        return ids
+
+    def _remove(self, entity: int) -> None:
+        super()._remove(entity)
+        if self._pens and not self._inside:
+            self._forget([entity])
+            self._call([REMOVE, entity])
+
+    def _fill(self, low: Cell, high: Cell, kind: int, push: bool) -> int:
+        if not self._pens:
+            return super()._fill(low, high, kind, push)
+        (x0, y0, z0), (x1, y1, z1) = segment_of(*low), segment_of(*(part - 1 for part in high))
+        for segment in ((x, y, z) for z in range(z0, z1 + 1) for y in range(y0, y1 + 1) for x in range(x0, x1 + 1)):
+            self._touch(segment)
+        call = [FILL, *low, *high, kind, push]
+        self._inside += 1  # what it pushes is not a call of its own
+        try:
+            changed = super()._fill(low, high, kind, push)
+        except OverlapError:
+            self._call(call)
+            raise
+        finally:
+            self._inside -= 1
+        self._call(call)
+        return changed
+
+    def _load(self, index: Cell, kinds: Kinds) -> None:
+        self._touch(index)
+        super()._load(index, kinds)
+        if self._pens:
+            self._call([LOAD, *index, packed(self, index)])
+
+    def _unload(self, index: Cell) -> None:
+        self._touch(index)
+        super()._unload(index)
+        if self._pens:
+            self._call([UNLOAD, *index])
+
+    def _write_blocks(self, segment: Cell, offsets: list[int], kinds: list[int]) -> None:
+        self._touch(segment)
+        super()._write_blocks(segment, offsets, kinds)
+        if self._pens:
+            self._call([WRITE, *segment, offsets, kinds])
+
+    def _rebase(self, tick: int) -> None:
+        super()._rebase(tick)
+        if self._pens:
+            self._call([REBASE, tick])
+
+    def restore(self, other: World) -> None:
+        if self._pens:
+            raise JournalError("a world that is being recorded cannot become another: end the recording first")
+        super().restore(other)
+
+    def step(self, inputs: Mapping[int, Input] | None = None) -> None:
+        super().step(inputs)
+        self.blocks.freshen(FRESHENED_PER_TICK)
+        for pen in self._pens:
+            pen.tick(self, inputs or {})
+
+    # -- inside ----------------------------------------------------------------------------------------------
+
+    def _call(self, call: Call) -> None:
+        for pen in self._pens:
+            pen.calls.append(call)
+
+    def _forget(self, entities: list[int]) -> None:
+        for pen in self._pens:
+            pen.forget(entities)
+
+    def _touch(self, segment: Cell) -> None:
+        for pen in self._pens:
+            pen.touch(segment)
+
+
+class _FilePen(Pen):
+    """Writes a recording."""
+
+    def __init__(self, file: Sink, world: RecordedWorld, failed: Callable[[OSError], None]) -> None:
+        super().__init__()
+        self._file, self._world, self._failed = file, world, failed
+        self._chain = 0
+
+    def begin(self) -> None:
+        """Writes the world as it is now."""
+        world = self._world
+        segments = [[*index, packed(world, index)] for index in sorted(world.blocks)]
+        states = world.states().astype("<i8").tobytes()
+        head = MAGIC + struct.pack("<H", VERSION)
+        self._chain = zlib.crc32(head)
+        self._record([world.scene.to_table(), world.tick, world.next_id, states, segments], head)
+
+    def tick(self, world: World, inputs: Mapping[int, Input]) -> None:
+        self._record(self.taken(world, inputs))
+
+    def end(self) -> None:
+        """Writes the end."""
+        self._record([None, self.calls, None, self._world.state_hash()])
+
+    def _record(self, parts: list[Any], head: bytes = b"") -> None:
+        payload = msgpack.packb(parts)
+        length = struct.pack("<I", len(payload))
+        check = zlib.crc32(payload, self._chain)
+        try:
+            self._file.write(head + length + struct.pack("<II", zlib.crc32(length, self._chain), check) + payload)
+            self._file.flush()
+        except OSError as error:
+            self._world.detach(self)
+            self._failed(error)
+        self._chain = check
+
+
+def packed(world: World, index: Cell) -> bytes | None:
+    """A loaded segment for the file; None if it is as the generator left it."""
+    kinds = world.blocks.segment(index)
+    with suppress(SceneError):
+        if np.array_equal(terrain.generate(world.scene.terrain, index), kinds.reshape(-1)):
+            return None
+    return pack(kinds)
+
+
+def _reraise(error: OSError) -> None:
+    raise error

@@ -1,0 +1,1 @@
+"""Sockets: the WebSocket server and its admission control."""

@@ -1,0 +1,1 @@
+"""Counters, metrics, caught errors, HTTP pages and the live page."""

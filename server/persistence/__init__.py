@@ -1,0 +1,1 @@
+"""Saved worlds: the database, its checkpoints, and the start from them."""

@@ -1,0 +1,135 @@
+"""The way back: from a directory to the world that was saved in it."""
+
+import logging
+import sys
+from pathlib import Path
+from typing import Any, BinaryIO, NamedTuple
+
+import msgpack
+
+from server.journal.recorded_world import RecordedWorld
+from server.journal.records import NOTE, DivergedError, redo
+from server.persistence import checkpoint, database
+from server.persistence.checkpoint import Known
+from server.persistence.database import Database, Saved, StoreError
+from shared.checks import Cell
+from shared.scene import Scene
+
+logger = logging.getLogger(__name__)
+
+
+class Note(NamedTuple):
+    """What `RecordedWorld.note` was told ahead of tick `tick`."""
+
+    tick: int
+    value: Any
+
+
+class Loaded(NamedTuple):
+    """What was found, or made."""
+
+    world: RecordedWorld
+    kept: Any
+    """What belongs to the checkpoint and is not in the world; None for a new one."""
+    notes: list[Note]
+    """Those since the checkpoint, in order."""
+    checkpoint_tick: int
+    chain: int
+    log_bytes: int
+    saved: dict[Cell, Known | None]
+    """The segments of the checkpoint."""
+
+
+def load(path: Path, scene: Scene, game: str = "", *, compiled: bool | None = None) -> Loaded:
+    """The world that was saved, checkpoint and log, each tick compared; or a new one, which is saved at once.
+
+    Raises:
+        StoreError: what is there cannot be used; it has been left as it is.
+        sqlite3.Error: it cannot be written.
+    """
+    version = database.version_of(path)
+    if 0 < version < len(database.MIGRATIONS):
+        Database(path).close()
+        logger.info("%s: brought from schema version %d to %d", path, version, len(database.MIGRATIONS))
+    saved = database.read(path) if version else None
+    if saved is None:
+        return _new(path, scene, game, compiled)
+    if saved.game is not None and saved.game != game:
+        raise StoreError(
+            f"{path}: was saved by {_served(saved.game)}, and this is {_served(game)}. Serve the same, or give another "
+            "directory"
+        )
+    try:
+        theirs = Scene.from_table(msgpack.unpackb(saved.scene, strict_map_key=False)).digests
+        differ = sorted(name for name in theirs | scene.digests if theirs.get(name) != scene.digests.get(name))
+        if differ:
+            raise StoreError(
+                f"{path}: was saved under other rules (another {', '.join(differ)}). Start with the scene that it was "
+                "saved with, or give another directory"
+            )
+        return _replayed(scene, saved, compiled)
+    except StoreError:
+        raise
+    except DivergedError as error:
+        raise StoreError(
+            f"{path}: replayed otherwise than it was played ({error}). Start it with the version of this program that "
+            "wrote it and stop it once: then there is nothing to replay"
+        ) from error
+    except (LookupError, TypeError, ValueError, OverflowError) as error:
+        raise database.damaged(path, error) from error
+
+
+def _served(game: str) -> str:
+    return f"a server of the game {game}" if game else "a server without a game"
+
+
+def _new(path: Path, scene: Scene, game: str, compiled: bool | None) -> Loaded:
+    world, first = checkpoint.generated(scene, compiled=compiled)
+    file = Database(path)
+    try:
+        file.save(first, msgpack.packb(scene.to_table()), 0, game)
+    finally:
+        file.close()
+    return Loaded(world, None, [], world.tick, 0, 0, checkpoint.saved_of(world))
+
+
+def _replayed(scene: Scene, saved: Saved, compiled: bool | None) -> Loaded:
+    world = checkpoint.restored(scene, saved.checkpoint, compiled=compiled)
+    known = checkpoint.saved_of(world)  # ahead of the log: what it touches belongs into the next checkpoint
+    notes: list[Note] = []
+    chain = saved.chain
+    for tick, record, chain in saved.log:  # noqa: B007 - the last one is what goes on
+        moment = redo(world, msgpack.unpackb(record))
+        if world.tick != tick:
+            raise ValueError(f"tick {world.tick} is in the log as tick {tick}")
+        packed = (call[1] for call in moment.calls if call[0] == NOTE)
+        notes += [Note(tick, msgpack.unpackb(value, strict_map_key=False)) for value in packed]
+    kept = msgpack.unpackb(saved.checkpoint.kept, strict_map_key=False)
+    size = sum(len(record.record) for record in saved.log)
+    return Loaded(world, kept, notes, saved.checkpoint.tick, chain, size, known)
+
+
+def claimed(directory: Path) -> BinaryIO:
+    """A directory for this process alone, until the file that is returned is closed or the process ends, however.
+
+    Raises:
+        StoreError: another process has it, or it cannot be used.
+    """
+    try:
+        directory.mkdir(parents=True, exist_ok=True)
+        file = (directory / "lock").open("ab")
+    except OSError as error:
+        raise StoreError(f"{directory}: cannot be used ({error.strerror or error})") from error
+    try:
+        if sys.platform == "win32":
+            import msvcrt
+
+            msvcrt.locking(file.fileno(), msvcrt.LK_NBLCK, 1)
+        else:
+            import fcntl
+
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError as error:
+        file.close()
+        raise StoreError(f"{directory}: another server is using it") from error
+    return file

@@ -1,0 +1,1 @@
+"""One player: its inputs, and what outlives a connection."""

@@ -1,0 +1,1 @@
+"""What each client is sent of the world, and when."""

@@ -1,0 +1,167 @@
+"""What each client is sent: the newest snapshot if its path has room, and terrain behind it.
+
+Theory of operation. Once a tick each session is served, or not: if more is on the way to it than `pacing` allows, it
+is left out, and gets the union of what it missed with its next snapshot. What goes into that is `sight`'s choice; the
+bytes of a segment's changes are `replication`'s, made once for all. A segment's blocks follow in pieces, behind the
+snapshot, as far as there is room: terrain never makes a snapshot late. What the rules tell goes behind the snapshot
+that has what it speaks of (`outbox`).
+"""
+
+from collections import deque
+from collections.abc import Collection, Iterable
+
+import numpy as np
+
+from server.config.limits import Limits
+from server.observability.counters import Counters
+from server.players.player import Player
+from server.replication import interest
+from server.replication.change_log import ChangeLog
+from server.replication.client_stream import ClientStream
+from shared import messages
+from shared.checks import Cell
+from shared.messages import Terrain, encode
+from shared.snapshot import VERDICT
+from shared.world import World
+
+GAPS_S = 2.0
+"""Gaps between a client's snapshots are kept for this time, in seconds: longer than lag compensation reaches back."""
+EVENT_BYTES = 128
+"""About so many bytes of events may go with each snapshot, however much terrain waits."""
+SNAPSHOT_BYTES = messages.MESSAGE_MAX // 2
+"""What more there is waits for the next snapshot, however wide the path; the own segment and one more never do."""
+
+
+class Delivery:
+    """Sends to sessions what there is for them."""
+
+    def __init__(self, world: World, log: ChangeLog, limits: Limits, counters: Counters) -> None:
+        self._world, self._log, self._limits, self._counters = world, log, limits, counters
+        self._tick_s = 1 / world.scene.tick_rate
+        self._around: dict[Cell, tuple[Cell, ...]] = {}
+        """What was seen from a segment by the latest who came into it."""
+
+    def serve(self, stream: ClientStream, player: Player, now: float) -> None:
+        """Sends a session the tick that has been recorded, if its path has room."""
+        pacing, near, centre = stream.pacing, stream.sight.near, self._log.segment(player.entity)
+        if not near or near[0] != centre:
+            self._look_around(stream, centre)
+        window = pacing.window(stream.snapshot_bytes, self._tick_s, now)
+        plain = window
+        if stream.acked < 0:
+            window = max(window, self._limits.first_bytes)
+        if (outstanding := pacing.outstanding) > window:
+            self._counters.snapshots_skipped += 1
+            return
+        stream.sent_at = now
+        self._send_snapshot(stream, player, min(pacing.room(window), SNAPSHOT_BYTES))
+        self._send_told(stream, player, plain)
+        if outstanding == 0 and stream.probe is None:
+            stream.probe = (self._world.tick, now, stream.snapshot_bytes)
+        if stream.terrain_now or stream.terrain_due:
+            pacing.look()
+            self._send_terrain(stream, window - pacing.outstanding)
+
+    def acked(self, stream: ClientStream, tick: int, now: float) -> None:
+        """The client has applied the snapshot of a tick."""
+        if stream.acked < tick <= stream.tick:
+            stream.acked = tick
+            stream.pacing.acked(tick)
+            if stream.probe is not None and tick >= stream.probe[0]:
+                probe, sent_at, size = stream.probe
+                stream.probe = None
+                if tick == probe:
+                    stream.pacing.answered(now - sent_at, size, now)
+
+    def forget(self, stream: ClientStream) -> None:
+        """Begins anew with what a client sees: keyframes and terrain."""
+        stream.sight.forget()
+        self._renew_terrain(stream, stream.sight.sees)
+
+    def _look_around(self, stream: ClientStream, centre: Cell) -> None:
+        """The entity is in another segment."""
+        sight = stream.sight
+        exists = self._world.blocks.__contains__
+        near = interest.around(centre, self._limits.see_radius, exists)
+        if self._around.get(centre) != near:
+            self._around[centre] = near
+        added, dropped = sight.move(self._around[centre], self._limits.keep_radius, self._world.tick)
+        due = [segment for segment in stream.terrain_due if segment in sight.sees] + [s for s in added if exists(s)]
+        stream.terrain_due = self._nearest(stream, due)
+        if stream.terrain_now and stream.terrain_now[0] in dropped:
+            stream.terrain_now = None
+
+    def _renew_terrain(self, stream: ClientStream, segments: Collection[Cell]) -> None:
+        """The blocks of these segments are to be sent, or sent again."""
+        if stream.terrain_now and stream.terrain_now[0] in segments:
+            stream.terrain_now = None
+        due = {segment for segment in segments if segment in self._world.blocks}
+        stream.terrain_due = self._nearest(stream, sorted(due.union(stream.terrain_due)))
+
+    def _nearest(self, stream: ClientStream, segments: Iterable[Cell]) -> deque[Cell]:
+        """Segments in the order in which their blocks are sent."""
+        own = stream.sight.near[0] if stream.sight.near else (0, 0, 0)
+        return deque(sorted(segments, key=lambda segment: interest.distance(segment, own)))
+
+    def _send_snapshot(self, stream: ClientStream, player: Player, room: int) -> None:
+        tick, inputs, sight = self._world.tick, player.inputs, stream.sight
+        if sight.lost_track(tick, self._log.history):
+            self._renew_terrain(stream, sight.lose(tick, self._log.history))
+        drops = np.array(sight.drops, "<i4").tobytes() if sight.drops else b""
+        n, parts = sight.take(self._log, tick, room)
+        verdicts = b""
+        if player.verdicts:
+            verdicts = np.array(player.verdicts[: messages.VERDICTS_MAX], VERDICT).tobytes()
+            del player.verdicts[: messages.VERDICTS_MAX]
+        margins, fates = inputs.told()
+        header = (tick, inputs.newest, margins, tick - len(fates) + 1, fates, verdicts, drops)
+        message = messages.join_snapshot(header, n, parts)
+        stream.send(message)
+        stream.pacing.sent(tick)
+        if tick - stream.tick > 1 and stream.tick >= 0:
+            kept = tick - GAPS_S / self._tick_s
+            stream.gaps = (*(gap for gap in stream.gaps if gap[1] > kept), (stream.tick, tick))
+        stream.tick = tick
+        size = stream.snapshot_bytes = len(message)
+        self._counters.snapshots_sent += 1
+        self._counters.snapshot_bytes += size
+
+    def _send_told(self, stream: ClientStream, player: Player, window: int) -> None:
+        """Sends what the rules have told: shared values, and events as far as they fit into what may be on the way.
+
+        Where terrain is due, half of that is left to it. A client that has not acknowledged anything is still joining
+        and would only keep the events: they do not go until nothing has to wait for them.
+        """
+        if stream.shared_due:
+            stream.send(stream.shared_due)
+            stream.shared_due = b""
+        outbox, pacing = player.outbox, stream.pacing
+        if not outbox.due:
+            return
+        room, terrain = window - pacing.outstanding, stream.terrain_now or stream.terrain_due
+        if stream.acked < 0 and (terrain or room <= 0):
+            return
+        for message in outbox.take(stream.sight.known, max(room // 2, EVENT_BYTES) if terrain else pacing.room(window)):
+            stream.send(message)
+
+    def _send_terrain(self, stream: ClientStream, room: int) -> None:
+        """Terrain behind the snapshot, as far as it fits into what may be on the way.
+
+        A segment's blocks never go before its keyframe, which tells no edits: those in between would be lost.
+        """
+        room = min(room, self._limits.terrain_bytes_per_tick)
+        while room > 0 and (stream.terrain_now or stream.terrain_due):
+            if stream.terrain_now is None:
+                segment = next((segment for segment in stream.terrain_due if stream.sight.begun(segment)), None)
+                blocks = None if segment is None else self._log.packed(segment)
+                if segment is None or blocks is None:
+                    return
+                stream.terrain_due.remove(segment)
+                stream.terrain_now = (segment, blocks, 0)
+            segment, packed, offset = stream.terrain_now
+            chunk = packed[offset : offset + self._limits.terrain_chunk_bytes]
+            stream.send(encode(Terrain(*segment, offset, len(packed), chunk)))
+            offset += len(chunk)
+            stream.terrain_now = (segment, packed, offset) if offset < len(packed) else None
+            room -= len(chunk)
+            self._counters.terrain_bytes += len(chunk)

@@ -1,0 +1,5 @@
+"""Lag compensation: the world as a client saw it when its player acted."""
+
+from server.rewind.history import Rewind
+
+__all__ = ["Rewind"]

@@ -1,0 +1,1 @@
+"""The process: the ticker, the event loop, logs and errors."""
