@@ -2,7 +2,7 @@
 
     joining   Hello and pings are sent; the welcome, the terrain around the player and the server's time arrive
     playing   in each tick: step the predicted world with the input, and send the input; after each snapshot: reconcile
-              (`client_sdk.play`)
+              (`client_sdk.input_loop`)
     away      the connection is lost; prediction goes on, at most 4 s beyond the newest snapshot. Over a new connection,
               the client sends unanswered commands again, fetches the world into a second replica, and then replaces
               the old one

@@ -1,13 +1,12 @@
 """The game in the README, as somebody wrote it who had read nothing else."""
 
 from sovereign_netcode.client_sdk.bots import Policy
-from sovereign_netcode.shared.inputs import NEUTRAL, Input, make_input
-from sovereign_netcode.shared.scene import load_scene
-from sovereign_netcode.shared.world import World
-
 from sovereign_netcode.examples.freeze import Freeze
 from sovereign_netcode.playtest import Match, Player, bot
 from sovereign_netcode.playtest import Path as Line
+from sovereign_netcode.shared.inputs import NEUTRAL, Input, make_input
+from sovereign_netcode.shared.scene import load_scene
+from sovereign_netcode.shared.world import World
 
 TYPICAL = Line(0.05, 0.01)
 

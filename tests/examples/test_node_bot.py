@@ -13,10 +13,10 @@ from itertools import pairwise
 from pathlib import Path
 
 import pytest
-from sovereign_netcode.server.journal.records import replay
-from sovereign_netcode.shared.layout import ID
 
 from sovereign_netcode.examples.tag import Tag
+from sovereign_netcode.server.journal.records import replay
+from sovereign_netcode.shared.layout import ID
 from tests.e2e.processes import running, stats, until
 
 EXAMPLES = Path(__file__).resolve().parents[2] / "scripts" / "examples"

@@ -12,9 +12,13 @@ from sovereign_netcode.shared.units import SEGMENT
 from tests.lengths import long_but
 
 from sovereign_netcode import new_game
+from sovereign_netcode.client_sdk.bots import Follow, RunAndJump
 from sovereign_netcode.examples.freeze import Freeze
 from sovereign_netcode.examples.tag import LEAVES, TRUNK, Tag
 from sovereign_netcode.playtest import Match, bot
+from sovereign_netcode.server.rules import Rules
+from sovereign_netcode.shared.scene import SCENES, Scene, load_scene
+from sovereign_netcode.shared.units import SEGMENT
 
 
 def skeleton() -> Rules:

@@ -6,14 +6,14 @@ from typing import Any
 
 import msgpack
 import pytest
-from sovereign_netcode.client_sdk.events import Diverged, Happened, Left
-from sovereign_netcode.server.journal.records import NOTE, Recording
-from sovereign_netcode.server.players.persisted_state import restored
-from sovereign_netcode.shared.scene import load_scene
 
+from sovereign_netcode.client_sdk.events import Diverged, Happened, Left
 from sovereign_netcode.examples.tag import Tag
 from sovereign_netcode.examples.tag_brain import TagPlayer
 from sovereign_netcode.playtest import Match, Path, Player, bot
+from sovereign_netcode.server.journal.records import NOTE, Recording
+from sovereign_netcode.server.players.persisted_state import restored
+from sovereign_netcode.shared.scene import load_scene
 
 TYPICAL = Path(0.05, 0.01, 0.01)
 CAUSES = {"late input", "other entity", "server act", "unknown edit", "missing terrain"}

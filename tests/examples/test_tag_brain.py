@@ -3,12 +3,12 @@
 import math
 
 import pytest
-from sovereign_netcode.shared.inputs import JUMP
-from sovereign_netcode.shared.scene import load_scene
-from sovereign_netcode.shared.world import World
 
 from sovereign_netcode.examples.tag import Tag
 from sovereign_netcode.examples.tag_brain import TagPlayer, wish
+from sovereign_netcode.shared.inputs import JUMP
+from sovereign_netcode.shared.scene import load_scene
+from sovereign_netcode.shared.world import World
 
 MEADOW = load_scene("meadow")
 HERE = (32.0, 32.0, 9.0)
