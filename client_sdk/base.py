@@ -69,7 +69,8 @@ class BaseClient:
     def link(self) -> Path | None:
         """The simulated link on top of the real connection, to try a bad network: `client.link = "wifi"`.
 
-        It may be set at any time, to the name of a preset of `client_sdk.netsim.links`, to a `Path`, or to None for no link.
+        It may be set at any time: to the name of a preset of `client_sdk.netsim.links`, to a `Path`, or to None for no
+        link.
 
         Raises:
             ValueError: no preset has that name.
