@@ -11,9 +11,9 @@ The server calls all hooks within a tick, before the step, in this order: `on_st
 raises, the exception is logged and counted, and the game goes on. A hook is a plain function and must not wait. Code
 that waits runs in a task or a thread of its own and hands its result back with `game.soon`.
 
-Hooks read and change the game through `self.game`, a `server.game_api.api.Stage`. Decisions about the world must use nothing
-else: `self.game.random` gives the same numbers when a game is computed again, but a clock or the order of a set does
-not.
+Hooks read and change the game through `self.game`, a `server.game_api.api.Stage`. Decisions about the world must use
+nothing else: `self.game.random` gives the same numbers when a game is computed again, but a clock or the order of a set
+does not.
 """
 
 import importlib

@@ -1,10 +1,10 @@
 """Prediction and reconciliation: the confirmed and the predicted world of a client.
 
 Theory of operation. The *confirmed* world is the server's world as of the newest snapshot, as far as this client sees
-it (`client_sdk.prediction.confirmed`). The *predicted* world is the confirmed one plus a replay: the function that steps the
-server's world steps it with the own inputs, while other entities go on with their latest known inputs. The states of
-every predicted tick are kept. When the snapshot for tick T arrives, it is compared with the prediction for T, bit by
-bit for every entity:
+it (`client_sdk.prediction.confirmed`). The *predicted* world is the confirmed one plus a replay: the function that
+steps the server's world steps it with the own inputs, while other entities go on with their latest known inputs. The
+states of every predicted tick are kept. When the snapshot for tick T arrives, it is compared with the prediction for T,
+bit by bit for every entity:
 
     equal       the prediction stays, and nothing is done. This also holds if only entities differ that are too far
                 away to be met before the next replay, and are not drawn as predicted; that replay corrects them.

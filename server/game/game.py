@@ -295,7 +295,9 @@ class Game:
                         assert session.player is not None
                         self.delivery.serve(session.stream, session.player, now)
                     else:
-                        session.stream.sent_at = now  # the welcome waits for the disk, which is not a stall of the client
+                        session.stream.sent_at = (
+                            now  # the welcome waits for the disk, which is not a stall of the client
+                        )
                 except Exception:
                     self._break(session, "serving a client")
 

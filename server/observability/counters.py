@@ -15,7 +15,7 @@ class InputCounts(Protocol):
 
 @dataclass
 class Counters:
-    """Counts since the start of the process. `server.metrics` describes most of them."""
+    """Counts since the start of the process. `server.observability.metrics` describes most of them."""
 
     joined: int = 0
     left: int = 0
