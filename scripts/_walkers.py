@@ -5,6 +5,7 @@ import math
 import time
 from collections import Counter
 
+from client_sdk.async_client import AsyncClient
 from client_sdk.core import Core
 from client_sdk.events import Diverged, Left
 from client_sdk.transports.connection import ConnectError

@@ -38,8 +38,8 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from client_sdk.timing.clock import PRICE_S, SAFETY_S, STALL_S, LeadController, PricedLead, ServerClock, Timeline
 from client_sdk.netsim.links import PRESETS, Weather, Wire
+from client_sdk.timing.clock import PRICE_S, SAFETY_S, STALL_S, LeadController, PricedLead, ServerClock, Timeline
 from scripts.controllers import RIVALS, Rival
 
 RATE = 32

@@ -6,6 +6,7 @@ import random
 import sys
 from pathlib import Path
 
+from client_sdk.async_client import AsyncClient
 from client_sdk.bots import POLICIES, Bot
 from sovereign_netcode.loadtest.processes import own_server
 from tests.chromium import chromium, installed

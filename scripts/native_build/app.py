@@ -22,15 +22,16 @@ from scripts.environment import ROOT
 SOURCES = ("client_sdk", "scripts", "server", "shared", "sovereign_netcode", "tests")
 BUILT = ROOT / "build" / "native"
 MODULES = (
-    "client_sdk/clock.py", "client_sdk/comeback.py", "client_sdk/confirmed.py", "client_sdk/core.py",
-    "client_sdk/events.py", "client_sdk/interpolation.py", "client_sdk/linked.py", "client_sdk/links.py",
-    "client_sdk/orders.py", "client_sdk/picture.py", "client_sdk/play.py", "client_sdk/prediction.py",
-    "client_sdk/replica.py", "client_sdk/smoothing.py", "client_sdk/stats.py",
-    "server/counters.py", "server/delivery.py", "server/door.py", "server/game.py", "server/gateway.py",
-    "server/interest.py", "server/orders.py", "server/pacing.py", "server/replication.py", "server/roster.py",
-    "server/session.py", "server/sight.py",
-    "shared/inputs.py", "shared/messages.py", "shared/ring.py", "shared/snapshot.py",
-    "sovereign_netcode/playtest/match.py",
+    "client_sdk/commands.py", "client_sdk/core.py", "client_sdk/events.py", "client_sdk/input_loop.py",
+    "client_sdk/interpolation/interpolation.py", "client_sdk/interpolation/smoothing.py", "client_sdk/netsim/linked.py",
+    "client_sdk/netsim/links.py", "client_sdk/prediction/confirmed.py", "client_sdk/prediction/prediction.py",
+    "client_sdk/reconnect.py", "client_sdk/replica.py", "client_sdk/stats.py", "client_sdk/timing/clock.py",
+    "client_sdk/view.py", "server/game/commands.py", "server/game/game.py", "server/game/roster.py",
+    "server/game/session.py", "server/net/admission.py", "server/net/websocket.py", "server/observability/counters.py",
+    "server/players/input_queue.py", "server/players/player.py", "server/replication/change_log.py",
+    "server/replication/client_stream.py", "server/replication/client_view.py", "server/replication/flow_control.py",
+    "server/replication/interest.py", "server/replication/sender.py", "shared/inputs.py", "shared/messages.py",
+    "shared/ring.py", "shared/snapshot.py", "sovereign_netcode/playtest/match.py",
 )  # fmt: skip
 """Modules that a tick of a server and of a client runs. Other programs cannot derive from the classes of a compiled
 module, so rules, policies and transports are not among them."""

@@ -5,11 +5,6 @@ from itertools import product
 from random import Random
 
 import pytest
-from sovereign_netcode.client_sdk.bots import Follow, RunAndJump
-from sovereign_netcode.server.rules import Rules
-from sovereign_netcode.shared.scene import SCENES, Scene, load_scene
-from sovereign_netcode.shared.units import SEGMENT
-from tests.lengths import long_but
 
 from sovereign_netcode import new_game
 from sovereign_netcode.client_sdk.bots import Follow, RunAndJump
@@ -19,6 +14,7 @@ from sovereign_netcode.playtest import Match, bot
 from sovereign_netcode.server.rules import Rules
 from sovereign_netcode.shared.scene import SCENES, Scene, load_scene
 from sovereign_netcode.shared.units import SEGMENT
+from tests.lengths import long_but
 
 
 def skeleton() -> Rules:

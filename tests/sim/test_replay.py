@@ -7,10 +7,10 @@ from pathlib import Path as File
 import pytest
 
 from client_sdk.core import Core
-from server.game import Game
-from server.journal.records import FILL, JournalError, Recording
 from server.config.limits import Limits
+from server.game import Game
 from server.journal.recorded_world import RecordedWorld
+from server.journal.records import FILL, JournalError, Recording
 from shared.inputs import Input
 from shared.scene import load_scene
 from shared.world import World

@@ -12,6 +12,7 @@ import pytest
 
 from client_sdk.core import Core
 from client_sdk.netsim.links import PRESETS
+from client_sdk.timing.clock import PricedLead
 from scripts import league
 from shared.inputs import Input
 from shared.scene import load_scene
