@@ -1,4 +1,4 @@
-"""The game: players join, act, and get what has changed, once a tick."""
+"""The game: its tick, its sessions and players, and their commands."""
 
 from server.game.game import Game
 

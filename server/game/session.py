@@ -9,33 +9,41 @@ from shared.messages import Hello
 
 
 class Session:
-    """One connection, from the handshake to its end."""
+    """One connection, from the handshake to its end.
+
+    Args:
+        link: the connection.
+        now: the time in seconds at which it opened.
+    """
 
     def __init__(self, link: Link, now: float) -> None:
         self.link = link
         self.stream = ClientStream(link, now)
         self.player: Player | None = None
         self.entity = 0
-        """The player's entity; 0 before the client has joined."""
+        """Number of the player's entity; 0 before the client has joined."""
         self.inputs = InputQueue()
-        """The player's."""
+        """Input queue of the player."""
         self.hello: Hello | None = None
-        """With which it waits to join."""
+        """Hello of a client that waits to join."""
         self.greeting: tuple[int, bytes] | None = None
-        """Its welcome, and the tick from which on it may be sent: when the token in it is on disk."""
+        """Tick that must be durable before the welcome is sent, because of its resume token; and the welcome."""
         self.subject = ""
         self.opened = self.heard = now
+        """Times in seconds: when the connection opened, and when the latest message arrived."""
         self.allowance = 0.0
+        """Number of messages that the client may send besides a full burst. Negative: the used part of the burst."""
         self.closed = False
         self.resynced_at = now
+        """Time in seconds of the client's latest request to get everything anew."""
         self.corrections = -1
-        """As the client has reported them; -1: not yet."""
+        """Number of corrections that the client has reported; -1: none yet."""
 
     def seat(self, player: Player) -> None:
-        """This connection is the player's from now on."""
+        """Makes this the connection of a player."""
         self.player, self.entity, self.inputs = player, player.entity, player.inputs
         player.session, player.away_until = self, math.inf
-        del player.verdicts[:-SETTLED_MAX]  # who comes back time and again without reading must not pile them up
+        del player.verdicts[:-SETTLED_MAX]  # bounds them for a client that reconnects again and again without reading
         self.hello = None
 
     def vacate(self) -> None:
@@ -49,7 +57,7 @@ class Session:
         self.stream.send(message)
 
     def close(self, code: int, reason: str) -> None:
-        """Ends the connection; nothing is taken from it or sent to it any more."""
+        """Closes the connection. Later messages in both directions are ignored."""
         if not self.closed:
             self.closed = True
             self.link.close(code, reason)

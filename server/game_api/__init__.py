@@ -1,1 +1,1 @@
-"""What the rules of a game call: `self.game`."""
+"""The game API: what `self.game` is for the rules of a game."""

@@ -1,1 +1,1 @@
-"""One player: its inputs, and what outlives a connection."""
+"""Players: their inputs, and their state beyond a connection."""

@@ -1,4 +1,11 @@
-"""The inputs of one player: exactly one is taken per tick."""
+"""The input queue: the inputs of one player by tick, from their arrival until they are used.
+
+Theory of operation. Exactly one input is taken per tick. If the player's own input has not arrived, the last known one
+is repeated for some ticks (`Bounds.repeats`); after that the neutral input is used. An input that arrives after its
+tick was computed does not change that tick, but it is the one that is repeated from then on. With each snapshot the
+client gets two lists: the arrival margin of each input, and the input status of each tick (its own input, a repeated
+one, the neutral one, or none expected yet). From these it controls how far ahead it sends.
+"""
 
 import math
 import struct
@@ -11,6 +18,7 @@ from shared.inputs import NEUTRAL, Input, clamp
 from shared.messages import IDLE, INPUT_ROW_BYTES, MARGIN_REFUSED, NEUTRALISED, REPEATED, USED, Inputs
 
 INPUT_ROW = struct.Struct("<bbB")
+"""Format of one input in a message: move_x, move_y, buttons."""
 DEFAULT = bounds(32)
 """Bounds of the default tick rate, 32 Hz."""
 assert sys.byteorder == "little", "margins lie in memory as they go over the wire"
@@ -32,26 +40,34 @@ class InputQueue:
     def __init__(self, bounds: Bounds = DEFAULT) -> None:
         self._bounds = bounds
         self._margin_one = bounds.margin_one
-        self._waiting: dict[int, Input] = {}  # by tick, at most `bounds.ahead` ahead
-        self._held = NEUTRAL  # the latest to arrive whose tick has come
-        self._missing = 0  # ticks since anything has arrived
-        self._accepted = -1  # the newest tick of which an input was not refused
+        self._waiting: dict[int, Input] = {}  # inputs for later ticks, by tick, at most `bounds.ahead` ticks ahead
+        self._held = NEUTRAL  # the input that is repeated: the newest one used or late
+        self._missing = 0  # ticks since an input was used or arrived late
+        self._accepted = -1  # the newest tick of which an input was accepted
         self.first = self.newest = -1
         self.margins = array("h")
-        """As they go over the wire, up to that of `newest`; at most `bounds.fates`, like the fates."""
+        """Arrival margins that are not sent yet, in the units of the wire; the last one is that of `newest`. At most
+        `bounds.fates` of them."""
         self.fates = bytearray()
+        """Input statuses of the ticks that are not sent yet, as on the wire. At most `bounds.fates` of them."""
         self.late = self.refused = self.used = self.substituted = 0
         self.wheel: Input | None = None
-        """What is taken in every tick, whatever comes: of a player who is inside the server."""
+        """Input of an in-process player. If it is set, it is used in every tick and queued inputs are ignored."""
 
     def file(self, message: Inputs, tick: int, ahead: float) -> None:
-        """Takes a message at tick `tick`; the next tick's deadline is `ahead` ticks away."""
+        """Queues the inputs of a message.
+
+        Args:
+            message: the message.
+            tick: the newest tick that has been computed.
+            ahead: ticks until the next tick's deadline, with a fraction.
+        """
         at, _, rows = message
         for start in range(0, len(rows), INPUT_ROW_BYTES):
             if at <= self._accepted:  # a duplicate, or an order that TCP cannot produce
                 self.refused += 1
             else:
-                if at <= self.newest:  # it was refused before, for coming too early
+                if at <= self.newest:  # it was refused before because it came too early
                     self._forget(at)
                 elif self.first < 0 or at > self.newest + 1:
                     self._skipped(at)
@@ -62,7 +78,7 @@ class InputQueue:
             del self.margins[: -self._bounds.fates]
 
     def restart(self, at: int) -> None:
-        """Withdraws the inputs for tick `at` and later that have not been used: the client sends them anew."""
+        """Removes the unused inputs for tick `at` and later, because the client is going to send them again."""
         if self.first < 0 or at > self.newest:
             return
         for tick in [tick for tick in self._waiting if tick >= at]:
@@ -71,12 +87,12 @@ class InputQueue:
         self._forget(at)
 
     def _forget(self, at: int) -> None:
-        """Counts margins off from tick `at - 1` again."""
+        """Removes the margins of tick `at` and later, so that `newest` is `at - 1` again."""
         del self.margins[max(len(self.margins) - (self.newest - at + 1), 0) :]
         self.first, self.newest = min(self.first, at), at - 1
 
     def _filed(self, at: int, row: bytes, tick: int, ahead: float) -> int:
-        """Files the input for the tick `at`; its margin."""
+        """Queues the input for the tick `at` if that is not too far ahead. Returns its margin in units of the wire."""
         if at > tick + self._bounds.ahead:
             self.refused += 1
             return MARGIN_REFUSED
@@ -91,14 +107,17 @@ class InputQueue:
         return margin if abs(margin) < -MARGIN_REFUSED else max(MARGIN_REFUSED + 1, min(margin, -MARGIN_REFUSED - 1))
 
     def _skipped(self, at: int) -> None:
-        """The tick `at` is the first, or some before it are left out: each gets a margin, to count them off by."""
+        """Handles the first input, or a gap before tick `at`: each left-out tick gets a margin of `MARGIN_REFUSED`.
+
+        The client assigns margins to ticks by counting, so no tick may be left out.
+        """
         if self.first < 0:
             self.first = at
         else:
             self.margins.extend([MARGIN_REFUSED] * min(at - self.newest - 1, self._bounds.fates))
 
     def take(self, tick: int) -> Input:
-        """The input for a tick whose time has come."""
+        """Takes the input for the tick that is about to be computed, or a substitute, and notes the input status."""
         if self.wheel is not None:
             self.used += 1
             return self.wheel
@@ -118,7 +137,7 @@ class InputQueue:
         return NEUTRAL if fate == NEUTRALISED else self._held
 
     def told(self) -> tuple[bytes, bytes]:
-        """Margins and fates as they go over the wire, which count as sent."""
+        """Takes the margins and statuses for the next snapshot, as on the wire. They count as sent."""
         margins, fates = self.margins.tobytes(), bytes(self.fates)
         del self.margins[:]
         self.fates.clear()

@@ -1,4 +1,4 @@
-"""A player: stays while its entity stays, whatever becomes of the connection."""
+"""A player: a participant with an entity, who stays while connections are lost and replaced."""
 
 import math
 from collections import deque
@@ -13,17 +13,17 @@ if TYPE_CHECKING:
     from server.game.session import Session
 
 SETTLED_MAX = 128
-"""Verdicts of commands that are kept for a client that was cut off before it received them."""
+"""Maximum number of verdicts kept for one player, in case that its client lost the connection before it got them."""
 
 
 class Player:
-    """Somebody who plays: stays while the entity stays, whatever becomes of the connection.
+    """A participant of the game. The player exists as long as its entity, also without a connection.
 
     Args:
-        entity: the player's own.
-        name: what it calls itself.
-        subject: whose token it showed; empty where none is asked for.
-        bounds: those of the scene's tick rate.
+        entity: number of the player's entity.
+        name: the name that the client gave.
+        subject: the subject of the client's token; empty if the server does not authenticate.
+        bounds: bounds for the scene's tick rate.
     """
 
     def __init__(self, entity: int, name: str = "", subject: str = "", bounds: Bounds = DEFAULT) -> None:
@@ -31,34 +31,37 @@ class Player:
         self.name = name
         self.subject = subject
         self.announced = True
-        """Whether the rules have been told of the join."""
+        """Whether `on_join` has been called for the player."""
         self.inputs = InputQueue(bounds)
         self.commands: deque[Command] = deque()
-        """Those that wait for their tick."""
+        """Commands that wait for their tick."""
         self.command = -1
-        """The highest number of a command so far."""
+        """Highest number of a command so far."""
         self.verdicts: list[tuple[int, int]] = []
-        """Number and verdict of commands, to be told."""
+        """Numbers and verdicts of commands, to be sent."""
         self.settled: dict[int, int] = {}
-        """The latest verdicts: who was cut off before hearing one asks again, and is told the same."""
+        """Latest verdicts by the number of the command. A client that lost its connection before it received a verdict
+        sends the command again and gets the same verdict."""
         self.edits_left = math.inf
+        """Number of edits that the player may do now; it grows with time."""
         self.tokens: list[bytes] = []
-        """Digests of the tokens with which to come back: the newest, and the one before until that has been heard."""
+        """Digests of the valid resume tokens: the newest one, and the one before until the client has the newest."""
         self.away_until = math.inf
-        """While there is no connection: when the entity goes."""
+        """Time in seconds at which a player without a connection leaves."""
         self.session: Session | None = None
+        """Present connection; None: the connection is lost."""
         self.outbox = Outbox()
-        """What the rules have sent, to be told."""
+        """Game events that wait to be sent."""
 
     def __repr__(self) -> str:
         return f"<Player {self.name!r}, entity {self.entity}>"
 
     def heard(self) -> None:
-        """The client has got its newest token: it may throw away the one before, and so is that one worth nothing."""
+        """Invalidates all resume tokens but the newest one, which the client has now."""
         del self.tokens[:-1]
 
     def settle(self, number: int, verdict: int) -> None:
-        """A command has been carried out, or not."""
+        """Queues the verdict of a command to be sent, and keeps it in case that the client asks again."""
         self.verdicts.append((number, verdict))
         self.settled[number] = verdict
         if len(self.settled) > SETTLED_MAX:

@@ -1,1 +1,1 @@
-"""What each client is sent of the world, and when."""
+"""Replication: which changes of the world each client is sent, their encoding, and flow control."""

@@ -43,15 +43,15 @@ class ClientStream:
         self.snapshot_bytes = 0
         """Size of the latest snapshot."""
         self.gaps: tuple[tuple[int, int], ...] = ()
-        """Pairs of ticks that followed each other in its snapshots with others between, as long as a shot may ask."""
+        """Pairs of ticks of consecutive snapshots between which other ticks were left out, for lag compensation."""
         self.probe: tuple[int, float, int] | None = None
-        """A snapshot that was sent when nothing was in flight: its tick, its time in seconds, its bytes."""
+        """Snapshot that measures the round trip, sent when nothing was on the way: its tick, time in seconds, bytes."""
         self.terrain_due: deque[Cell] = deque()
         """Segments whose blocks are still to be sent, nearest first."""
         self.terrain_now: tuple[Cell, bytes, int] | None = None
         """The segment that is being sent: its cell, its packed blocks, and how many bytes of them have been sent."""
         self.shared = 0
-        """Version of the game's shared values that the client has been sent, or that waits in `shared_due`."""
+        """Version of the game's shared values that the client has been sent or that waits in `shared_due`."""
         self.shared_due = b""
         """Message with the shared values that follows the next snapshot; empty: there is none."""
 

@@ -1,10 +1,10 @@
-"""What one client sees and has been sent of it: which segments' changes go into its next snapshot.
+"""The client view: the segments that one client sees, how much of them it has been sent, and what to send next.
 
-Theory of operation. Everything that changed goes, as long as it fits into what may be on the way to the client.
-Where it does not, the own segment goes, then the others by urgency: how many ticks of changes wait, over how far away
-they are. One of them always goes, and what waits grows more urgent: nobody is starved. A segment that is new to
-the client is sent whole (a keyframe) and waits its turn in the same order, so that walking up to a crowd does not put
-a wall of bytes in front of the own position.
+Theory of operation. A snapshot has all changed segments if they fit into the room that flow control allows. Otherwise
+the segment of the client's own entity comes first, then the others by urgency: the number of ticks whose changes wait,
+divided by 1 + 3 x the distance in segments. At least one other segment is always sent, and waiting segments become more
+urgent, so every segment is sent eventually. A segment that is new to the client is sent as a keyframe and waits in the
+same order. Thus walking up to a crowd does not delay the update of the own position.
 """
 
 from server.replication import interest
@@ -14,25 +14,36 @@ from shared.snapshot import KEYFRAME
 
 
 class Sight:
-    """The segments that a client sees."""
+    """The segments that one client sees, with the tick of each that was sent last."""
 
     def __init__(self) -> None:
         self.sees: set[Cell] = set()
         self.near: tuple[Cell, ...] = ()
-        """Of them those around the entity, its own first; the rest it has come away from."""
+        """Segments around the client's entity, its own first. `sees` also has some that are further away."""
         self.drops: list[Cell] = []
-        """What the client knows and does not see any more: to be told with the next snapshot."""
-        self._rest: tuple[Cell, ...] = ()
-        self._knows: set[Cell] = set()
-        self._fresh: dict[Cell, int] = {}  # no keyframe sent yet; in sight, and unknown, since this tick
-        self._behind: dict[Cell, int] = {}  # sent last with this tick, which is before `_tick`
-        self._tick = -1
+        """Segments that the client knows and no longer sees. The next snapshot names them."""
+        self._rest: tuple[Cell, ...] = ()  # the segments of `sees` that are not in `near`
+        self._knows: set[Cell] = set()  # segments of which a keyframe was sent
+        self._fresh: dict[Cell, int] = {}  # segments that wait for their keyframe, with the tick of their entry
+        self._behind: dict[Cell, int] = {}  # segments left out of the latest snapshot, with the tick sent last
+        self._tick = -1  # tick of the latest snapshot
 
     def move(self, near: tuple[Cell, ...], keep: int, tick: int = -1) -> tuple[list[Cell], list[Cell]]:
-        """The entity is in another segment as of `tick`: what is seen from then on, nearest first, and is let go."""
+        """Updates the view after the entity has come into another segment.
+
+        Args:
+            near: the segments around the entity, its own first.
+            keep: distance in segments up to which segments stay in the view.
+            tick: the tick in which this happened.
+
+        Returns:
+            The segments that are new in the view, nearest first, and those that were dropped from it.
+        """
         added, dropped = interest.update(self.sees, near, keep)
         self.near = near
-        self._fresh.update(dict.fromkeys(added, tick if self.sees else -1))  # the first ones: as far back as can be
+        self._fresh.update(
+            dict.fromkeys(added, tick if self.sees else -1)
+        )  # -1: until these are sent, `known` precedes all
         self.sees.difference_update(dropped)
         for segment in dropped:
             self._fresh.pop(segment, None)
@@ -43,17 +54,17 @@ class Sight:
         return added, dropped
 
     def forget(self) -> None:
-        """Everything is to be sent anew."""
+        """Makes all segments be sent as keyframes again."""
         self._fresh = dict.fromkeys(self.sees, -1)
         self._behind.clear()
         self._tick = -1
 
     def lost_track(self, tick: int, history: int) -> bool:
-        """Whether something waits for longer than its changes are kept: `history` ticks."""
+        """Returns whether a segment has waited for more than `history` ticks, for which its changes are kept."""
         return self._tick >= 0 and self.waits(tick) > history
 
     def lose(self, tick: int, history: int) -> list[Cell]:
-        """Gives up on what waits for longer than its changes are kept: it is to be sent whole. Returns the segments."""
+        """Makes segments that have waited for more than `history` ticks be sent as keyframes. Returns them."""
         if tick - self._tick > history:
             self.forget()
             return list(self.sees)
@@ -64,27 +75,36 @@ class Sight:
         return list(lost)
 
     def begun(self, segment: Cell) -> bool:
-        """Whether a segment that is seen has been sent whole."""
+        """Returns whether a segment of the view has been sent as a keyframe."""
         return segment not in self._fresh
 
     @property
     def complete(self) -> bool:
-        """Whether the latest snapshot had all there was."""
+        """Whether the latest snapshot left out nothing."""
         return not (self._behind or self._fresh)
 
     @property
     def known(self) -> int:
-        """The newest tick of which the client has been sent all that was in its sight at the end of it."""
+        """Newest tick of which the client has been sent everything that was in its view at the end of that tick."""
         return min((self._tick, *self._behind.values(), *(since - 1 for since in self._fresh.values())))
 
     def waits(self, tick: int) -> int:
-        """For how many ticks the segment that was sent longest ago, of those known, has not been sent."""
+        """Returns the number of ticks since the known segment that has waited longest was sent."""
         return tick - (min(self._behind.values()) if self._behind else self._tick)
 
     def take(self, log: ChangeLog, tick: int, room: int) -> tuple[int, bytes]:
-        """How many parts a snapshot for `tick` has, and their bytes, some `room`; they count as sent, as do `drops`."""
+        """Chooses the segments of the next snapshot. They, and `drops`, count as sent afterwards.
+
+        Args:
+            log: the changes of the world.
+            tick: the tick of the snapshot.
+            room: bytes that the segment deltas should not exceed.
+
+        Returns:
+            The number of segment deltas, and their bytes.
+        """
         known = log.since(self._tick)
-        if not (self._behind or self._fresh or self.drops):  # as nearly always
+        if not (self._behind or self._fresh or self.drops):  # the usual case
             n, plain = known.together(self.near)
             for segment in self._rest:
                 if segment in known.changed and (part := known[segment]):
@@ -113,7 +133,15 @@ class Sight:
     def _urgent(
         self, parts: dict[Cell, bytes], due: dict[Cell, int], tick: int, history: int, room: int
     ) -> dict[Cell, bytes]:
-        """The parts that fit, in the order of urgency; at least the own segment and one more."""
+        """Returns the most urgent deltas that fit into the room, but at least the own segment and one more.
+
+        Args:
+            parts: the deltas by segment.
+            due: the tick of each segment that was sent last, or `KEYFRAME`.
+            tick: the tick of the snapshot.
+            history: ticks for which changes are kept; a keyframe counts as waiting for as long.
+            room: the room in bytes.
+        """
         centre = self.near[0]
 
         def urgency(segment: Cell) -> float:

@@ -1,27 +1,30 @@
-"""How much may be on its way to one client: enough to keep its path busy, too little to make snapshots old.
+"""Flow control: how many bytes may be on the way to one client.
 
-Theory of operation. What a TCP connection has not acknowledged yet stands in a queue somewhere, and the newest
-snapshot goes behind it. So a snapshot is sent only while the bytes on the way (unsent and unacknowledged) fit into
+The amount must keep the connection busy without making snapshots old.
+
+Theory of operation. Bytes that TCP has sent and not acknowledged wait in some queue, and the newest snapshot goes
+behind them. So a snapshot is sent only while the bytes on the way (unsent and unacknowledged) fit into the window
 
     max(two snapshots, 512 bytes, rate x (3 x least round trip + one tick))
 
-where `rate` is the fastest the path has acknowledged bytes lately and the least round trip is that of an empty
-path. Three of them, because a lost packet holds up the acknowledgements of all behind it for two or more, although
-no queue has grown: with one, a path of 200 ms that loses 2 % of its packets gets 28 snapshots/s instead of 32.
+`rate` is the highest rate at which the connection has acknowledged bytes lately. The least round trip is measured with
+nothing else on the way. The window has three of them because a lost packet delays the acknowledgements of everything
+behind it by two or more, although no queue has grown. With one round trip, a connection of 200 ms that loses 2 % of its
+packets gets 28 snapshots/s instead of 32. For long round trips the factor is smaller (`HOLD_S_MAX`).
 
-Where that holds back most snapshots for a second, it is no loss but the path that is narrow. Then the queue is of
-one's own making, and there should be none: one round trip and two ticks may be on the way when a snapshot is sent, and
-it may be as large as the path carries in an eighth of a second. So a client gets small snapshots often, its own segment
-in each, instead of large ones rarely: at 30 kb/s for a view of 90, they are 0.28 s old instead of 0.56.
+If the window holds back most snapshots for a second, the cause is not packet loss but a narrow connection. Then the
+queue consists of this server's own bytes and should be empty: when a snapshot is sent, only the bytes of one round trip
+and two ticks may be on the way. The snapshot may be as large as what the connection carries in an eighth of a second.
+So a client gets small snapshots often, with its own segment in each, instead of large ones rarely. At 30 kb/s for a
+view that needs 90, they are 0.28 s old instead of 0.56 s.
 
-The round trip is measured of snapshots before which nothing was on the way. Where that never happens because the
-path is full, sending pauses once a minute until it is empty, or a queue of one's own would pass for distance, and grow
-for ever.
-A client that lost some ticks that way gets their union in its next snapshot: latest wins.
+The round trip is measured with snapshots before which nothing was on the way. If that never happens because the
+connection is always full, sending pauses once a minute until it is empty. Otherwise the queue would count as distance
+and could grow without bound. A client whose snapshots were left out gets the union of the changes with the next one.
 
-The link is asked what is on the way only where that decides something: from one time to the next, what has been sent
-since is counted on top (2.3 us less of 31.7 for each client's tick). Where the system cannot tell (Linux can), what the
-client has not acknowledged counts.
+The link is asked for the bytes on the way only if the answer matters. In between, the bytes sent since are added to the
+last answer, which saves 2.3 of 31.7 us per client and tick. If the system cannot tell (Linux can), bytes up to a
+snapshot count as on the way until the client acknowledges it.
 """
 
 import math
@@ -29,48 +32,51 @@ from collections import deque
 from collections.abc import Callable
 
 RATE_WINDOW_S = 1.0
-"""The rate is the best of the last second,"""
+"""Seconds of which the highest measured rate counts."""
 RATE_SPAN_S = 0.25
-"""each measured over at least a quarter of one."""
+"""Minimum time over which a rate is measured, in seconds."""
 SAMPLE_S = 0.1
-"""and looked at so often: that is one tick in three or four, and takes 1.3 us off each client's tick."""
+"""Seconds between two measurements: one tick in three or four, which saves 1.3 us per client and tick."""
 RTT_WINDOW_S = 60.0
+"""Seconds of which the shortest round trip counts, and after which sending pauses to measure a new one."""
 RTT_SPAN_S = 1.0
-"""Of the round trips within such a time only one that is shorter than the last is kept."""
+"""Seconds after a measured round trip in which only a shorter one is kept."""
 STALL_RTTS = 3.0
+"""Round trips whose bytes may be on the way."""
 HOLD_S_MAX = 0.6
-"""Three round trips are enough at this length; of longer ones one and a half."""
+"""Upper bound of the time that `STALL_RTTS` round trips stand for, in seconds; but it is at least 1.5 round trips."""
 LEAST_BYTES = 512
+"""Bytes that may always be on the way."""
 HELD_S = 1.0
-"""The share of ticks in which nothing could be sent is averaged over this long."""
+"""Seconds over which the share of ticks is averaged in which nothing could be sent."""
 NARROW, WIDE = 0.5, 0.4
-"""A path is narrow from this share on, until it is less than that."""
+"""Share of such ticks above which a connection counts as narrow, and below which it no longer does."""
 NARROW_S = 0.125
-"""On a narrow path, a snapshot may be as large as what the path carries in this time,"""
+"""Seconds. On a narrow connection, a snapshot may be as large as what the connection carries in this time."""
 NARROW_BYTES = 96
-"""or this."""
+"""Bytes that a snapshot on a narrow connection may always have."""
 
 
 class Pacing:
-    """The path to one client, from what was sent and what is still on the way.
+    """The flow control of the connection to one client.
 
     Args:
-        ask: as `server.game.session.Link.outstanding`.
+        ask: returns the bytes on the way, or None if unknown, like `client_stream.Link.outstanding`.
     """
 
     def __init__(self, ask: Callable[[], int | None]) -> None:
         self.sent_bytes = 0
-        """All that has been handed to the transport."""
+        """Total of bytes handed to the transport."""
         self._ask = ask
-        self._taken = 0  # so much of it at least is not on the way any more
-        # Where the link cannot tell: snapshots that have not been acknowledged, and what had been sent with each. They
-        # count from the first acknowledgement on: a client that waits for terrain sends none.
+        self._taken = 0  # lower bound of the bytes that are no longer on the way
+        # If the link cannot tell: the snapshots that are not acknowledged, with the total of bytes after each. They
+        # count from the first acknowledgement on, because a client that waits for terrain sends none.
         self._blind = False
         self._unheard: deque[tuple[int, int]] = deque()
         self._heard = -1
         self._measure_at = -math.inf
         self._acked: list[tuple[float, int]] = []  # time, bytes acknowledged by then
-        # Time and value; whatever a later one beats is dropped, so the best is in front.
+        # Pairs of time and value. A pair is dropped once a later one is better, so the best is in front.
         self._rates: list[tuple[float, float]] = []
         self._rtts: list[tuple[float, float]] = []
         self._full_at = -math.inf
@@ -81,42 +87,48 @@ class Pacing:
 
     @property
     def rate(self) -> float:
-        """Bytes per second that the path has lately been seen to carry."""
+        """Highest rate of the last `RATE_WINDOW_S`, in bytes per second; 0: not measured yet."""
         return self._rates[0][1] if self._rates else 0.0
 
     @property
     def least_rtt_s(self) -> float:
-        """The shortest time lately from sending a snapshot to hearing that it was applied."""
+        """Shortest time from sending a snapshot to its acknowledgement, in seconds; 0: not measured yet."""
         return self._rtts[0][1] if self._rtts else 0.0
 
     @property
     def outstanding(self) -> int:
-        """Bytes that are on the way, at most."""
+        """Upper bound of the bytes that are on the way."""
         return self.sent_bytes - self._taken
 
     def look(self) -> None:
-        """Asks the link: `outstanding` is exact now."""
+        """Asks the link for the bytes on the way, which makes `outstanding` exact."""
         told = self._ask()
         self._blind = self._blind or told is None
         unheard = self._unheard[-1][1] - self._heard if self._unheard else 0
         self._taken = self.sent_bytes - max(told or 0, unheard)
 
     def sent(self, tick: int) -> None:
-        """The snapshot of a tick has been handed over."""
+        """Notes that the snapshot of a tick was handed to the transport."""
         if self._blind and self._heard >= 0:
             self._unheard.append((tick, self.sent_bytes))
 
     def acked(self, tick: int) -> None:
-        """The client has applied the snapshot of a tick."""
+        """Notes that the client has acknowledged the snapshot of a tick."""
         if self._heard < 0:
             self._heard = self.sent_bytes
         while self._unheard and self._unheard[0][0] <= tick:
             self._heard = self._unheard.popleft()[1]
 
     def answered(self, rtt_s: float, size: int, now: float) -> None:
-        """The client has acknowledged, `rtt_s` after it was sent, `size` bytes before which nothing was on the way."""
+        """Takes a measured round trip.
+
+        Args:
+            rtt_s: seconds from sending a message, before which nothing was on the way, to its acknowledgement.
+            size: bytes of the message.
+            now: the current time in seconds.
+        """
         if now - self._full_at < RATE_WINDOW_S + rtt_s and self.rate > 0:
-            rtt_s = max(rtt_s - size / self.rate, 0.0)  # of a narrow path, part of that was its width
+            rtt_s = max(rtt_s - size / self.rate, 0.0)  # on a narrow connection, subtract the time of the transfer
         if self._rtts and rtt_s >= self._rtts[-1][1] and now - self._rtts[-1][0] < RTT_SPAN_S:
             return
         while self._rtts and (self._rtts[0][0] < now - RTT_WINDOW_S):
@@ -127,7 +139,13 @@ class Pacing:
         self._pauses = False
 
     def window(self, snapshot_bytes: int, tick_s: float, now: float) -> int:
-        """How many bytes may be on the way now, if the latest snapshot had so many; call once a tick."""
+        """Returns how many bytes may be on the way now. Call it once per tick.
+
+        Args:
+            snapshot_bytes: size of the latest snapshot.
+            tick_s: duration of a tick in seconds.
+            now: the current time in seconds.
+        """
         measure = now >= self._measure_at
         if measure:
             self._measure_at = now + SAMPLE_S
@@ -148,7 +166,7 @@ class Pacing:
         return window
 
     def room(self, window: int) -> int:
-        """How large about a snapshot may be that is sent now."""
+        """Returns how many bytes, about, a snapshot may have that is sent now, for the result of `window`."""
         return self._portion if self._narrow else max(window - self.outstanding, LEAST_BYTES)
 
     def _measure(self, tick_s: float, now: float) -> None:

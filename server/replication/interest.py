@@ -1,4 +1,4 @@
-"""Who sees what: the segments around a client's entity, let go only further away than they were taken."""
+"""Interest: the segments around an entity. A segment leaves the view at a larger distance than it enters it."""
 
 from collections.abc import Callable
 
@@ -6,14 +6,19 @@ from shared.checks import Cell
 
 
 def distance(a: Cell, b: Cell) -> int:
-    """How many segments apart, along the longest axis."""
+    """Returns the distance of two segments in segments, along the axis where it is largest."""
     return max(abs(a[0] - b[0]), abs(a[1] - b[1]), abs(a[2] - b[2]))
 
 
 def around(centre: Cell, see: int, exists: Callable[[Cell], bool]) -> tuple[Cell, ...]:
-    """What an entity in segment `centre` sees in any case, nearest first.
+    """Returns the existing segments around a segment, nearest first.
 
-    The centre itself is always seen, also where no segment exists (below the floor).
+    The centre itself is included even if it does not exist (below the floor, for example).
+
+    Args:
+        centre: the segment with the entity.
+        see: maximum distance in segments.
+        exists: returns whether a segment exists.
     """
     x, y, z = centre
     span = range(-see, see + 1)
@@ -23,7 +28,13 @@ def around(centre: Cell, see: int, exists: Callable[[Cell], bool]) -> tuple[Cell
 
 
 def update(sees: set[Cell], near: tuple[Cell, ...], keep: int) -> tuple[list[Cell], list[Cell]]:
-    """What to add to `sees`, nearest first, and what to drop from it, for an entity `around` which is `near`."""
+    """Returns the segments to add to a view, nearest first, and the segments to drop from it.
+
+    Args:
+        sees: the segments of the view.
+        near: the result of `around` for the entity; its first segment is the entity's own.
+        keep: distance in segments beyond which a segment is dropped.
+    """
     added = [segment for segment in near if segment not in sees]
     dropped = [segment for segment in sees if distance(segment, near[0]) > keep]
     return added, dropped

@@ -1,10 +1,11 @@
-"""What each client is sent: the newest snapshot if its path has room, and terrain behind it.
+"""Sending: the newest snapshot to each client whose connection has room, then game events and terrain.
 
-Theory of operation. Once a tick each session is served, or not: if more is on the way to it than `pacing` allows, it
-is left out, and gets the union of what it missed with its next snapshot. What goes into that is `sight`'s choice; the
-bytes of a segment's changes are `replication`'s, made once for all. A segment's blocks follow in pieces, behind the
-snapshot, as far as there is room: terrain never makes a snapshot late. What the rules tell goes behind the snapshot
-that has what it speaks of (`outbox`).
+Theory of operation. Once per tick `serve` is called for each session. If more bytes are on the way to the client than
+flow control allows (`flow_control`), the tick is left out; the next snapshot has the union of the changes. The client
+view (`client_view`) chooses the segments of a snapshot. `change_log` encodes the changes of a segment, once
+for all clients. Shared values and game events follow the snapshot; an event is not sent before a snapshot that has the
+entities it names (`server.players.outbox`). The blocks of new segments follow last, in pieces, as far as there is room, so
+terrain never delays a snapshot.
 """
 
 from collections import deque
@@ -25,24 +26,32 @@ from shared.snapshot import VERDICT
 from shared.world import World
 
 GAPS_S = 2.0
-"""Gaps between a client's snapshots are kept for this time, in seconds: longer than lag compensation reaches back."""
+"""Seconds for which gaps between a client's snapshots are kept: longer than lag compensation can look back."""
 EVENT_BYTES = 128
-"""About so many bytes of events may go with each snapshot, however much terrain waits."""
+"""Bytes of game events, about, that may go with each snapshot even if terrain waits."""
 SNAPSHOT_BYTES = messages.MESSAGE_MAX // 2
-"""What more there is waits for the next snapshot, however wide the path; the own segment and one more never do."""
+"""Maximum bytes of a snapshot, about. Further segments wait for the next snapshot, but never the own segment and one
+more."""
 
 
 class Delivery:
-    """Sends to sessions what there is for them."""
+    """The sender of snapshots, game events and terrain to all sessions.
+
+    Args:
+        world: the world.
+        log: the changes of the world.
+        limits: the limits.
+        counters: where snapshots and bytes are counted.
+    """
 
     def __init__(self, world: World, log: ChangeLog, limits: Limits, counters: Counters) -> None:
         self._world, self._log, self._limits, self._counters = world, log, limits, counters
         self._tick_s = 1 / world.scene.tick_rate
         self._around: dict[Cell, tuple[Cell, ...]] = {}
-        """What was seen from a segment by the latest who came into it."""
+        """Segments around a segment, by the latter. Clients share the tuples, which `Parts.together` relies on."""
 
     def serve(self, stream: ClientStream, player: Player, now: float) -> None:
-        """Sends a session the tick that has been recorded, if its path has room."""
+        """Sends a client the snapshot of the latest recorded tick, and what follows it, if its connection has room."""
         pacing, near, centre = stream.pacing, stream.sight.near, self._log.segment(player.entity)
         if not near or near[0] != centre:
             self._look_around(stream, centre)
@@ -63,7 +72,7 @@ class Delivery:
             self._send_terrain(stream, window - pacing.outstanding)
 
     def acked(self, stream: ClientStream, tick: int, now: float) -> None:
-        """The client has applied the snapshot of a tick."""
+        """Handles the acknowledgement of a client: it has applied the snapshot of a tick."""
         if stream.acked < tick <= stream.tick:
             stream.acked = tick
             stream.pacing.acked(tick)
@@ -74,12 +83,12 @@ class Delivery:
                     stream.pacing.answered(now - sent_at, size, now)
 
     def forget(self, stream: ClientStream) -> None:
-        """Begins anew with what a client sees: keyframes and terrain."""
+        """Starts over with a client: its next snapshots have keyframes, and all terrain is sent again."""
         stream.sight.forget()
         self._renew_terrain(stream, stream.sight.sees)
 
     def _look_around(self, stream: ClientStream, centre: Cell) -> None:
-        """The entity is in another segment."""
+        """Updates the client view after the entity has come into another segment."""
         sight = stream.sight
         exists = self._world.blocks.__contains__
         near = interest.around(centre, self._limits.see_radius, exists)
@@ -92,14 +101,14 @@ class Delivery:
             stream.terrain_now = None
 
     def _renew_terrain(self, stream: ClientStream, segments: Collection[Cell]) -> None:
-        """The blocks of these segments are to be sent, or sent again."""
+        """Queues the blocks of segments to be sent, or to be sent again."""
         if stream.terrain_now and stream.terrain_now[0] in segments:
             stream.terrain_now = None
         due = {segment for segment in segments if segment in self._world.blocks}
         stream.terrain_due = self._nearest(stream, sorted(due.union(stream.terrain_due)))
 
     def _nearest(self, stream: ClientStream, segments: Iterable[Cell]) -> deque[Cell]:
-        """Segments in the order in which their blocks are sent."""
+        """Returns segments in the order in which their blocks are sent: the nearest first."""
         own = stream.sight.near[0] if stream.sight.near else (0, 0, 0)
         return deque(sorted(segments, key=lambda segment: interest.distance(segment, own)))
 
@@ -127,10 +136,14 @@ class Delivery:
         self._counters.snapshot_bytes += size
 
     def _send_told(self, stream: ClientStream, player: Player, window: int) -> None:
-        """Sends what the rules have told: shared values, and events as far as they fit into what may be on the way.
+        """Sends the shared values, and game events as far as the window has room.
 
-        Where terrain is due, half of that is left to it. A client that has not acknowledged anything is still joining
-        and would only keep the events: they do not go until nothing has to wait for them.
+        If terrain is due, events get half of the room. A client that has not acknowledged anything is still joining and
+        could not show the events; they wait until there is room and no terrain is due.
+
+        Args:
+            session: the session.
+            window: bytes that may be on the way.
         """
         if stream.shared_due:
             stream.send(stream.shared_due)
@@ -145,9 +158,10 @@ class Delivery:
             stream.send(message)
 
     def _send_terrain(self, stream: ClientStream, room: int) -> None:
-        """Terrain behind the snapshot, as far as it fits into what may be on the way.
+        """Sends terrain as far as the room in bytes allows.
 
-        A segment's blocks never go before its keyframe, which tells no edits: those in between would be lost.
+        A segment's blocks are never sent before its keyframe. A keyframe has no edits, so the client would miss the
+        edits between the two.
         """
         room = min(room, self._limits.terrain_bytes_per_tick)
         while room > 0 and (stream.terrain_now or stream.terrain_due):

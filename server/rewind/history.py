@@ -1,15 +1,16 @@
-"""Lag compensation: what a player saw when acting, answered by the server a moment later.
+"""Lag compensation: the world as a player saw it, for the check of a shot.
 
-Theory of operation. A client draws everybody else a little in the past, between two ticks; by the time its shot is
-here, they are elsewhere. So the last half second is kept (`Limits.rewind_s`), as what each tick has undone: for the
-rows of the world's matrix that the tick changed, what they held before, and likewise the blocks. A `Past` starts from
-the newest tick and takes those back, one after the other: that costs what has changed, and nothing for what sleeps.
-Between two ticks it is computed in the same floats as `client_sdk.interpolation`, so a target is exactly where its
-shooter drew it. Blocks are those of the tick before: what is edited in a tick is there when that tick is over.
+Theory of operation. A client draws other entities a little in the past, between two ticks. When its shot arrives, they
+are elsewhere. Therefore the server keeps the past of the last `Limits.rewind_s` seconds (0.5 by default), as undo data
+of each tick: the former contents of the rows of the world's matrix and of the blocks that the tick changed. A `Past`
+starts from the newest tick and undoes one tick after the other. Its cost depends on the number of changes; sleeping
+entities cost nothing. Positions between two ticks are computed with the same float operations as in
+`client_sdk.interpolation`, so a target is exactly where its shooter drew it. Blocks are those of the earlier of the two
+ticks: an edit takes effect when its tick is over.
 
-What the rules do (place, remove, change, spawn) takes effect at the end of its tick: until then an entity that they
-placed is where it was. A client that was not sent every tick draws between two ticks that are further apart: its *gaps*
-say which, and the second of the two is when all that they did in between takes effect for it.
+Acts of the rules (place, remove, change, spawn) take effect at the end of their tick: until then a placed entity is at
+its former position. A client that was not sent every tick interpolates between two ticks that are further apart. Its
+*gaps* are these pairs of ticks. All acts within a gap take effect at its second tick.
 """
 
 import math
@@ -30,17 +31,17 @@ from shared.units import BLOCK, SEGMENT_SHIFT
 from shared.world import World
 
 WINDOW_S = 0.5
-"""How far back a query may go by default, in seconds."""
+"""Seconds that a query can look back by default."""
 KEPT = [ID, TEMPLATE, X, X + 1, X + 2]
-"""The columns that are kept of a row."""
+"""Columns of a row that are kept."""
 MARGIN = 1e-3
-"""Boxes are sorted out in floats with this much to spare, in blocks; what is left is decided exactly."""
+"""Blocks by which boxes are enlarged in the quick test in floats. Boxes that pass it are tested exactly."""
 
 Floats = npt.NDArray[np.float64]
 
 
 class Hit(NamedTuple):
-    """What a ray has met: an entity or a block (the other is None), how far away and where, in blocks."""
+    """A hit of a ray: an entity or a block (the other is None), its distance and the point, in blocks."""
 
     entity: int | None
     block: Cell | None
@@ -49,9 +50,10 @@ class Hit(NamedTuple):
 
 
 class _Undo(NamedTuple):
-    """What a tick has changed, as it was before: rows of the matrix ([n, 6], each after its number), and blocks.
+    """The undo data of one tick.
 
-    `placed`: the entities that did not move there, but were placed.
+    `rows`: the number of each changed row of the matrix and its former contents, [n, 6]. `blocks`: the former kinds of
+    the changed blocks. `placed`: the entities that the rules placed in the tick.
     """
 
     rows: Int64s
@@ -60,11 +62,11 @@ class _Undo(NamedTuple):
 
 
 class Rewind:
-    """The recent past of one world. Record each tick once, after its step.
+    """The recent past of one world. Call `record` once per tick, after the step.
 
     Args:
-        world: stepped elsewhere.
-        window_s: how far back it goes, in seconds. It takes 48 bytes for each entity that a tick of it has changed.
+        world: the world; other code steps it.
+        window_s: seconds that are kept. Each change of an entity in a tick takes 48 bytes.
     """
 
     def __init__(self, world: World, window_s: float = WINDOW_S) -> None:
@@ -72,7 +74,7 @@ class Rewind:
         self._reach = window_s * world.scene.tick_rate
         self._undo: deque[_Undo] = deque()
         self._placed_at = -math.inf
-        """The newest tick in which an entity was placed."""
+        """Newest tick in which an entity was placed."""
         self._boxes = _boxes(world.scene)
         self._tick = -1
         self._alive = 0
@@ -80,9 +82,9 @@ class Rewind:
         self._begin()
 
     def record(self) -> None:
-        """Takes in what the step has changed."""
+        """Records the undo data of the latest step."""
         world = self._world
-        if world.tick != self._tick + 1:  # it has been put elsewhere in time
+        if world.tick != self._tick + 1:  # the world was set to another tick
             self._begin()
             return
         w = world.arrays
@@ -104,19 +106,19 @@ class Rewind:
         if world.placed:
             self._placed_at = world.tick
         kept = math.ceil(self._reach)
-        # Within the reach, a gap of up to that length may be drawn: it begins as much earlier.
+        # A query within the reach may be in a gap of up to the same length, which begins that much earlier.
         if self._tick - self._placed_at <= 2 * kept:
             kept *= 2
         while len(self._undo) > kept:
             self._undo.popleft()
 
     def at(self, seen: float, own: int = 0, gaps: Iterable[tuple[int, int]] = ()) -> "Past":
-        """The world at a moment, which need not be a whole tick; clamped to what is kept.
+        """Returns the world at a moment. A moment outside of what is kept is moved to its nearest end.
 
         Args:
-            seen: the server's tick, as a fraction.
-            own: an entity that no query finds: who asks.
-            gaps: the asking client was sent the two ticks of each, and none between.
+            seen: the moment in ticks of server time, with a fraction.
+            own: an entity that no query finds: that of the player for whom the query is.
+            gaps: pairs of ticks between which the player's client was sent no snapshot.
 
         Raises:
             SceneError: `seen` is not a finite number.
@@ -142,7 +144,7 @@ class Rewind:
         return Past(self._world, seen, entities, self._boxes, blocks, own)
 
     def _begin(self) -> None:
-        """Knows the present and no past."""
+        """Starts over with the present state and no past."""
         self._undo.clear()
         self._tick = self._world.tick
         self._now = np.ascontiguousarray(self._world.matrix[:, KEPT])
@@ -150,9 +152,10 @@ class Rewind:
 
 
 class Past:
-    """The world at one moment of the recent past, for as long as no tick has passed since it was asked for.
+    """The world at one moment of the recent past. Valid until the next tick.
 
-    `seen` is the moment that was granted, in ticks of the server.
+    Attributes:
+        seen: the moment, in ticks of server time, after it was limited to what is kept.
     """
 
     def __init__(
@@ -179,10 +182,10 @@ class Past:
         return bool((self._ids == entity).any())
 
     def position(self, entity: int) -> Vec:
-        """Where an entity was, in blocks.
+        """Returns the position of an entity at that moment, in blocks.
 
         Raises:
-            KeyError: it did not exist.
+            KeyError: the entity did not exist.
         """
         found = np.flatnonzero(self._ids == entity)
         if not len(found):
@@ -191,20 +194,23 @@ class Past:
         return x, y, z
 
     def block(self, x: int, y: int, z: int) -> int | None:
-        """The kind of a block; None where no segment is loaded (now: of whole segments there is no past)."""
+        """Returns the kind of a block at that moment; None if its segment is not loaded now.
+
+        Loading and unloading of whole segments is not undone.
+        """
         kind = self._blocks.get((x, y, z))
         return self._world.blocks.get(x, y, z) if kind is None else kind
 
     def ray(
         self, origin: Sequence[float], direction: Sequence[float], length: float, but: Collection[int] = ()
     ) -> list[Hit]:
-        """What a ray meets, nearest first, up to the first block; what is not loaded is a block.
+        """Returns the hits of a ray, nearest first. It ends at the first block; a place that is not loaded is a block.
 
         Args:
-            origin: in blocks.
-            direction: of any length but zero.
-            length: in blocks, at most 1024.
-            but: ids that are left out, besides one's own.
+            origin: start of the ray in blocks.
+            direction: direction of the ray, of any length except zero.
+            length: length of the ray in blocks, at most 1024.
+            but: entities to ignore, besides the player's own.
 
         Raises:
             SceneError: a number is not finite or out of range, or the direction is zero.
@@ -225,7 +231,7 @@ class Past:
         return hits
 
     def box(self, low: Sequence[float], high: Sequence[float]) -> list[int]:
-        """The ids of the entities that overlap the box between two corners (in blocks), ascending.
+        """Returns the entities that overlap the box between two corners (in blocks), in ascending order.
 
         Raises:
             SceneError: a number is not finite.
@@ -239,7 +245,7 @@ class Past:
         return cell[2] >= self._floor if kind is None else kind != 0
 
     def _near(self, ray: Ray) -> Int64s:
-        """The entities that the ray may hit: the slab test in floats, with a margin."""
+        """Returns the indices of the entities that the ray may hit, by the slab test in floats with a margin."""
         largest = max(map(abs, ray.direction))
         origin, way = np.array(ray.origin), np.array(ray.direction) / largest
         low, high = self._low - origin - MARGIN, self._high - origin + MARGIN
@@ -253,7 +259,17 @@ class Past:
 
 
 def _between(old: Int64s, new: Int64s, share: float, placed: set[int]) -> tuple[Int64s, Floats]:
-    """Returns the entities of `old` and their places: on the way to `new`, unless they are gone or were `placed`."""
+    """Interpolates between two ticks.
+
+    Args:
+        old: the kept columns of all rows at the first tick.
+        new: the same at the second tick.
+        share: the moment between them, from 0 to 1.
+        placed: entities that the rules placed; they stay at their positions of the first tick.
+
+    Returns:
+        The rows of `old` with an entity, and their positions in blocks.
+    """
     places = old[:, 2:] / BLOCK
     if share > 0:
         moves = old[:, 0] == new[:, 0]
@@ -266,6 +282,6 @@ def _between(old: Int64s, new: Int64s, share: float, placed: set[int]) -> tuple[
 
 
 def _boxes(scene: Scene) -> Any:
-    """For each template its box's low corner from the position, and its sides: [n, 2, 3], in blocks."""
+    """Returns low corner (relative to the position) and sides of the box of each template, [n, 2, 3], in blocks."""
     rows = scene.kernel_tables()[0][:, layout.LO_X : layout.LO_X + 6]
     return rows.reshape(-1, 2, 3) / BLOCK

@@ -1,8 +1,8 @@
-"""Rays through boxes and blocks, exact: floats are whole numbers over powers of two, and so nothing is rounded.
+"""Rays through boxes and blocks, computed exactly: a float is a fraction of whole numbers, so nothing is rounded.
 
-A ray hits what it goes through for more than a point. One that only touches an edge or a corner passes; one that
-runs within a face belongs to the box above that face (a box is closed at its low side and open at its high one).
-Where it starts inside, the distance is 0. Points of a ray are counted in `t`: origin + t * direction.
+A ray hits a box if they share more than a point. A ray that only touches an edge or a corner passes. A ray within a
+face hits the box above that face, because a box is closed at its low sides and open at its high sides. If a ray starts
+inside a box, its distance is 0. `t` is the parameter of a point on the ray: origin + t * direction.
 """
 
 import math
@@ -13,16 +13,16 @@ from shared.checks import Cell, SceneError, Vec, finite, vector
 from shared.units import RANGE_BLOCKS
 
 LENGTH_MAX = 1024.0
-"""No ray is longer, in blocks."""
+"""Maximum length of a ray, in blocks."""
 
 
 class Ray:
-    """A ray of some length, at most 1024 blocks.
+    """A ray of limited length.
 
     Args:
-        origin: in blocks.
-        direction: of any length but zero.
-        length: in blocks.
+        origin: start of the ray in blocks.
+        direction: direction of the ray, of any length except zero.
+        length: length of the ray in blocks, at most 1024.
 
     Raises:
         SceneError: a number is not finite or out of range, or the direction is zero.
@@ -32,7 +32,7 @@ class Ray:
         self.origin = vector(origin, "origin")
         self.direction = vector(direction, "direction")
         if max(map(abs, self.origin)) > RANGE_BLOCKS:
-            raise SceneError(f"origin = {origin!r}: outside of +-{RANGE_BLOCKS} blocks")
+            raise SceneError(f"origin = {origin!r}: must be within +-{RANGE_BLOCKS} blocks")
         if not any(self.direction):
             raise SceneError(f"direction = {direction!r}: must not be zero")
         self.length = finite(length, "length")
@@ -43,16 +43,16 @@ class Ray:
         self._norm = math.hypot(*(float(part / self._longest) for part in self._way))
 
     def distance(self, t: Fraction) -> float:
-        """How far along the ray a point is, in blocks."""
+        """Returns the distance of the point `t` from the origin, in blocks."""
         return float(t * self._longest) * self._norm
 
     def point(self, t: Fraction) -> Vec:
-        """The point itself, in blocks, each part rounded once."""
+        """Returns the position of the point `t` in blocks. Each coordinate is rounded once."""
         x, y, z = (float(Fraction(a) + t * way) for a, way in zip(self.origin, self._way, strict=True))
         return x, y, z
 
     def enters(self, low: Sequence[float], high: Sequence[float]) -> Fraction | None:
-        """Where the ray enters the box between two corners; None if it misses it or the box is out of reach."""
+        """Returns the `t` at which the ray enters the box between two corners; None if it misses or is too short."""
         first, last = Fraction(0), None
         for a, way, lo, hi in zip(self.origin, self._way, low, high, strict=True):
             if not way:
@@ -66,13 +66,16 @@ class Ray:
         return first if first < last and self.distance(first) <= self.length else None
 
     def meets(self, solid: Callable[[Cell], bool]) -> tuple[Cell, Fraction] | None:
-        """The first solid block that the ray goes through, and where it enters it; None: there is none within reach.
+        """Returns the first solid block on the ray and the `t` at which the ray enters it; None: there is none.
 
-        The crossings of all three axes are brought to one denominator: then they are whole numbers that are
-        compared and added, whatever the direction. Where two coincide, the ray goes through the edge.
+        The crossings of the block planes of all three axes get one denominator, so they are whole numbers that can be
+        compared and added for any direction. If two crossings coincide, the ray goes through an edge.
+
+        Args:
+            solid: returns whether a block stops the ray.
         """
         ones = [part.as_integer_ratio() for part in self.origin]
-        one = max(den for _, den in ones)  # powers of two: the greatest is a multiple of all
+        one = max(den for _, den in ones)  # all are powers of two, so the greatest is a multiple of the others
         ways = [part.as_integer_ratio() for part in self.direction]
         unit = max(den for _, den in ways)
         way = [num * (unit // den) for num, den in ways]
