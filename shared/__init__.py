@@ -1,1 +1,1 @@
-"""The rules: one deterministic world that server and client step alike."""
+"""The rules that server and client share: the deterministic world, its wire format and its limits."""

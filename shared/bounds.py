@@ -33,7 +33,7 @@ assert UPDATE_S <= AHEAD_S, "the inputs of one update are accepted"
 
 
 class Bounds(NamedTuple):
-    """The limits above in ticks; `bounds(rate)` makes them."""
+    """The time limits in ticks, for one tick rate; `bounds(rate)` returns them."""
 
     ahead: int
     repeats: int
@@ -43,7 +43,7 @@ class Bounds(NamedTuple):
     update: int
     predicted: int
     margin_one: float
-    """A margin of one tick, in units of the wire."""
+    """Value on the wire of a margin of one tick: `MARGINS_PER_S` divided by the tick rate."""
 
 
 def in_ticks(seconds: float, rate: float, least: int) -> int:

@@ -1,7 +1,7 @@
-"""Checks of values that come from people: what is not as it should be raises `SceneError`.
+"""Checks of values that come from a program or a file; a wrong value raises `SceneError`.
 
-Each error names the field (`at`: where it stands, like "templates[1].name") and the value. Numbers may be numpy's, and
-come out as Python's own, which MessagePack can hold. A truth value is no number.
+The argument `at` names the field, like "templates[1].name"; each error names the field and the value. Numbers of numpy
+are accepted and returned as Python's own, which MessagePack can hold. A truth value does not count as a number.
 """
 
 import math
@@ -12,36 +12,43 @@ from typing import Any
 import numpy as np
 
 WHOLE = (int, np.integer)
+"""Types of whole numbers (`bool` is a subclass of `int`, and has to be excluded separately)."""
 NUMBERS = (*WHOLE, float, np.floating)
-"""Types of which a value is a number, if it is no truth value; `WHOLE`: a whole one."""
+"""Types of numbers (`bool` has to be excluded separately)."""
 
 Vec = tuple[float, float, float]
+"""Three numbers: x, y, z."""
 Cell = tuple[int, int, int]
+"""Three whole numbers: the index of a segment, or the place of a block."""
 
 
 class SceneError(ValueError):
-    """A value that no world can hold; the message names the field and the value."""
+    """A value that a world cannot hold; the message names the field and the value."""
 
 
 class MissingError(KeyError):
-    """Something is named that is not there: an entity, or a segment; the message says which."""
+    """An entity or a segment does not exist; the message says which."""
 
     def __str__(self) -> str:
         return str(self.args[0])
 
 
 def shown(value: object) -> str:
-    """A value as an error shows it: short, and on one line, whatever it is."""
+    """Returns a value as a short text of one line, for an error; works for any object."""
     try:
         text = repr(value)
-    except Exception:  # a number of 5,000 digits, a list of lists of lists, an object of its own mind
+    except Exception:  # a number of 5,000 digits, a deeply nested list, or an object whose `__repr__` fails
         text = f"<{type(value).__name__}>"
     text = " ".join(text.split())
     return text if len(text) <= 80 else f"{text[:77]}..."
 
 
 def finite(value: object, at: str) -> float:
-    """A finite number, as a float; not a truth value."""
+    """Returns a finite number as a float.
+
+    Raises:
+        SceneError: `value` is not a number, or not finite.
+    """
     if isinstance(value, bool) or not isinstance(value, NUMBERS):
         raise SceneError(f"{at} = {shown(value)}: must be a number")
     try:
@@ -54,7 +61,16 @@ def finite(value: object, at: str) -> float:
 
 
 def duration(value: object, at: str, *, endless: bool = False) -> float:
-    """A number of 0 or more: a time in seconds, for example. With `endless`, math.inf is one, too."""
+    """Returns a number of 0 or more, for example a time in seconds.
+
+    Args:
+        value: the value to check.
+        at: name of the field, for the error.
+        endless: whether math.inf is allowed.
+
+    Raises:
+        SceneError: `value` is not such a number.
+    """
     if endless and value == math.inf:
         return math.inf
     if finite(value, at) < 0:
@@ -63,7 +79,7 @@ def duration(value: object, at: str, *, endless: bool = False) -> float:
 
 
 def utf8(value: str) -> bool:
-    """Whether UTF-8 can hold a text: a lone surrogate, half of a character, it cannot."""
+    """Returns whether UTF-8 can hold a text; it cannot hold a lone surrogate, which is half of a character."""
     try:
         value.encode()
     except UnicodeEncodeError:
@@ -72,7 +88,11 @@ def utf8(value: str) -> bool:
 
 
 def text(value: object, at: str, longest: int = 64, shortest: int = 1) -> str:
-    """Returns a text of `shortest` to `longest` characters that UTF-8 can hold."""
+    """Returns a text of `shortest` to `longest` characters that UTF-8 can hold.
+
+    Raises:
+        SceneError: `value` is not such a text.
+    """
     if not isinstance(value, str) or not shortest <= len(value) <= longest:
         raise SceneError(f"{at} = {shown(value)}: must be a text of {shortest} to {longest} characters")
     if not utf8(value):
@@ -81,14 +101,22 @@ def text(value: object, at: str, longest: int = 64, shortest: int = 1) -> str:
 
 
 def boolean(value: object, at: str) -> bool:
-    """True or false, as Python's own."""
+    """Returns a truth value as Python's own.
+
+    Raises:
+        SceneError: `value` is not a truth value.
+    """
     if not isinstance(value, bool | np.bool_):
         raise SceneError(f"{at} = {shown(value)}: must be true or false")
     return bool(value)
 
 
 def whole(value: object, at: str, low: int, high: int) -> int:
-    """A whole number from `low` to `high`; not a truth value."""
+    """Returns a whole number from `low` to `high`.
+
+    Raises:
+        SceneError: `value` is not such a number.
+    """
     if type(value) is int and low <= value <= high:
         return value
     if isinstance(value, bool) or not isinstance(value, WHOLE) or not low <= value <= high:
@@ -97,34 +125,54 @@ def whole(value: object, at: str, low: int, high: int) -> int:
 
 
 def choice(value: object, at: str, choices: Collection[str]) -> str:
-    """One of some texts."""
+    """Returns a text that is one of `choices`.
+
+    Raises:
+        SceneError: `value` is not one of them.
+    """
     if not isinstance(value, str) or value not in choices:
         raise SceneError(f"{at} = {shown(value)}: must be one of {', '.join(choices)}")
     return value
 
 
 def items(value: object, at: str) -> list[Any]:
-    """A list or a tuple, as a list."""
+    """Returns a list or a tuple as a list.
+
+    Raises:
+        SceneError: `value` is neither.
+    """
     if not isinstance(value, list | tuple):
         raise SceneError(f"{at} = {shown(value)}: must be a list")
     return list(value)
 
 
 def vector(value: object, at: str) -> Vec:
-    """Three finite numbers; an error in one names its axis."""
+    """Returns three finite numbers.
+
+    Raises:
+        SceneError: `value` has not three numbers, or one is not finite; the message names the axis.
+    """
     x, y, z = (finite(part, f"{at}.{axis}") for axis, part in zip("xyz", _three(value, at, "numbers"), strict=True))
     return x, y, z
 
 
 def cell(value: object, at: str, low: int, high: int) -> Cell:
-    """Three whole numbers from `low` to `high`; an error in one names its axis."""
+    """Returns three whole numbers from `low` to `high`.
+
+    Raises:
+        SceneError: `value` has not three such numbers; the message names the axis.
+    """
     parts = _three(value, at, "whole numbers")
     x, y, z = (whole(part, f"{at}.{axis}", low, high) for axis, part in zip("xyz", parts, strict=True))
     return x, y, z
 
 
 def _three(value: object, at: str, what: str) -> list[Any]:
-    """The parts of a list, a tuple, an array or a vector of three."""
+    """Returns the three parts of a list, a tuple, an array or another vector.
+
+    Raises:
+        SceneError: `value` has not three parts, which `what` names.
+    """
     parts: list[Any] = []
     if isinstance(value, Sized) and isinstance(value, Iterable) and not isinstance(value, str | bytes | Mapping | Set):
         with suppress(TypeError):  # an array without a dimension

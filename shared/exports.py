@@ -1,6 +1,6 @@
 """The functions of the kernel sources that Python calls, and the kinds of their arguments.
 
-Both the prebuilt libraries (`scripts/kernels`) and the entry points that Numba compiles are made from this table.
+The prebuilt libraries (`scripts/kernels`) and the entry points that Numba compiles are made from this table.
 """
 
 from types import ModuleType
@@ -10,7 +10,7 @@ from shared.layout import Arrays
 WORLD, NUMBER, TRUTH = "w", "n", "?"
 """Kinds of arguments: the `Arrays` of a world, a whole number, and a truth value."""
 ARRAYS = {"q": ("int64", 8), "i": ("int32", 4), "u": ("uint32", 4), "b": ("uint8", 1)}
-"""Kinds of flat arrays: the type of their elements, and its size in bytes. A capital letter: it is written to."""
+"""Kinds of flat arrays: type and size in bytes of their elements. A capital letter is an array that is written to."""
 
 EXPORTS = {
     "kernel": {
@@ -35,28 +35,28 @@ EXPORTS = {
         "recall": "qqQQn",
     },
 }
-"""Each function by its source: one letter for each argument. All return nothing, a truth value or a whole number that
-fits into 32 bits."""
+"""Argument kinds of each function, by source: one letter per argument. A function returns nothing, a truth value, or a
+whole number that fits into 32 bits."""
 
 FIELDS = {name: {"solid": "u", "heads": "i"}.get(name, "q") for name in Arrays._fields}
-"""The kind of each array of a world."""
+"""Kind of each array of a world (`layout.Arrays`), by name."""
 
 
 def functions() -> dict[str, str]:
-    """The argument kinds of all functions, by name."""
+    """Returns the argument kinds of all functions, by name."""
     return {name: kinds for of_source in EXPORTS.values() for name, kinds in of_source.items()}
 
 
 def of(source: ModuleType) -> dict[str, str]:
-    """Returns the functions of one source, with the kinds of their arguments."""
+    """Returns the argument kinds of the functions of one source, by name."""
     return EXPORTS[source.__name__.rpartition(".")[2]]
 
 
 def words_of(kinds: str) -> int:
-    """The number of int64 words that hold the arguments of a call: two for an array (address, length), else one."""
+    """Returns the number of int64 words for the arguments of a call: two per array (address, length), else one."""
     return sum(1 if kind in (WORLD, NUMBER, TRUTH) else 2 for kind in kinds)
 
 
 def item(kind: str) -> tuple[str, int]:
-    """The element type of an array of a kind, and its size in bytes."""
+    """Returns the element type of an array of a kind, and the size of an element in bytes."""
     return ARRAYS[kind.lower()]

@@ -1,4 +1,4 @@
-"""What a player wishes for one tick, in small integers: the unit of prediction and of authority."""
+"""The input of a player for one tick: a direction and buttons, in small whole numbers."""
 
 import math
 from typing import NamedTuple
@@ -9,18 +9,19 @@ from shared.checks import SceneError, boolean, finite, shown, whole
 from shared.units import rounded
 
 MOVE_MAX = 127
-"""Length of a full-speed move intent."""
+"""Length of a direction at full speed."""
 BUTTONS_MAX = 255
+"""Greatest value of the buttons: 8 bits."""
 WISH_MAX = 1 << 31
-"""The greatest part of a move intent that is taken; `clamp` and the kernel shorten it to 127."""
+"""Greatest part of a direction that is accepted; `clamp` and the kernel shorten the direction to length 127."""
 FAR = 1e9
-"""The longest direction that `make_input` takes."""
+"""Greatest part of a direction that `make_input` accepts, where full speed is 1."""
 JUMP = 1
 """Bit of `Input.buttons`: jump as soon as something supports the entity."""
 
 
 class Input(NamedTuple):
-    """One atomic input: `move_x` (east) and `move_y` (north) in -127..127, and buttons as bits."""
+    """The input of one tick: the direction `move_x` (east) and `move_y` (north) in -127..127, and buttons as bits."""
 
     move_x: int = 0
     move_y: int = 0
@@ -31,15 +32,16 @@ NEUTRAL = Input()
 
 
 def make_input(x: float = 0.0, y: float = 0.0, *, jump: object = False, buttons: int = 0) -> Input:
-    """An input from a direction in -1..1 per axis; anything longer than 1 is shortened to 1.
+    """Returns the input for a direction of length 0 (stand) to 1 (full speed). A longer one is shortened to 1.
 
     Args:
-        x, y: the direction, east and north; truth values count as 0 and 1, as keys that are held.
+        x: east part of the direction. A truth value counts as 0 or 1, so the state of a key can be passed.
+        y: north part of the direction.
         jump: whether to jump.
-        buttons: further bits, 0 to 255.
+        buttons: further buttons as bits, 0 to 255.
 
     Raises:
-        SceneError: a direction that is not finite or beyond +-10^9, or another value of the wrong kind.
+        SceneError: the direction is not finite, or beyond +-10^9; or another value is of a wrong type.
     """
     jumps = bool(jump) if isinstance(jump, int) else boolean(jump, "jump")
     bits = whole(buttons, "buttons", 0, BUTTONS_MAX) if buttons else 0
@@ -48,7 +50,7 @@ def make_input(x: float = 0.0, y: float = 0.0, *, jump: object = False, buttons:
 
 
 def _way(part: object, at: str) -> float:
-    """One part of a direction."""
+    """Returns one part of a direction, checked."""
     if type(part) in (float, int) and -FAR <= part <= FAR:  # type: ignore[operator]
         return part  # type: ignore[return-value]
     number = finite(int(part) if isinstance(part, bool | np.bool_) else part, at)
@@ -58,10 +60,14 @@ def _way(part: object, at: str) -> float:
 
 
 def checked_input(wish: object, at: str) -> Input:
-    """An input whose parts are Python's own whole numbers; a move intent beyond 127 is shortened later.
+    """Returns an input with Python's own whole numbers. A direction longer than 127 is allowed; `clamp` shortens it.
+
+    Args:
+        wish: the value to check.
+        at: name of the argument, for the error.
 
     Raises:
-        SceneError: it is none.
+        SceneError: `wish` is not an input.
     """
     if not isinstance(wish, tuple) or len(wish) != len(Input._fields):
         raise SceneError(f"{at} = {shown(wish)}: must be an `Input`")
@@ -74,18 +80,18 @@ def checked_input(wish: object, at: str) -> Input:
 
 
 def row(wish: Input) -> bytes:
-    """An input as it goes over the wire, in `Inputs.rows`."""
+    """Returns an input packed for `Inputs.rows`: 3 bytes."""
     x, y, buttons = wish
     return bytes((x & 0xFF, y & 0xFF, buttons & 0xFF))
 
 
 def clamp(wish: Input) -> Input:
-    """`wish` with its move intent shortened to length 127 in whole numbers (the one rule for both sides)."""
+    """Returns the input with its direction shortened to length 127, in whole numbers. Both sides use this rule."""
     x, y = wish.move_x, wish.move_y
     square = x * x + y * y
     if square <= MOVE_MAX * MOVE_MAX:
         return wish
-    # The longest vector in this direction whose parts are whole: |part| = floor(127 |part| / length).
+    # |part| = floor(127 |part| / length): the longest vector of whole numbers in this direction.
     return wish._replace(move_x=_shortened(x, square), move_y=_shortened(y, square))
 
 

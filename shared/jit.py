@@ -1,23 +1,28 @@
-"""What turns functions into a kernel: nothing in the plain instance of its source, Numba in the compiled one."""
+"""Decorators of the kernel's functions: Numba's in the compiled instance of a source, none in the plain instance."""
 
 from typing import Any, Protocol, TypeVar
 
 F = TypeVar("F")
 
 COMPILED = "_compiled"
-"""The end of the name under which the compiled instance of a source is loaded (`shared.kernels`)."""
+"""Suffix of the module name under which the compiled instance of a source is loaded (`shared.numba_kernel`)."""
 OPTIONS = {"cache": True, "nogil": True, "error_model": "numpy", "_nrt": False}
-"""Without reference counts on the arrays (`_nrt`) a turn takes 60 ns instead of 2,200: nothing in kernels makes any."""
+"""Options of Numba. Without reference counts on arrays (`_nrt`) a turn takes 60 ns instead of 2,200; kernels create no
+arrays, so they need none."""
 
 
 class Decorator(Protocol):
-    """Leaves the type of a function as it is."""
+    """A decorator that keeps the type of a function."""
 
     def __call__(self, function: F, /) -> F: ...
 
 
 def decorators(module: str) -> tuple[Decorator, Decorator]:
-    """For the functions of a module, by its name: the one that compiles, and the one that also inlines."""
+    """Returns two decorators for the functions of a module: one that compiles, and one that also inlines.
+
+    Args:
+        module: name of the module. Without the suffix `COMPILED`, both decorators change nothing.
+    """
     if not module.endswith(COMPILED):
         return _plain, _plain
     import numba

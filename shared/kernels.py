@@ -1,13 +1,13 @@
-"""One source, three forms: the kernel of `shared.kernel` and `shared.bulk` prebuilt, compiled by Numba, and as it is.
+"""The choice of the kernel: `shared.kernel` and `shared.bulk` in three forms.
 
-    prebuilt  a library of this package for this platform (`scripts/kernels` makes it); it is loaded in a millisecond
-    numba     compiled when it is first used, by Numba if that is installed: up to a minute, then from a cache on disk
-    plain     the sources as they are, in Python: some hundred times slower, and everywhere
+    prebuilt  a library of this package for this platform (`scripts/kernels` makes it); it loads in a millisecond
+    numba     compiled at its first use, by Numba if that is installed: up to a minute, then from a cache on disk
+    plain     the sources as they are, in Python: a hundred times slower or more, but available everywhere
 
-Theory of operation. All three compute the same bits, so the choice is one of speed alone: the first of them that is
-there. The setting SOVEREIGN_KERNEL forces one. A prebuilt library carries a checksum of the sources and of the
-constants that it was made from; where these are others by now, it is not used. Nobody else decides this: a `World` asks
-for a `Kernel` here and everything that works on this world takes the world's.
+Theory of operation. All three forms compute the same bits, so the choice affects speed alone: the first form that is
+available is used. The setting SOVEREIGN_KERNEL forces one. A prebuilt library carries a checksum of the sources and
+constants that it was made from; if these have changed, it is not used. This module alone makes the choice: a `World`
+gets its `Kernel` here, and all code that works on this world uses the world's kernel.
 """
 
 import contextlib
@@ -29,33 +29,41 @@ import numpy as np
 from shared import bulk, exports, freshness, kernel, numba_kernel
 
 VARIABLE = "SOVEREIGN_KERNEL"
+"""Name of the environment variable that forces a form."""
 PREBUILT, NUMBA, PLAIN = FORMS = ("prebuilt", "numba", "plain")
+"""Forms of the kernel."""
 AUTO = "auto"
+"""Setting that takes the first form that is available."""
 CHOICES = (AUTO, *FORMS)
+"""Values of the setting."""
 SOURCES: tuple[ModuleType, ...] = (kernel, bulk)
+"""Modules that the kernel is made from."""
 LIBRARIES = Path(__file__).parent / "prebuilt"
+"""Folder of the prebuilt libraries."""
 MODULE = "sovereign_kernel"
-"""The name of the Python module in each library."""
+"""Name of the Python module in each library."""
 TARGETS = {
     ("linux", "x86_64"): "linux-x86_64.so",
     ("linux", "aarch64"): "linux-arm64.so",
     ("win32", "amd64"): "windows-x86_64.pyd",
     ("darwin", "arm64"): "macos-arm64.so",
 }
-"""The library for each platform (`sys.platform`, `platform.machine()`)."""
+"""File name of the library for each platform (`sys.platform`, `platform.machine()`)."""
 MANIFEST = "manifest.json"
+"""File name of the list of libraries with their checksums."""
 CONSTANTS_CRC, CODE_CRC = range(2)
-"""What `built_from` of a library is asked for."""
+"""Arguments of a library's function `built_from`: which checksum it returns."""
 
 
 class Kernel(SimpleNamespace):
-    """The functions of `shared.exports` in one form, as attributes, and what their arguments have to be.
+    """One form of the kernel: the functions of `shared.exports` as attributes, and converters for their arguments.
 
     Attributes:
         form: one of `FORMS`.
-        compiled: whether it is a fast one.
-        lent: makes of a numpy array the flat array that functions take, on the same memory.
-        bound: makes of the `Arrays` of a world what functions take for it. Whoever calls keeps the arrays alive.
+        compiled: whether the form is a compiled one.
+        lent: returns the flat array that functions take for a numpy array; both share the memory.
+        bound: returns the value that functions take for the `Arrays` of a world. The caller has to keep the arrays
+            alive.
     """
 
     form: str
@@ -63,11 +71,14 @@ class Kernel(SimpleNamespace):
 
 
 def get(compiled: bool | None = None) -> Kernel:
-    """A kernel: the chosen form by default; else a compiled form (the chosen one if it is one), or the plain one.
+    """Returns a kernel.
+
+    Args:
+        compiled: None: the chosen form; True: a compiled form (the chosen one if it is compiled); False: the plain one.
 
     Raises:
-        ImportError: that form cannot be had here.
-        ValueError: the setting is none of `CHOICES`.
+        ImportError: that form is not available here.
+        ValueError: the setting is not one of `CHOICES`.
     """
     if compiled is None:
         return _loaded(chosen())
@@ -78,13 +89,13 @@ def get(compiled: bool | None = None) -> Kernel:
 
 
 def chosen(setting: str | None = None) -> str:
-    """The form that runs: the one that is forced, or the first that is there.
+    """Returns the form that is used: the forced one, or the first that is available.
 
     Args:
-        setting: one of `CHOICES`; None: the one in force.
+        setting: one of `CHOICES`; None: the setting in force.
 
     Raises:
-        ValueError: the setting is none of `CHOICES`.
+        ValueError: the setting is not one of `CHOICES`.
     """
     setting = setting or _forced.get(VARIABLE) or os.environ.get(VARIABLE) or AUTO
     if setting not in CHOICES:
@@ -97,25 +108,29 @@ def chosen(setting: str | None = None) -> str:
 
 
 def force(setting: str) -> None:
-    """Chooses one of `CHOICES` for this process, whatever the environment says."""
+    """Sets one of `CHOICES` for this process; it takes precedence over the environment variable."""
     _forced[VARIABLE] = setting
 
 
 def ready() -> bool:
-    """Whether the chosen form can be had at once: nothing has to be compiled, or it has been."""
+    """Returns whether the chosen form is available at once, without waiting for a compiler."""
     form = chosen()
     return form != NUMBA or form in _kernels
 
 
 def missing(setting: str) -> str:
-    """Why one of `CHOICES` cannot be had here; empty if it can."""
+    """Returns the reason why one of `CHOICES` is not available here; empty if it is."""
     if setting == PREBUILT:
         return trouble()
     return "Numba is not installed" if setting == NUMBA and not numba_installed() else ""
 
 
 def describe(setting: str | None = None) -> str:
-    """The form that runs, for people: with its library, or why it is not the prebuilt one. Arguments as of `chosen`."""
+    """Returns a text with the form that is used, and its library, or the reason why it is not the prebuilt one.
+
+    Args:
+        setting: one of `CHOICES`; None: the setting in force.
+    """
     form = chosen(setting)
     if form == PREBUILT:
         return f"{form}, {_target()}"
@@ -123,17 +138,17 @@ def describe(setting: str | None = None) -> str:
 
 
 def available() -> bool:
-    """Whether there is any compiled form."""
+    """Returns whether a compiled form is available."""
     return not trouble() or numba_installed()
 
 
 def numba_installed() -> bool:
-    """Whether Numba is installed, without importing it."""
+    """Returns whether Numba is installed, without importing it."""
     return importlib.util.find_spec("numba") is not None
 
 
 def constants_crc() -> int:
-    """A checksum of what is built into the functions though it stands in other files: constants, and the exports."""
+    """Returns a checksum of what a library contains from other files: constants and the table of exports."""
     return freshness.crc(
         [repr([freshness.constants(source) for source in SOURCES]), repr((exports.EXPORTS, exports.FIELDS))]
     )
@@ -141,7 +156,7 @@ def constants_crc() -> int:
 
 @functools.cache
 def trouble() -> str:
-    """Why the prebuilt kernel cannot be used here; empty if it can."""
+    """Returns the reason why the prebuilt kernel cannot be used here; empty if it can."""
     try:
         _library()
     except ImportError as error:
@@ -151,7 +166,7 @@ def trouble() -> str:
 
 @contextlib.contextmanager
 def compiling(tell: Callable[[], None]) -> Iterator[None]:
-    """Meanwhile calls `tell`, once, as soon as Numba has to compile what is not in its cache on disk."""
+    """Returns a context in which `tell` is called once, when Numba begins to compile what its cache does not have."""
     if chosen() != NUMBA:
         yield
         return
@@ -185,7 +200,7 @@ def _loaded(form: str) -> Kernel:
 
 
 def _view(array: np.ndarray[Any, Any]) -> memoryview:
-    """An array, flat: the plain source gets Python's own whole numbers from it, a library its buffer."""
+    """Returns a flat view of an array. The plain sources read Python's own numbers from it, a library its buffer."""
     return memoryview(array.reshape(-1))  # type: ignore[arg-type]
 
 
@@ -195,28 +210,28 @@ def _plain() -> Kernel:
 
 
 def kernel_of(library: ModuleType, form: str = PREBUILT) -> Kernel:
-    """The kernel in a Python module that `scripts/kernels` can build."""
+    """Returns the kernel in a Python module that `scripts/kernels` builds."""
     functions = {name: getattr(library, name) for name in exports.functions()}
     return Kernel(form=form, compiled=True, lent=_view, bound=_table, **functions)
 
 
 def _table(arrays: Any) -> memoryview:
-    """Address and length of each array."""
+    """Returns a table with the address and the length of each array."""
     words = [word for each in map(np.asarray, arrays) for word in (each.__array_interface__["data"][0], each.size)]
     return memoryview(np.array(words, np.int64))  # type: ignore[arg-type]
 
 
 def _target() -> str:
-    """The library for this platform; empty if there is none."""
+    """Returns the file name of the library for this platform; empty if there is none."""
     return TARGETS.get((sys.platform, platform.machine().lower()), "") if sys.maxsize > 1 << 32 else ""
 
 
 @functools.cache
 def _library() -> ModuleType:
-    """The module of this platform's library.
+    """Returns the module in this platform's library.
 
     Raises:
-        ImportError: there is none, this Python cannot load it, or it was made from other sources.
+        ImportError: there is no library, this Python cannot load it, it is damaged, or was made from other sources.
     """
     target = _target()
     if not target:
@@ -224,7 +239,7 @@ def _library() -> ModuleType:
     if ".abi3.so" not in EXTENSION_SUFFIXES and (os.name != "nt" or EXTENSION_SUFFIXES[0].partition("-")[0][-1] == "t"):
         raise ImportError("no prebuilt kernel for this kind of Python: it has no stable ABI")
     known, path = _manifest(), LIBRARIES / target
-    with contextlib.suppress(OSError):  # which the loader tells better
+    with contextlib.suppress(OSError):  # the loader reports a missing file with a better message
         if known and hashlib.sha256(path.read_bytes()).hexdigest() != known["files"][target]["sha256"]:
             raise ImportError(f"{path}: damaged")
     loader = ExtensionFileLoader(MODULE, str(path))
@@ -234,12 +249,14 @@ def _library() -> ModuleType:
     loader.exec_module(module)
     built: Callable[[int], int] = module.built_from
     if built(CONSTANTS_CRC) != constants_crc() or not _made_from_the_sources(built(CODE_CRC), known):
-        raise ImportError("the prebuilt kernel is not that of shared/kernel.py and shared/bulk.py; run scripts/kernels")
+        raise ImportError(
+            "the prebuilt kernel was not made from the present shared/kernel.py and shared/bulk.py; run scripts/kernels"
+        )
     return module
 
 
 def _manifest() -> dict[str, Any]:
-    """The manifest of `scripts/kernels`; empty where it is damaged, or left out as by a frozen program."""
+    """Returns the manifest of `scripts/kernels`; empty if it is damaged, or missing (in a frozen program)."""
     try:
         return json.loads((LIBRARIES / MANIFEST).read_text("utf-8"))  # type: ignore[no-any-return]
     except (OSError, ValueError):
@@ -247,7 +264,10 @@ def _manifest() -> dict[str, Any]:
 
 
 def _made_from_the_sources(code_crc: int, known: dict[str, Any]) -> bool:
-    """Whether a library with this checksum was made from the sources; a frozen program may have none."""
+    """Returns whether a library with this checksum was made from the sources.
+
+    Also true if there are no source files to compare with, as in a frozen program.
+    """
     paths = [Path(source.__file__ or "") for source in SOURCES]
     if not all(path.suffix == ".py" and path.is_file() for path in paths):
         return True

@@ -1,7 +1,7 @@
-"""How a world lies in memory: the one struct between the world and its kernel.
+"""The memory layout of a world: the arrays that `World` and its kernel share.
 
-Everything that moves is a row of 16 int64, so that the kernel sees a plain matrix, numpy sees a structured
-array, and both name a column alike.
+An entity is a row of 16 int64. The kernel sees a plain matrix and numpy a structured array; both use the column names
+below.
 """
 
 from typing import Any, NamedTuple
@@ -12,53 +12,63 @@ import numpy.typing as npt
 COLUMNS = "id template flags x y z vx vy vz move_x move_y buttons cell next prev changed".split()
 ID, TEMPLATE, FLAGS, X, Y, Z, VX, VY, VZ, MOVE_X, MOVE_Y, BUTTONS, CELL, NEXT, PREV, CHANGED = range(16)
 ENTITY = np.dtype([(name, np.int64) for name in COLUMNS])
-"""An entity. `id` 0 is a free row; position and velocity in grid steps; `cell` its place in the index of
-cells (-1: none) with its `next` and `prev` neighbour rows; `changed` the tick that last changed it, and above
-what was to be foreseen of that (`tick << EVENT_BITS | events`; see `kernel.advance`)."""
+"""Type of an entity's row. `id` is 0 in a free row. Position and velocity are in grid steps. `cell` is the entity's
+cell in the entity index (-1: none), and `next` and `prev` are its neighbour rows in that cell. `changed` is
+`tick << EVENT_BITS | events`: the tick that last changed the entity, and the events of that tick, which a client cannot
+extrapolate (`kernel.advance`)."""
 
 WIDTH_SHIFT = 4
-"""In the kernel's flat view the row r of an entity begins at r << WIDTH_SHIFT."""
+"""Shift from an entity's row to its start in the kernel's flat view: row r begins at r << WIDTH_SHIFT."""
 
 FALLING = 1
-"""Flag: gravity acts."""
+"""Flag of an entity: gravity acts on it."""
 AWAKE = 2
-"""Flag (bookkeeping): the row is in the list of the awake."""
+"""Flag of an entity, for bookkeeping: the row is in the list of awake entities."""
 
 EVENT_BITS = 9
+"""Number of bits for the events of a turn."""
 STOP_X, STOP_Y, STOP_Z, GO_X, GO_Y, FALL, LAUNCH, TOLD, WHOLE = (1 << bit for bit in range(EVENT_BITS))
-"""What a turn decided: stopped along an axis, walks as wished again, nothing stands under it, jumped; its wish is
-another one; it was written from outside or came into another segment."""
+"""Events of a turn. STOP_X, STOP_Y, STOP_Z: it stopped along that axis. GO_X, GO_Y: it walks again as its input says.
+FALL: nothing supports it any more. LAUNCH: it jumped. TOLD: it has a new input. WHOLE: it was written from outside, or
+came into another segment, so its whole state is needed."""
 TURN = 8
-"""Numbers of a turn that is told: id (to the kernel: row, or -1), events, the wish (3), the position (3)."""
+"""Number of columns of an explicit turn: id (for the kernel: row, or -1), events, input (3), position (3)."""
 
-# A template's row: the box relative to the position, and what it may do.
+# Columns of a template's row: the box relative to the position, and the abilities.
 LO_X, LO_Y, LO_Z, SIZE_X, SIZE_Y, SIZE_Z, SOLID, WALKS, JUMP_SPEED = range(9)
 TEMPLATE_COLUMNS = 9
 
-# The numbers of a scene that the kernel needs.
+# Places of the scene's numbers in `Arrays.parameters`.
 GRAVITY, TERMINAL, RATE, EXACT, MEAN, PAIRS, FLOOR = range(7)  # FLOOR: the lowest z, in blocks
 REACH_LO, REACH_HI = 7, 10  # how far any box reaches below and above its position, three columns each
 PARAMETERS = 13
 
-# Lengths of the lists that the kernel keeps.
+# Places of the lists' lengths in `Arrays.lengths`.
 N_AWAKE, N_WOKEN, N_CHANGED, N_FELL, N_LATER, N_HOMELESS, N_STEPPED = range(7)
 LENGTHS = 7
 
 CELL_SHIFT = 2
+"""Shift from blocks to a cell of the entity index, along x and y."""
 CELL_SHIFT_Z = 4
-"""A cell of the entity index is 4 x 4 x 16 blocks: crowds spread on the ground; a segment has 8 x 8 x 2 of them."""
+"""Shift from blocks to a cell of the entity index, along z. A cell is 4 x 4 x 16 blocks, because crowds spread on the
+ground; a segment has 8 x 8 x 2 cells."""
 CELLS_SHIFT = 7
+"""Shift from a segment's row to its first cell."""
 CELLS = 1 << CELLS_SHIFT
+"""Number of cells of a segment."""
 CANDIDATE = 7
-"""Numbers of a candidate: low corner, high corner, row."""
+"""Number of columns of a candidate: low corner (3), high corner (3), row."""
 NOWHERE = 0
-"""The segment row whose cells hold the entities of all segments that are not loaded: they are still obstacles."""
+"""Segment row whose cells hold the entities of all segments that are not loaded; these are still obstacles."""
 
 Int64s = npt.NDArray[np.int64]
 
 
 class Arrays(NamedTuple):
-    """All that `kernel.step` reads and writes: int64 unless said (flat arrays, or memoryviews for the plain source)."""
+    """The arrays that the kernel reads and writes: flat, int64 unless stated otherwise; memoryviews for plain Python.
+
+    Sizes stand in brackets.
+    """
 
     entities: Any  # [rows * 16]
     templates: Any  # [templates * 9]
@@ -68,12 +78,12 @@ class Arrays(NamedTuple):
     segments: Any  # [segments * 3] index of each loaded segment
     table: Any  # [power of two] open addressing: segment row + 1, 0 is empty
     heads: Any  # int32 [segments * 128] first entity row of each cell, -1 is empty
-    awake: Any  # [rows + 1] keys (id << 32 | row), ascending: whose turn it is
-    next_awake: Any  # [rows + 1] the same for the next tick, in the making
-    woken: Any  # [rows + 1] heap of keys that join the awake
-    later: Any  # [rows + 1] keys woken after their turn had passed
-    candidates: Any  # [(rows + 1) * 7] box and row of the entities near the one whose turn it is
+    awake: Any  # [rows + 1] keys (id << 32 | row) of the entities that have a turn, ascending
+    next_awake: Any  # [rows + 1] keys of the entities that have a turn in the next tick, while it is built
+    woken: Any  # [rows + 1] heap of keys that join the awake ones
+    later: Any  # [rows + 1] keys of entities that were woken after their turn had passed
+    candidates: Any  # [(rows + 1) * 7] box and row of the entities near the one that has its turn
     changed: Any  # [rows + 1] rows whose state the step changed
-    fell: Any  # [rows + 1] ids below the scene's floor
-    lengths: Any  # [7]; N_HOMELESS counts the entities nowhere, N_STEPPED says nothing changed since a step
-    near: Any  # [4] the segment looked up last: index and row
+    fell: Any  # [rows + 1] ids of entities below the scene's floor
+    lengths: Any  # [7]; N_HOMELESS: entities in no loaded segment; N_STEPPED: nothing has changed since a step
+    near: Any  # [4] index and row of the segment that was looked up last

@@ -1,4 +1,4 @@
-"""The kernel sources compiled by Numba: for platforms without a prebuilt kernel, and for whoever edits the sources."""
+"""The kernel sources compiled by Numba, for platforms without a prebuilt kernel and for changes of the sources."""
 
 import functools
 import importlib
@@ -41,14 +41,15 @@ def functions(sources: Iterable[ModuleType]) -> dict[str, Any]:
             types_of_arguments = tuple(kinds.get(kind) or array(kind) for kind in arguments)
             function = getattr(compiled, name)
             function.compile(types_of_arguments)
-            # By the entry point, Numba does not inspect each array of `Arrays`: 2 us, more than a client's whole step.
+            # A call of the entry point skips Numba's check of each array of `Arrays`, which takes 2 us: more than a
+            # whole step of a client.
             found[name] = function.overloads[types_of_arguments].entry_point
     return found
 
 
 @functools.cache
 def jitted(source: ModuleType) -> ModuleType:
-    """Loads a source under another name, in which its functions are Numba's. They are compiled when first called.
+    """Loads a second instance of a source, whose functions Numba compiles when they are first called.
 
     Raises:
         ImportError: Numba is not installed.
@@ -62,7 +63,7 @@ def jitted(source: ModuleType) -> ModuleType:
     module = importlib.util.module_from_spec(spec)
     sys.modules[name] = module
     place = config.CACHE_DIR
-    # Numba's cache on disk knows the source alone, not the constants that it imports.
+    # Numba's cache depends on the source file alone, so the folder's name has a checksum of the imported constants.
     kept = f"numba-{zlib.crc32(repr((freshness.constants(source), OPTIONS)).encode()):08x}"
     config.CACHE_DIR = str(Path(place or Path(source.__file__).parent / "__pycache__") / kept)
     try:

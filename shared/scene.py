@@ -1,4 +1,7 @@
-"""What exists in a world and by which numbers: validated, and the same on both sides by fingerprint."""
+"""The scene: the description of a world, with all numbers of its physics.
+
+Every value is checked when a scene is made. A fingerprint shows whether client and server have the same scene.
+"""
 
 import functools
 import hashlib
@@ -18,18 +21,24 @@ from shared.inputs import MOVE_MAX
 from shared.units import RANGE_BLOCKS, SEGMENT, SPEED, rounded, to_position, to_velocity
 
 TEMPLATES_MAX = 255
+"""Limit of the templates of a scene."""
 SEGMENTS_MAX = 1 << 16
+"""Limit of the segments of a scene."""
 BOX_MAX = 32.0
-"""No box is longer, in blocks."""
+"""Longest side, and longest offset, of a template's box, in blocks."""
 REACH_MAX = 1024.0
+"""Greatest reach of a player, in blocks."""
 INTEGRATORS = ("mean", "semi")
+"""Choices of `Scene.integrator`."""
 SHOWN = ("interpolated", "predicted")
+"""Choices of `Template.shown`."""
 
 SCENES = Path(__file__).parent / "scenes"
+"""Folder of the scenes that come with the package."""
 
 
 def _own_numbers(owner: Any) -> None:
-    """Puts Python's own numbers in the place of numpy's, which MessagePack cannot hold."""
+    """Replaces numpy's numbers in the fields of a dataclass by Python's own, because MessagePack holds no others."""
     for f in fields(owner):
         value = getattr(owner, f.name)
         if isinstance(value, np.generic):
@@ -38,16 +47,22 @@ def _own_numbers(owner: Any) -> None:
 
 @dataclass(frozen=True)
 class Template:
-    """A kind of entity. Lengths in blocks, speeds in blocks/s.
+    """A named set of properties that entities share. Lengths in blocks, speeds in blocks/s.
 
     Args:
+        name: name of the template.
         box_offset: displacement of the box's corner from the entity's position.
-        box_size: the sides of the box; a negative one extends the box the other way (the seed's y).
-        walk_speed: an entity of this template moves by its move intent; 0: it keeps its velocity instead.
-        jump_speed: upward speed of a jump; 0: it cannot.
-        solid: whether solid entities stop each other (and stand on each other); blocks stop all.
-        shown: how clients draw those of others: "interpolated" (as they were a moment ago) or "predicted" (as they
-            are now, if they go on as they did).
+        box_size: sides of the box; a negative side extends the box to the other direction, as the project's first
+            proposal did for y.
+        walk_speed: speed with which an entity follows its input; 0: it ignores inputs and keeps its velocity.
+        jump_speed: upward speed of a jump; 0: an entity cannot jump.
+        solid: whether entities of this template and other solid ones stop each other, and stand on each other. Blocks
+            stop every entity.
+        shown: how clients draw such entities, apart from their own: "interpolated" (a little in the past) or
+            "predicted" (now, if their inputs do not change).
+
+    Raises:
+        SceneError: a value is not valid; the message names it.
     """
 
     name: str
@@ -77,7 +92,7 @@ class Template:
         object.__setattr__(self, "box_size", size)
 
     def row(self) -> list[int]:
-        """The row of `layout.Arrays.templates`: the box normalised to its low corner and positive sides."""
+        """Returns the row of `layout.Arrays.templates`. The box gets its low corner and positive sides."""
         low, sides = [], []
         for axis, offset, size in zip("xyz", self.box_offset, self.box_size, strict=True):
             ends = sorted((to_position(offset, axis), to_position(offset, axis) + to_position(size, axis)))
@@ -88,21 +103,29 @@ class Template:
 
 @dataclass(frozen=True)
 class Scene:
-    """The rules and the extent of a world. What is switched off costs nothing.
+    """The description of a world: its physics, its extent, its templates and its terrain.
+
+    A feature that a scene switches off costs no time.
 
     Args:
+        name: name of the scene.
+        templates: the templates of entities.
         tick_rate: ticks per second, 1 to 240.
-        gravity: downward acceleration in blocks/s^2; 0: there is no gravity (nor support, nor jumps).
-        terminal_speed: the fastest fall, in blocks/s.
-        integrator: "mean" moves by the mean of the old and the new fall speed (exact for constant acceleration),
-            "semi" by the new one (the seed's rule).
+        gravity: downward acceleration in blocks/s^2; 0: there is no gravity, no support and no jumping.
+        terminal_speed: greatest speed of a fall, in blocks/s.
+        integrator: "mean" moves an entity by the mean of the old and the new fall speed, which is exact for a constant
+            acceleration; "semi" moves it by the new one (the rule of the project's first proposal).
         entity_collision: whether solid entities stop each other.
-        size: the extent of the world in segments of 32 blocks; (0, 0, 0) has its low corner at `origin`.
-        origin: index of the lowest segment.
-        terrain: the generator's name under "generator", and its parameters.
-        spawns: where players appear, in turn.
-        player: the name of the template of players.
-        reach: how far from its position a player may place and remove blocks, in blocks to their centres; 0: nowhere.
+        size: extent of the world in segments of 32 blocks, along x, y and z.
+        origin: index of the segment with the lowest x, y and z.
+        terrain: name of the terrain generator under "generator", and its parameters.
+        spawns: spawn points, which players use in turn, in blocks.
+        player: name of the players' template.
+        reach: greatest distance from a player's position to the centre of a block that it may place or remove, in
+            blocks; 0: players cannot edit.
+
+    Raises:
+        SceneError: a value is not valid; the message names it.
     """
 
     name: str
@@ -120,7 +143,7 @@ class Scene:
     reach: float = 6.0
 
     def __repr__(self) -> str:
-        """Short, for events show it; all of it is `to_table`."""
+        """Returns a short text, because events are printed with it; `to_table` has all values."""
         blocks = " x ".join(str(SEGMENT * part) for part in self.size)
         return f"<Scene {self.name!r}, {blocks} blocks, {self.tick_rate} ticks/s>"
 
@@ -177,7 +200,7 @@ class Scene:
 
     @classmethod
     def from_table(cls, table: Mapping[str, Any]) -> "Scene":
-        """A scene from what TOML or the wire gives.
+        """Returns the scene that a table from TOML or from a welcome describes.
 
         Raises:
             SceneError: a field is unknown, missing or out of range; the message names it.
@@ -199,7 +222,7 @@ class Scene:
         return cls(**values)
 
     def to_table(self) -> dict[str, Any]:
-        """The reverse of `from_table`: plain lists, tables, strings and numbers."""
+        """Returns a table for `from_table`, of plain lists, tables, texts and numbers."""
         table = {f.name: _plain(getattr(self, f.name)) for f in fields(self)}
         table["templates"] = [
             {f.name: _plain(getattr(entry, f.name)) for f in fields(entry)} for entry in self.templates
@@ -208,20 +231,20 @@ class Scene:
 
     @functools.cached_property
     def fingerprint(self) -> bytes:
-        """16 bytes: two sides with the same one compute the same world."""
+        """A hash of all fields, 16 bytes; two sides with equal fingerprints compute the same world."""
         return hashlib.blake2b(msgpack.packb(_sorted(self.to_table())), digest_size=16).digest()
 
     @functools.cached_property
     def index_of(self) -> dict[str, int]:
-        """Template names to their numbers."""
+        """The numbers of the templates, by name."""
         return {template.name: i for i, template in enumerate(self.templates)}
 
     def template(self, name: object, at: str = "template") -> int:
-        """The number of a template.
+        """Returns the number of a template.
 
         Args:
-            name: the template's.
-            at: where the name stands, for the error.
+            name: name of the template.
+            at: name of the field or argument that has `name`, for the error.
 
         Raises:
             SceneError: there is no such template.
@@ -232,34 +255,35 @@ class Scene:
         return kind
 
     def with_template(self, name: str, like: str | None = None, **changes: Any) -> "Scene":
-        """The same scene with one template more.
+        """Returns a copy of the scene with one more template.
 
         Args:
-            like: the template to begin with; None: that of players.
-            changes: what is different, by the field's name.
+            name: name of the new template.
+            like: name of the template to copy; None: the players' template.
+            changes: fields of the new template that differ, by name.
 
         Raises:
-            SceneError: there is no template to begin with, a field is unknown or out of range, or the name is taken.
+            SceneError: there is no template `like`, a field is unknown or out of range, or the name is in use.
         """
         base = self.templates[self.template(self.player if like is None else like, "like")]
         entry = {f.name: getattr(base, f.name) for f in fields(Template)}
         return replace(self, templates=(*self.templates, _template({**entry, **changes, "name": name})))
 
     def segments(self) -> list[Cell]:
-        """The index of every segment of the world, in ascending order of z, y, x."""
+        """Returns the index of every segment of the scene, in ascending order of z, y, x."""
         (ox, oy, oz), (nx, ny, nz) = self.origin, self.size
         return [(ox + x, oy + y, oz + z) for z in range(nz) for y in range(ny) for x in range(nx)]
 
     @functools.cached_property
     def digests(self) -> dict[str, bytes]:
-        """8 bytes for each field, so that two sides can tell by name where they differ."""
+        """A hash of each field, 8 bytes, by name; two sides find the fields that differ by these."""
         return {
             name: hashlib.blake2b(msgpack.packb(_sorted(value)), digest_size=8).digest()
             for name, value in self.to_table().items()
         }
 
     def kernel_tables(self) -> tuple[layout.Int64s, layout.Int64s, layout.Int64s]:
-        """Templates, walk velocities and parameters as `layout.Arrays` wants them, each rounded once."""
+        """Returns templates, walk velocities and parameters for `layout.Arrays`; each number is rounded once."""
         templates = np.array([template.row() for template in self.templates], np.int64)
         walk = np.array(
             [
@@ -283,10 +307,10 @@ class Scene:
 
 
 def load_scene(name_or_path: str | Path) -> Scene:
-    """A scene that comes with the package, by name, or any other by the path of its TOML file.
+    """Loads a scene of the package by its name, or any other one by the path of its TOML file.
 
     Raises:
-        SceneError: there is no such scene, or its file is broken; the message says where.
+        SceneError: there is no such scene, or its file is not valid; the message says where.
     """
     if not isinstance(name_or_path, str | Path):
         raise SceneError(f"scene = {shown(name_or_path)}: must be a name, or the path of a file")
@@ -296,7 +320,7 @@ def load_scene(name_or_path: str | Path) -> Scene:
         table = tomllib.loads(path.read_text("utf-8"))
     except tomllib.TOMLDecodeError as error:
         raise SceneError(f"scene {path}: not valid TOML ({error})") from error
-    except (OSError, ValueError) as error:  # no such file; or its text, or its path, is none
+    except (OSError, ValueError) as error:  # no such file, or the text or the path is not valid
         names = ", ".join(sorted(file.stem for file in SCENES.glob("*.toml")))
         raise SceneError(f"scene {name_or_path!r}: cannot be read ({error}); built in are {names}") from error
     try:
@@ -318,7 +342,7 @@ def _template(entry: object) -> Template:
 
 
 def _plain(value: Any) -> Any:
-    """Lists for tuples, tables for mappings, all the way down."""
+    """Returns a value with lists in place of tuples and tables in place of mappings, at every depth."""
     if isinstance(value, Mapping):
         return {key: _plain(value[key]) for key in value}
     if isinstance(value, list | tuple):
@@ -327,7 +351,7 @@ def _plain(value: Any) -> Any:
 
 
 def _sorted(value: Any) -> Any:
-    """Tables with their keys in order, and whole floats as floats: 18 and 18.0 are one number."""
+    """Returns a value with the keys of tables in order, and whole numbers as floats: 18 and 18.0 are one number."""
     if isinstance(value, Mapping):
         return {key: _sorted(value[key]) for key in sorted(value)}
     if isinstance(value, list):

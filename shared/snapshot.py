@@ -1,28 +1,29 @@
-"""One segment's part of a snapshot: encoded once per tick, read by every client that sees the segment.
+"""The parts of a snapshot, one per segment: encoded once per tick, and sent to every client that sees the segment.
 
     segment   [x, y, z, ago, heads, tails, rows, gone, check, edits, attributes]   an array inside the snapshot's array,
               without the fields at its end that are empty
-    ago       what follows is what happened in so many ticks; -1 (`KEYFRAME`): rows are all entities of the segment
-    heads     n * [u32 id, u8 events]: entities that did not go on as they had, where `ago` is 1
-    tails     for each of them, as its events say: i8 move_x, move_y u8 buttons if it was `TOLD` another wish; then i32
+    ago       the number of ticks that this part covers; -1 (`KEYFRAME`): rows are all entities of the segment
+    heads     n * [u32 id, u8 events]: entities that did not go on as before; only if `ago` is 1
+    tails     for each of them: i8 move_x, i8 move_y, u8 buttons if it has the event `TOLD` (a new input); then an i32
               for each axis along which it stopped, in grid steps from the segment's low corner
     rows      n * 33 bytes, the whole exact state of an entity:
               u32 id  u8 template  u8 flags  i32 x, y, z (grid steps from the segment's low corner)
               i32 vx, vy, vz  i8 move_x, move_y  u8 buttons
     gone      n * u32: entities that have left the segment or the world
     edits     n * [u16 block, u8 kind]: blocks that changed, by index z << 10 | y << 5 | x
-    check     now and then a checksum of all of the segment, entities and blocks, else 0
-    attributes  [u32 id, {name: value}, u32 id, ...]: all that the game's rules say of an entity (its name, say), where
-              that has changed, or the entity has come into the segment, since then
+    check     sometimes a checksum of the segment, its entities and its blocks; otherwise 0
+    attributes  [u32 id, {name: value}, u32 id, ...]: all attributes of an entity (its name, for example), if they
+              changed in these ticks, or the entity came into the segment
 
-On the wire the flags have two bits more. `ACTED`: the server's rules acted on the entity (placed it, threw it, changed
-its template). `PLACED`: they placed it, so it did not move from where it was before to where it is.
+On the wire the flags have two more bits. `ACTED`: the server's rules acted on the entity (placed it, threw it, changed
+its template). `PLACED`: the rules placed the entity, so it did not move from its old position to the new one.
 
-Theory of operation. The physics is the same on both sides, so what an entity does as long as nothing happens to it is
-not sent: whoever has its state of a tick has that of the next, by `World.follow`. What is sent is what took place in
-its turn (`layout.STOP_X` ...): it stopped, walks on, falls, jumps, wishes something else. That is all that a turn takes
-from its surroundings, so the result is exact whether the client knows them or not. An entity that was written, or
-changed its segment, is sent whole, as is all that something has happened to in a span of more ticks than one.
+Theory of operation. The physics is equal on both sides, so the motion of an entity is not sent as long as nothing
+happens to it: its state of one tick gives its state of the next (`World.follow`). The server sends only the events of
+its turn (`layout.STOP_X` ...): it stopped, walks again, falls, jumps, has a new input. A turn depends on its
+surroundings through these events alone. So the result is exact whether the client knows the surroundings or not. An
+entity that was written, or has changed its segment, is sent as a row. So is every entity with an event if a part covers
+more than one tick.
 """
 
 import hashlib
@@ -54,50 +55,63 @@ ROW = np.dtype(
     + [(name, "<i4") for name in ("x", "y", "z", "vx", "vy", "vz")]
     + [("move_x", "i1"), ("move_y", "i1"), ("buttons", "u1")]
 )
+"""Layout of a row of `rows`."""
 ROW_BYTES = ROW.itemsize
+"""Length of a row, in bytes."""
 FLAGS_AT = 5
+"""Place of the flags within a row, in bytes."""
 ROW_BY_SIZE = np.dtype([("id", "<u4"), ("kind", "u1", 2), ("place", "<i4", 6), ("move", "i1", 2), ("buttons", "u1")])
-"""The same bytes in runs of equal size, each of which is converted at once."""
+"""Layout of a row as runs of fields of equal size, each of which is converted at once."""
 COLUMNS_BY_SIZE = (
     (ID, "id"), (slice(TEMPLATE, X), "kind"), (slice(X, MOVE_X), "place"), (slice(MOVE_X, BUTTONS), "move"),
     (BUTTONS, "buttons"),
 )  # fmt: skip
+"""Columns of a state for each field of `ROW_BY_SIZE`."""
 HEAD = np.dtype([("id", "<u4"), ("events", "u1")])
+"""Layout of an entry of `heads`."""
 VERDICT = np.dtype([("number", "<u4"), ("verdict", "u1")])
+"""Layout of an entry of `Snapshot.verdicts`."""
 EDIT = np.dtype([("block", "<u2"), ("kind", "u1")])
+"""Layout of an entry of `edits`."""
 NO_EDITS = np.zeros(0, EDIT)
 NO_STATES = np.zeros((0, CELL), np.int64)
 NO_TURNS = np.zeros((0, TURN), np.int64)
 NO_FIELDS: list[Any] = [b"", b"", b"", b"", 0, b"", []]
-"""What the fields of a part from `heads` on are where they are left out."""
+"""Values of the fields from `heads` on that a part leaves out."""
 SIDE = SEGMENT * BLOCK
-"""Grid steps along one side of a segment."""
+"""Length of a segment's side, in grid steps."""
 FIELDS = ("id", "template", "flags", "x", "y", "z", "vx", "vy", "vz", "move_x", "move_y", "buttons")
+"""Names of the columns of a state."""
 assert len(FIELDS) == CELL == BUTTONS + 1
 assert SIDE & (SIDE - 1) == 0
 assert (HEAD.itemsize, ROW_BYTES) == (bulk.HEAD_BYTES, bulk.ROW_BYTES)
 FAR = 1 << 23
-"""No index of a segment is further from 0 along an axis."""
+"""Bound of a segment's index along each axis, in segments: from `-FAR` to `FAR - 1`."""
 
 KEYFRAME = -1
-"""The `ago` of a part that holds everything."""
+"""Value of `ago` in a part that has all entities of the segment."""
 ACTED = 4
 """Flag on the wire: the server's rules acted on this entity."""
 PLACED = 2
 """Flag on the wire: the server's rules placed this entity; `ACTED` is set, too."""
 PART_MAX = 200 * 1024
-"""No field of a segment's part is longer, in bytes."""
+"""Longest field of a segment's part, in bytes."""
 
 STATE_LOW = np.array([1, 0, 0, 0, 0, 0, -(1 << 30), -(1 << 30), -(1 << 30), -127, -127, 0], np.int64)
+"""Lowest values of a state on the wire. Beyond the bounds, a peer could make the kernel leave its tables."""
 STATE_HIGH = np.array(
     [ENTITY_MAX, 255, FALLING | ACTED | PLACED, SIDE - 1, SIDE - 1, SIDE - 1, 1 << 30, 1 << 30, 1 << 30, 127, 127, 255],
     np.int64,
 )
-"""The bounds of a state on the wire: nothing a peer sends may take the kernel out of its tables."""
+"""Greatest values of a state on the wire."""
 
 
 class SegmentPart(NamedTuple):
-    """A decoded part: how many of the `states` are its `entities`, `gone` ids, `edits` (`EDIT` records)."""
+    """A decoded part of a snapshot.
+
+    `entities` is the number of the part's states, `gone` has ids, and `edits` has `EDIT` records. The other fields are
+    those of the wire format.
+    """
 
     segment: Cell
     ago: int
@@ -109,11 +123,12 @@ class SegmentPart(NamedTuple):
 
 
 def encode_rows(rows: Int64s, acted: Collection[int] = (), placed: Collection[int] = ()) -> bytes:
-    """Packs entities ([n, >= 12] state columns), each in the segment of its position.
+    """Returns entities packed as rows, with positions from the low corner of the segment that each is in.
 
     Args:
+        rows: entities, [n, at least 12]; the first 12 columns are the state.
         acted: ids that get the flag `ACTED`.
-        placed: ids that get `ACTED` and `PLACED`.
+        placed: ids that get the flags `ACTED` and `PLACED`.
     """
     packed = np.empty(len(rows), ROW_BY_SIZE)
     for columns, name in COLUMNS_BY_SIZE:
@@ -128,8 +143,11 @@ def encode_rows(rows: Int64s, acted: Collection[int] = (), placed: Collection[in
 
 
 class Share(NamedTuple):
-    """What has happened in a segment: the ids to which, those of them that are sent `whole`, and the fields `heads`,
-    `tails` and `rows`."""
+    """The changes of one segment in a tick: its segment delta.
+
+    `ids` are the entities that something happened to, `whole` those of them that are sent as rows, and `packed` has the
+    fields `heads`, `tails` and `rows`.
+    """
 
     segment: Cell
     ids: list[int]
@@ -138,11 +156,11 @@ class Share(NamedTuple):
 
 
 class News:
-    """Packs what has happened to entities in a tick, all at once; what it needs of memory serves for the next, too.
+    """The tick encoder: packs the changes of all entities in a tick by segment. Its buffers are reused in every tick.
 
     Args:
-        world: stepped elsewhere.
-        check_ticks: how often a segment in which something changes is due.
+        world: the server's world, which other code steps.
+        check_ticks: number of ticks between two checksums of a segment in which something changes.
     """
 
     def __init__(self, world: World, check_ticks: int) -> None:
@@ -150,11 +168,14 @@ class News:
         self._allocate(len(world.arrays.changed))
 
     def pack(self, acted: Collection[int], placed: Collection[int] = ()) -> tuple[list[Share], set[Cell]]:
-        """What there is to tell of the entities that the latest step changed, and the segments of them that are due.
+        """Packs the entities that the latest step changed.
 
         Args:
-            acted: ids on which the rules acted.
-            placed: ids that the rules placed.
+            acted: ids of entities on which the rules acted.
+            placed: ids of entities that the rules placed.
+
+        Returns:
+            The changes of each segment, and the segments that are due for a checksum.
         """
         w, tick = self._world.arrays, self._world.tick
         if len(w.changed) >= len(self._ids):
@@ -180,7 +201,7 @@ class News:
         return shares, {(due[i], due[i + 1], due[i + 2]) for i in range(0, len(due), 3)}
 
     def _allocate(self, room: int) -> None:
-        """Makes room for so many entities."""
+        """Makes room for `room` entities."""
         self._ids, self._parts, self._due, self._packed = (
             self._world.kernel.lent(np.empty(1 + room * numbers, kind))
             for numbers, kind in ((1, np.int64), (8, np.int64), (3, np.int64), (ROW_BYTES, np.uint8))
@@ -199,7 +220,19 @@ def encode_part(
     check: int = 0,
     attributes: Sequence[Any] = (),
 ) -> bytes:
-    """One segment's part, ready to be joined into any client's snapshot."""
+    """Returns a segment's part, encoded for `messages.join_snapshot`.
+
+    Args:
+        segment: index of the segment.
+        ago: number of ticks that the part covers, or `KEYFRAME`.
+        rows: entities that are sent whole, [n, at least 12].
+        gone: ids of entities that have left the segment.
+        edits: changed blocks, as pairs of index and kind.
+        acted: ids that get the flag `ACTED`.
+        placed: ids that get the flags `ACTED` and `PLACED`.
+        check: checksum of the segment, or 0.
+        attributes: id, attributes, id, attributes, ...
+    """
     return join_part(segment, ago, (b"", b"", encode_rows(rows, acted, placed)), gone, edits, check, attributes)
 
 
@@ -212,7 +245,7 @@ def join_part(
     check: int = 0,
     attributes: Sequence[Any] = (),
 ) -> bytes:
-    """The same from heads, tails and rows that are packed already."""
+    """Returns a segment's part like `encode_part`, from `news`: heads, tails and rows that are packed already."""
     packed_gone = np.array(gone, "<u4").tobytes() if gone else b""
     packed_edits = np.array(edits, EDIT).tobytes() if edits else b""
     fields = [*news, packed_gone, check, packed_edits, attributes]
@@ -222,9 +255,10 @@ def join_part(
 
 
 def checksum(world: World, segment: Cell) -> int:
-    """The check of a loaded segment as it is, entities and blocks: 1 to 2^32 - 1.
+    """Returns the checksum of a loaded segment, over its entities and blocks: 1 to 2^32 - 1.
 
-    It is the first 4 bytes, little-endian, of a SHA-256: over the segment's digest and the rows of its entities.
+    It is the first 4 bytes, little-endian, of a SHA-256 over the segment's digest and the rows of its entities; 1
+    stands for 0.
     """
     kernel = world.kernel
     keys, packed = np.empty(len(world), np.int64), np.empty(len(world) * ROW_BYTES, np.uint8)
@@ -238,14 +272,19 @@ def checksum(world: World, segment: Cell) -> int:
 def decode_parts(
     segments: Sequence[Any], templates: int, kernel: Kernel | None = None
 ) -> tuple[list[SegmentPart], Int64s, Int64s]:
-    """Checks and unpacks `Snapshot.segments`, in a scene of so many templates, by a kernel (None: the plain one).
+    """Checks and unpacks `Snapshot.segments`.
+
+    Args:
+        segments: the segments of a snapshot.
+        templates: number of templates in the scene.
+        kernel: kernel that unpacks; None: the plain one.
 
     Returns:
-        The parts, the states ([n, 12], as `World.put` takes them but for `ACTED` and `PLACED`) of all their entities,
-        part after part, and all their turns ([n, 8], as `World.follow` takes them).
+        The parts; the states of all their entities, part after part ([n, 12], as for `World.put`, but with the flags
+        `ACTED` and `PLACED`); and all their turns ([n, 8], as for `World.follow`).
 
     Raises:
-        ProtocolError: anything is not as drawn above.
+        ProtocolError: a part breaks the format that this module describes.
     """
     if not segments:
         return [], NO_STATES, NO_TURNS
@@ -274,7 +313,10 @@ def _decode_turns(heads: bytes, tails: bytes, kernel: Kernel) -> Int64s:
 
 
 def _decode_part(part: Any, corners: list[int], news: tuple[list[bytes], ...]) -> SegmentPart:
-    """One part; its low corner in grid steps and its number of rows go to the `corners`, what they hold to `news`."""
+    """Checks and returns one part.
+
+    Appends its low corner (grid steps) and its number of rows to `corners`, and its heads, tails and rows to `news`.
+    """
     if type(part) is not list or not 4 <= len(part) <= 11:
         raise ProtocolError("segment: not four to eleven fields")
     x, y, z, ago, heads, tails, rows, gone, check, edits, attributes = part + NO_FIELDS[len(part) - 4 :]
@@ -289,7 +331,7 @@ def _decode_part(part: Any, corners: list[int], news: tuple[list[bytes], ...]) -
         and max(len(heads), len(tails), len(rows), len(gone), len(edits)) <= PART_MAX
         and len(heads) % HEAD.itemsize == len(rows) % ROW_BYTES == len(gone) % 4 == len(edits) % EDIT.itemsize == 0
     ):
-        raise ProtocolError("segment: heads, tails, rows, gone or edits are no bytes, too many, or part of one")
+        raise ProtocolError("segment: heads, tails, rows, gone or edits are not bytes, too long, or of a wrong length")
     if heads and ago != 1:
         raise ProtocolError(f"segment.heads of {ago} ticks: not allowed")
     all_heads, all_tails, all_rows = news

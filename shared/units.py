@@ -1,8 +1,8 @@
-"""The numbers of the world: whole grid steps, so that every sum and comparison is exact.
+"""The units of the world: whole grid steps, so that every sum and comparison is exact.
 
-A position is a whole number of steps of 2^-24 block, a velocity of steps of 2^-16 block/s. Both are
-64-bit integers: there is no rounding, no epsilon, no NaN and no negative zero to agree about, and equal
-means `==`. Values of people (floats, in blocks and blocks/s) are rounded once, where they enter.
+A position is a whole number of steps of 2^-24 block, a velocity of steps of 2^-16 block/s. Both are 64-bit integers. So
+client and server need not agree about rounding, an epsilon, NaN or negative zero, and equality is `==`. Floats of a
+program (blocks and blocks/s) are rounded once, when they enter.
 """
 
 import math
@@ -14,35 +14,40 @@ from shared.checks import SceneError, finite, shown
 
 BLOCK_SHIFT = 24
 BLOCK = 1 << BLOCK_SHIFT
-"""Grid steps in one block."""
+"""Number of grid steps in one block."""
 SPEED = 1 << 16
-"""Velocity steps in one block per second."""
+"""Number of velocity steps in one block per second."""
 RANGE_BLOCKS = 1 << 28
-"""Positions lie within +- this many blocks."""
+"""Greatest distance of a position from 0 along each axis, in blocks."""
 SPEED_MAX = 1024.0
-"""No scene, template or velocity is faster, in blocks/s."""
+"""Greatest speed in a scene, a template or a velocity, in blocks/s."""
 
 SEGMENT_SHIFT = 5
+"""Shift from a block to the index of its segment."""
 SEGMENT = 1 << SEGMENT_SHIFT
-"""Blocks along one side of a world segment."""
+"""Length of a segment's side, in blocks."""
 TO_SEGMENT = BLOCK_SHIFT + SEGMENT_SHIFT
-"""A position shifted right by so much is the index of its segment,"""
+"""Shift from a position in grid steps to the index of its segment."""
 IN_SEGMENT = (1 << TO_SEGMENT) - 1
-"""and these bits of it count from the segment's low corner."""
+"""Mask of a position's bits that count from the low corner of its segment, in grid steps."""
 
 
 def rounded(value: float) -> int:
-    """The nearest whole number, halves away from zero, so that mirrored motion stays mirrored."""
+    """Returns the nearest whole number; halves are rounded away from zero, so that mirrored motion stays mirrored."""
     whole = math.floor(abs(value))
     whole += abs(value) - whole >= 0.5
     return whole if value >= 0 else -whole
 
 
 def to_position(value: object, field: str) -> int:
-    """Blocks to grid steps.
+    """Converts blocks to grid steps.
+
+    Args:
+        value: a number of blocks.
+        field: name of the field, for the error.
 
     Raises:
-        SceneError: not a finite number, or outside +-2^28 blocks.
+        SceneError: `value` is not a finite number, or outside +-2^28 blocks.
     """
     blocks = finite(value, field)
     if abs(blocks) > RANGE_BLOCKS:
@@ -51,10 +56,14 @@ def to_position(value: object, field: str) -> int:
 
 
 def to_positions(values: npt.ArrayLike, field: str) -> npt.NDArray[np.int64]:
-    """The same for many positions at once, [n, 3].
+    """Converts positions [n, 3] in blocks to grid steps.
+
+    Args:
+        values: the positions.
+        field: name of the field, for the error.
 
     Raises:
-        SceneError: another shape, or a row in which a value is not finite or out of range.
+        SceneError: the shape is another one, or a value is not finite or outside +-2^28 blocks.
     """
     try:
         given = np.asarray(values)
@@ -76,10 +85,14 @@ def to_positions(values: npt.ArrayLike, field: str) -> npt.NDArray[np.int64]:
 
 
 def to_velocity(value: object, field: str) -> int:
-    """Blocks per second to velocity steps.
+    """Converts blocks per second to velocity steps.
+
+    Args:
+        value: a speed in blocks/s.
+        field: name of the field, for the error.
 
     Raises:
-        SceneError: not a finite number, or faster than 1024 blocks/s.
+        SceneError: `value` is not a finite number, or faster than 1024 blocks/s.
     """
     speed = finite(value, field)
     if abs(speed) > SPEED_MAX:

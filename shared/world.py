@@ -1,12 +1,19 @@
-"""A world: blocks, entities and a tick, and the one function that takes it to the next.
+"""The world: all blocks and entities of a scene at one tick, and `step`, which computes the next tick.
 
     world = World(load_scene("hills"))
     world.load_terrain()
     player = world.spawn("player", (64, 64, 30))
     world.step({player: make_input(1, 0, jump=True)})
 
-The world changes only here: by the methods below between ticks, and by `step`. Two worlds of one scene that
-are told the same in the same order have the same `state_hash()` at every tick, on every machine, compiled or not.
+Theory of operation. A world changes only in this module: by the methods below between two ticks, and by `step`. Two
+worlds of one scene that get the same calls in the same order have the same `state_hash()` at every tick, on every
+machine, with every form of the kernel. For this, all state is whole numbers, and entities take their turns in ascending
+order of id.
+
+Entities are rows of one int64 matrix (`shared.layout`), which the kernel (`shared.kernel`) reads and writes in place;
+Python keeps only which row belongs to which id. Only entities that are awake have a turn in a step. Each method that
+could change what an entity rests on wakes the entities concerned. The row of an entity that was removed while awake is
+reused only after the next step, because the kernel's lists name it until then.
 """
 
 import hashlib
@@ -27,29 +34,34 @@ from shared.states import ID_MAX, STATES, checked_states
 from shared.units import BLOCK, RANGE_BLOCKS, SEGMENT, SPEED, to_position, to_positions, to_velocity
 
 HASH_BYTES = 20
-"""Bytes of a world's hash."""
+"""Length of a state hash in bytes."""
 SEGMENT_MAX = RANGE_BLOCKS // SEGMENT
-"""No index of a segment is further from 0 along an axis."""
+"""Bound of a segment's index along each axis, in segments: from `-SEGMENT_MAX` to `SEGMENT_MAX - 1`."""
 FILL_MAX = 1 << 20
-"""The most blocks that one `fill` sets."""
+"""Limit of the blocks of one `fill`."""
 TICK_MAX = (1 << 53) - 1
+"""Greatest tick of a world, which a float holds exactly."""
 COLLECT_MAX = 1024
-"""Up to so many rows, the kernel sorts states by insertion: 1 us for some ten, instead of 9."""
+"""Number of rows up to which the kernel sorts the states, by insertion: 1 us for about ten rows instead of numpy's
+9."""
 
 
 class OverlapError(SceneError):
-    """A place is taken: by a block, or by a solid entity."""
+    """The place is occupied by a block or by a solid entity."""
 
 
 class World:
-    """All of a scene's state at one tick.
+    """The whole state of a scene at one tick.
 
-    What names an entity raises `MissingError` (a `KeyError`) if there is none of that number. A wrong value raises
-    `SceneError`, with the field and the value in its text, before anything has changed.
+    A method that takes an entity raises `MissingError` (a `KeyError`) if there is no entity of that number. A wrong
+    value raises `SceneError`, with the field and the value in its text, before anything has changed.
 
     Args:
-        scene: the rules.
-        compiled: run a compiled kernel, or the plain one; None: the one that `kernels` chooses.
+        scene: the description of the world.
+        compiled: True: use a compiled kernel; False: use the plain one; None: use the one that `kernels` chooses.
+
+    Raises:
+        SceneError: `scene` is not a `Scene`.
     """
 
     def __init__(self, scene: Scene, *, compiled: bool | None = None) -> None:
@@ -58,25 +70,27 @@ class World:
             raise SceneError(f"scene = {shown(rules)}: must be a `Scene`")
         self.scene = scene
         self.tick = 0
-        """How many ticks have passed; see `rebase`."""
+        """Number of the latest step: the world is the state at the end of this tick. `rebase` sets it without a
+        step."""
         self.blocks = blocks.Blocks()
         self.kernel = kernels.get(compiled)
-        """What steps it; its functions are for all that works on this world."""
+        """Kernel that steps this world; all other code that works on the world's arrays uses it, too."""
         self._templates, self._walk, self._parameters = scene.kernel_tables()
         self._row_of: dict[int, int] = {}
         self._next_id = 1
-        self._rows = 0  # rows ever used
+        self._rows = 0  # number of rows that were ever used
         self._free: list[int] = []
-        self._limbo: list[int] = []  # freed since the last step: still in the kernel's lists
+        self._limbo: list[int] = []  # rows freed since the latest step: the kernel's lists may still name them
         self._lengths = np.zeros(layout.LENGTHS, np.int64)
         self.editing: dict[Cell, int] = {}
-        """The blocks changed since the latest step, and their kinds until then."""
+        """Blocks that changed since the latest step, with their kinds before."""
         self.edited: dict[Cell, int] = {}
-        """The blocks changed between the latest step and the one before it, and their kinds until then."""
+        """Blocks that changed between the latest step and the step before it, with their kinds before."""
         self.placing: set[int] = set()
-        """The entities placed since the latest step."""
+        """Entities that were placed since the latest step."""
         self.placed: set[int] = set()
-        """The entities placed between the latest step and the one before it: they did not come here by moving."""
+        """Entities that were placed between the latest step and the step before it; they did not move to where they
+        are."""
         self._inputs = np.zeros(32, np.int64)
         self._entities = np.zeros((0, len(layout.COLUMNS)), np.int64)
         self._awake = self._next_awake = self._woken = self._later = np.zeros(0, np.int64)
@@ -95,11 +109,11 @@ class World:
 
     @property
     def entities(self) -> np.ndarray[Any, np.dtype[Any]]:
-        """Every entity as a structured array (`layout.ENTITY`, grid steps), in ascending order of id. A copy."""
+        """A copy of all entities as a structured array (`layout.ENTITY`, in grid steps), ascending by id."""
         return self.rows(sorted(self._row_of)).view(ENTITY).reshape(-1)
 
     def rows(self, entities: Iterable[int]) -> layout.Int64s:
-        """Some entities as an int64 matrix [n, 16] in the order asked for (columns as in `layout`). A copy."""
+        """Returns a copy of some entities as an int64 matrix [n, 16], in the given order (columns as in `layout`)."""
         asked = list(entities)
         try:
             rows = [self._row_of[entity] for entity in asked]
@@ -108,7 +122,7 @@ class World:
         return self._entities[rows]
 
     def states(self) -> layout.Int64s:
-        """The whole states of all entities, [n, 12], ascending by id: equal worlds have equal ones. A copy."""
+        """Returns the states of all entities, [n, 12], ascending by id; equal worlds have equal states. A copy."""
         if self.compiled and self._rows <= COLLECT_MAX:
             out = np.empty((self._rows, STATES), np.int64)
             return out[: self.kernel.collect(self._arrays.entities, self._rows, self.kernel.lent(out))]
@@ -119,64 +133,64 @@ class World:
         return rows
 
     def state(self, entity: int) -> tuple[int, ...]:
-        """The whole state of one entity as 12 whole numbers (the columns before `cell`)."""
+        """Returns the state of one entity as 12 whole numbers (the columns of `layout.COLUMNS` before `cell`)."""
         state = self._entities[self._row_at(entity), :STATES].copy()
         state[FLAGS] &= FALLING
         return tuple(state.tolist())
 
     def position(self, entity: int) -> tuple[float, float, float]:
-        """Where an entity is, in blocks."""
+        """Returns the position of an entity, in blocks."""
         x, y, z = self._entities[self._row_at(entity), X : X + 3].tolist()
         return x / BLOCK, y / BLOCK, z / BLOCK
 
     def velocity(self, entity: int) -> tuple[float, float, float]:
-        """How fast an entity is, in blocks/s."""
+        """Returns the velocity of an entity, in blocks/s."""
         x, y, z = self._entities[self._row_at(entity), VX : VX + 3].tolist()
         return x / SPEED, y / SPEED, z / SPEED
 
     def falling(self, entity: int) -> bool:
-        """Whether the gravity flag of an entity is up: it falls, or rises."""
+        """Returns whether gravity acts on an entity, so that it falls or rises."""
         return bool(self._entities[self._row_at(entity), FLAGS] & FALLING)
 
     def awake(self, entity: int) -> bool:
-        """Whether an entity will have a turn in the next tick without an input."""
+        """Returns whether an entity will have a turn in the next tick even without an input."""
         return bool(self._entities[self._row_at(entity), FLAGS] & layout.AWAKE)
 
     @property
     def awake_count(self) -> int:
-        """How many entities have a turn in the next tick."""
+        """The number of entities that have a turn in the next tick."""
         return int(self._lengths[layout.N_AWAKE] + self._lengths[layout.N_WOKEN])
 
     @property
     def changed(self) -> layout.Int64s:
-        """The entities that the latest step changed, or that were written since the one before it, [n, 16]. A copy."""
+        """A copy of the entities that the latest step changed, or that were written since the step before, [n, 16]."""
         rows: layout.Int64s = self._entities[self._changed[: self._lengths[layout.N_CHANGED]]]
         alive: layout.Int64s = rows[rows[:, ID] != 0]
         return alive
 
     @property
     def matrix(self) -> layout.Int64s:
-        """Every row as it lies, [rows ever used, 16], free ones with id 0. A view, read-only."""
+        """A read-only view of all rows in memory, [rows ever used, 16]; a free row has the id 0."""
         view: layout.Int64s = self._entities[: self._rows]
         view.flags.writeable = False
         return view
 
     @property
     def compiled(self) -> bool:
-        """Whether its kernel is a compiled one."""
+        """Whether the world's kernel is a compiled one."""
         return self.kernel.compiled
 
     @property
     def arrays(self) -> Arrays:
-        """All that the kernel works on, as it lies now: to be read, by other functions of it."""
+        """The arrays that the kernel works on, at their current place in memory, for other functions that read them."""
         return self._arrays
 
     @property
     def next_id(self) -> int:
-        """The id of the next entity to be spawned.
+        """The id of the next entity that is spawned. It can be set to a higher one.
 
         Raises:
-            SceneError: it was set to a lower one than it is, or to more than there are.
+            SceneError: the new id is lower than the present one, or above the range of ids.
         """
         return self._next_id
 
@@ -186,12 +200,12 @@ class World:
 
     @property
     def fell(self) -> list[int]:
-        """The entities that the latest step left below the scene's floor."""
+        """The ids of the entities that were below the scene's floor at the end of the latest step."""
         fell: list[int] = self._fell[: self._lengths[layout.N_FELL]].tolist()
         return fell
 
     def in_segment(self, index: Cell) -> layout.Int64s:
-        """The entities whose position lies in a loaded segment, [n, 16], ascending by id. A copy.
+        """Returns a copy of the entities whose position is in a loaded segment, [n, 16], ascending by id.
 
         Raises:
             MissingError: the segment is not loaded.
@@ -207,7 +221,11 @@ class World:
         return rows[np.argsort(rows[:, ID])]
 
     def state_hash(self, entities: Iterable[int] | None = None) -> bytes:
-        """20 bytes over the tick, all blocks and all entities (or just some, and then no blocks)."""
+        """Returns the state hash (20 bytes) over the tick, all blocks and all entities.
+
+        Args:
+            entities: if given, only these entities are hashed, and no blocks.
+        """
         if entities is None:
             self.blocks.freshen()
             rows = list(self.blocks.rows.values())
@@ -220,13 +238,18 @@ class World:
     # -- blocks --------------------------------------------------------------------------------------------
 
     def load_terrain(self, indices: Iterable[Cell] | None = None) -> None:
-        """Generates segments by the scene's generator (all of the scene's by default)."""
+        """Generates segments with the scene's terrain generator; all segments of the scene by default."""
         for index in self.scene.segments() if indices is None else indices:
             segment = _segment(index)
             self._load(segment, terrain.generate(self.scene.terrain, segment))
 
     def load_segment(self, index: Cell, kinds: blocks.Kinds) -> None:
-        """Adds or replaces a segment ([32768] kinds) and wakes what may stand on it or have waited for it."""
+        """Adds or replaces a segment, and wakes the entities that overlap or touch it.
+
+        Args:
+            index: index of the segment.
+            kinds: [32768] kinds of blocks, by index z << 10 | y << 5 | x.
+        """
         self._load(_segment(index), blocks.checked_kinds(kinds))
 
     def _load(self, index: Cell, kinds: blocks.Kinds) -> None:
@@ -237,10 +260,10 @@ class World:
         self._wake_segment(index)
 
     def unload_segment(self, index: Cell) -> None:
-        """Forgets a segment; it is solid from then on.
+        """Removes a segment. A segment that is not loaded is solid (below the scene's floor it is void).
 
         Raises:
-            MissingError: it is not loaded.
+            MissingError: the segment is not loaded.
             OverlapError: entities are still in it.
         """
         segment = _segment(index)
@@ -250,26 +273,40 @@ class World:
 
     def _unload(self, index: Cell) -> None:
         self.blocks.unload(index)
-        self._wake_segment(index)  # below the scene's floor, what is not loaded is void
+        self._wake_segment(index)  # below the scene's floor, a segment that is not loaded is void, so things may fall
 
     def block(self, x: int, y: int, z: int) -> int | None:
-        """The kind of a block; None where no segment is loaded."""
+        """Returns the kind of a block; None if its segment is not loaded."""
         return self.blocks.get(*_block(x, y, z))
 
     def set_block(self, x: int, y: int, z: int, kind: int, *, push: bool = False) -> bool:
-        """Places (kind 1 to 255) or removes (0) a block; whether anything changed. Raises as `fill` does."""
+        """Places (kind 1 to 255) or removes (0) a block. Returns whether anything changed.
+
+        With `push`, solid entities in the way go to their nearest free places.
+
+        Raises:
+            OverlapError: a solid entity is in the way (and, with `push`, cannot be pushed out of it).
+            SceneError: a value is not a valid coordinate or kind, or the block's segment is not loaded.
+        """
         x, y, z = _block(x, y, z)
         kind, push = whole(kind, "kind", blocks.AIR, blocks.KIND_MAX), boolean(push, "push")
         return self._fill((x, y, z), (x + 1, y + 1, z + 1), kind, push) > 0
 
     def fill(self, low: Cell, high: Cell, kind: int, *, push: bool = False) -> int:
-        """Sets every block of the box between two corners (`high` excluded), or none; returns how many changed.
+        """Sets every block of a box, or none if it raises an error.
 
-        With `push`, solid entities in the way go to their nearest free places as in `place`, in ascending order of id.
+        Args:
+            low: the lowest block of the box.
+            high: the corner opposite to it, excluded along every axis.
+            kind: 1 to 255; 0 removes the blocks.
+            push: move solid entities that are in the way to their nearest free places, in ascending order of id.
+
+        Returns:
+            The number of blocks that changed.
 
         Raises:
             OverlapError: a solid entity is in the way (and, with `push`, cannot be pushed out of it).
-            SceneError: not a kind, more than `FILL_MAX` blocks, or no segment is loaded there.
+            SceneError: a value is not valid, the box has more than `FILL_MAX` blocks, or a segment is not loaded.
         """
         low, high = (cell(corner, at, -RANGE_BLOCKS, RANGE_BLOCKS) for corner, at in ((low, "low"), (high, "high")))
         kind, push = whole(kind, "kind", blocks.AIR, blocks.KIND_MAX), boolean(push, "push")
@@ -315,16 +352,16 @@ class World:
         *,
         push: bool = False,
     ) -> int:
-        """Adds an entity and returns its id; ids ascend and are never used again.
+        """Adds an entity and returns its id. Ids ascend and are never used again.
 
         Args:
-            template: its name in the scene.
+            template: name of the entity's template in the scene.
             position: in blocks, rounded to the grid.
             velocity: in blocks/s, rounded to the grid.
-            push: if the place is taken, use the nearest free one, at most a block away along one axis.
+            push: if the place is occupied, use the nearest free one, at most a block away along one axis.
 
         Raises:
-            OverlapError: the place is taken (and, with `push`, so is everything near).
+            OverlapError: the place is occupied (and, with `push`, so are the places near it).
             SceneError: a value is not finite or out of range, or there is no such template.
         """
         kind = self.scene.template(template)
@@ -337,14 +374,17 @@ class World:
         return entity
 
     def spawn_many(self, template: str, positions: npt.ArrayLike) -> range:
-        """Adds entities at rest, all or none, as `spawn` would one after the other; their ids, in order.
+        """Adds entities at rest, as `spawn` would one after the other; all of them, or none if it raises an error.
 
         Args:
-            template: its name in the scene.
+            template: name of the entities' template in the scene.
             positions: [n, 3] in blocks, rounded to the grid.
 
+        Returns:
+            The ids of the new entities, in the order of the positions.
+
         Raises:
-            OverlapError: a place is taken, if only by an earlier one.
+            OverlapError: a place is occupied, perhaps by an earlier entity of this call.
             SceneError: a value is not finite or out of range, or there is no such template.
         """
         kind = self.scene.template(template)
@@ -370,7 +410,18 @@ class World:
         return ids
 
     def place(self, entity: int, position: tuple[float, float, float], *, push: bool = False) -> None:
-        """Teleports an entity, which keeps its velocity. Raises as `spawn` does, and `MissingError`."""
+        """Teleports an entity, which keeps its velocity.
+
+        Args:
+            entity: number of the entity.
+            position: in blocks, rounded to the grid.
+            push: if the place is occupied, use the nearest free one, at most a block away along one axis.
+
+        Raises:
+            MissingError: there is no such entity.
+            OverlapError: the place is occupied (and, with `push`, so are the places near it).
+            SceneError: a value is not finite or out of range.
+        """
         row = self._row_at(entity)
         state = list(self.state(entity))
         state[X : X + 3] = self._free_place(row, state[TEMPLATE], position, boolean(push, "push"))
@@ -378,14 +429,25 @@ class World:
         self.placing.add(state[ID])
 
     def set_velocity(self, entity: int, velocity: tuple[float, float, float]) -> None:
-        """Throws an entity, in blocks/s; upwards raises its gravity flag. Raises as `place` does."""
+        """Sets the velocity of an entity, in blocks/s. An upward velocity makes gravity act on it.
+
+        Raises:
+            MissingError: there is no such entity.
+            SceneError: a value is not finite or out of range.
+        """
         state = list(self.state(entity))
         state[VX : VX + 3] = _velocity(velocity)
         state[FLAGS] |= self._thrown(state[VX + 2])
         self._put([tuple(state)])
 
     def set_template(self, entity: int, template: str) -> None:
-        """Changes what an entity is, and so its box. Raises as `place` does."""
+        """Changes the template of an entity, and so its box and its abilities.
+
+        Raises:
+            MissingError: there is no such entity.
+            OverlapError: there is no room for the box of the new template.
+            SceneError: there is no such template.
+        """
         row = self._row_at(entity)
         state = list(self.state(entity))
         state[TEMPLATE] = self.scene.template(template)
@@ -395,7 +457,11 @@ class World:
         self._put([tuple(state)])
 
     def remove(self, entity: int) -> None:
-        """Takes an entity out of the world and wakes what stood on it."""
+        """Removes an entity from the world, and wakes the entities that stood on it.
+
+        Raises:
+            MissingError: there is no such entity.
+        """
         self._row_at(entity)
         self._remove(int(entity))
 
@@ -407,11 +473,18 @@ class World:
         (self._limbo if self._entities[row, FLAGS] & layout.AWAKE else self._free).append(row)
 
     def put(self, states: Iterable[tuple[int, ...]] | layout.Int64s) -> None:
-        """Writes whole states ([n, 12], as `state` gives them), new or known, as they are: nothing is in their way."""
+        """Writes states as they are, without a check for free places; ids that are not known become new entities.
+
+        Args:
+            states: [n, 12] whole numbers, as `state` returns them.
+
+        Raises:
+            SceneError: a value is out of range, or two states have one id.
+        """
         self._put(checked_states(states, len(self.scene.templates)))
 
     def write(self, states: layout.Int64s) -> None:
-        """Writes whole states as `put` does, without its checks: for what `snapshot.decode_parts` has checked."""
+        """Writes states like `put`, but without its checks, for states that `snapshot.decode_parts` has checked."""
         self._put(states)
 
     def _put(self, states: Iterable[tuple[int, ...]] | layout.Int64s) -> None:
@@ -422,10 +495,16 @@ class World:
         self.kernel.store(self._bound, self.kernel.lent(rows), self.kernel.lent(new), len(rows), self.tick + 1)
 
     def write_blocks(self, segment: Cell, offsets: Iterable[int], kinds: Iterable[int]) -> None:
-        """Changes blocks of a loaded segment (by index z << 10 | y << 5 | x), as they are: nothing is in their way.
+        """Changes blocks of a loaded segment, without a check for entities in the way.
+
+        Args:
+            segment: index of the segment.
+            offsets: the blocks, by index z << 10 | y << 5 | x within the segment.
+            kinds: their new kinds, one for each offset.
 
         Raises:
             MissingError: the segment is not loaded.
+            SceneError: a value is out of range, or there are more offsets than kinds, or fewer.
         """
         where, what = list(offsets), list(kinds)
         if len(where) != len(what):
@@ -450,15 +529,23 @@ class World:
             )
 
     def follow(self, turns: layout.Int64s, ticks: int, tick: int) -> bool:
-        """Takes a world that is written and never stepped on by some ticks, the last of which is `tick`: what has no
-        turn in `turns` goes on as it did, with nothing in its way, but does not leave its segment.
+        """Advances a world that is written and never stepped: a client's confirmed world.
+
+        Each entity without a turn in `turns` moves on as before, with nothing in its way, but does not leave its
+        segment.
 
         Args:
-            turns: of those that do not, [n, 8]: id, events (`layout.STOP_X` ...), wish (3), position (3; only that
-                within its segment, along axes where it stopped). Only where `ticks` is 1. Is written to.
+            turns: explicit turns, [n, 8]: id, events (`layout.STOP_X` ...), input (3), position (3). The position
+                counts from the segment's low corner, and only along the axes where the entity stopped. Empty unless
+                `ticks` is 1. The array is written to.
+            ticks: number of ticks to advance.
+            tick: the tick that the world has then reached.
 
         Returns:
             Whether there is an entity for every turn.
+
+        Raises:
+            SceneError: `turns` has another type or shape.
         """
         if turns.dtype != np.int64 or turns.ndim != 2 or turns.shape[1] != layout.TURN:
             raise SceneError(f"turns = {shown(turns)}: must be int64 rows of {layout.TURN}")
@@ -470,11 +557,15 @@ class World:
         return bool(there)
 
     def rebase(self, tick: int) -> None:
-        """Declares what has been written to be the world at the end of `tick`, without a step."""
+        """Sets the tick without a step: the world as it was written becomes the state at the end of `tick`.
+
+        Raises:
+            SceneError: `tick` is not a whole number from -1 to `TICK_MAX`.
+        """
         self._rebase(whole(tick, "tick", -1, TICK_MAX))
 
     def _rebase(self, tick: int) -> None:
-        self._entities[: self._rows, layout.CHANGED] = -1  # it may be a tick that has been before
+        self._entities[: self._rows, layout.CHANGED] = -1  # the new tick may be an earlier one
         self._lengths[layout.N_CHANGED] = self._lengths[layout.N_FELL] = 0
         self._rebased(tick)
 
@@ -494,7 +585,15 @@ class World:
     # -- time ----------------------------------------------------------------------------------------------
 
     def step(self, inputs: Mapping[int, Input] | None = None) -> None:
-        """One tick: `inputs` by entity id; an entity without one goes on with its latest."""
+        """Computes the next tick.
+
+        Args:
+            inputs: inputs by entity id. An entity without one goes on with its latest input.
+
+        Raises:
+            MissingError: there is no entity of an id.
+            SceneError: a value is not an `Input`.
+        """
         n = len(inputs) if inputs else 0
         if inputs:
             told = self._told_of(inputs)
@@ -512,7 +611,7 @@ class World:
             self._limbo.clear()
 
     def _told_of(self, inputs: Mapping[int, Input]) -> list[int]:
-        """Inputs as the kernel wants them: the row, the move intent and the buttons of each."""
+        """Returns inputs as the kernel takes them: row, move_x, move_y and buttons for each."""
         told: list[int] = []
         rows, most = self._row_of, WISH_MAX
         try:
@@ -524,23 +623,23 @@ class World:
                 ):
                     raise ValueError
                 told += (rows[entity], x, y, buttons)
-        except (KeyError, TypeError, ValueError):  # one of them is not right, or numpy's
+        except (KeyError, TypeError, ValueError):  # one of them is wrong, or has numbers of numpy
             told = []
             for entity, wish in inputs.items():
                 told += (self._row_at(entity), *checked_input(wish, f"inputs[{entity}]"))
         return told
 
     def copy(self) -> "World":
-        """Another world in the same state."""
+        """Returns another world in the same state."""
         other = World(self.scene, compiled=self.compiled)
         other.restore(self)
         return other
 
     def restore(self, other: "World") -> None:
-        """Becomes equal to `other`, a world of the same scene; cheap where little differs.
+        """Makes this world equal to `other`, a world of the same scene. Cheap if few segments differ.
 
         Raises:
-            SceneError: it is not of the same scene.
+            SceneError: `other` is not a world of the same scene.
         """
         source: object = other
         if not isinstance(source, World):
@@ -573,7 +672,7 @@ class World:
             self._bind()
 
     def use(self, kernel: kernels.Kernel) -> None:
-        """Goes on with another kernel; the state stays the same."""
+        """Replaces the kernel; the state of the world stays the same."""
         self.kernel = kernel
         self._told = kernel.lent(self._inputs)
         self._bind()
@@ -581,14 +680,14 @@ class World:
     # -- inside --------------------------------------------------------------------------------------------
 
     def _allocate(self, rows: int) -> None:
-        """Makes room for this many entities, keeping those there are."""
+        """Makes room for `rows` entities, and keeps the present ones."""
         self._entities = blocks.grown(self._entities, 0, rows)
         for name in ("_awake", "_next_awake", "_woken", "_later", "_changed", "_fell"):
             setattr(self, name, blocks.grown(getattr(self, name), 0, rows + 1))
         self._candidates = np.zeros((rows + 1, layout.CANDIDATE), np.int64)
 
     def _bind(self) -> None:
-        """Hands the kernel the arrays as they lie now."""
+        """Passes the arrays to the kernel; called whenever one has moved in memory."""
         b = self.blocks
         arrays: tuple[np.ndarray[Any, Any], ...] = (
             self._entities, self._templates, self._walk, self._parameters, b.solid, b.segments, b.table, b.heads,
@@ -599,7 +698,7 @@ class World:
         self._bound = self.kernel.bound(self._arrays)
 
     def _row_at(self, entity: int) -> int:
-        """The row of an entity.
+        """Returns the row of an entity.
 
         Raises:
             MissingError: there is no such entity.
@@ -611,7 +710,7 @@ class World:
         return row
 
     def _row(self, entity: int) -> int:
-        """The row of an entity, a new one if it is not known."""
+        """Returns the row of an entity, a new one if the entity is not known."""
         row = self._row_of.get(entity)
         if row is None:
             if self._free:
@@ -629,22 +728,22 @@ class World:
         return row
 
     def _thrown(self, speed: int) -> int:
-        """The flags of what flies up: it is not held by what it stands on."""
+        """Returns the flags for a vertical speed: an entity that moves up falls, even if something supports it."""
         return FALLING if speed > 0 and self._parameters[layout.GRAVITY] else 0
 
     def _box_at(self, kind: int, position: Iterable[int]) -> list[int]:
-        """Low and high corner of a template's box at a position."""
+        """Returns the low and the high corner of a template's box at a position, in grid steps."""
         row = self._templates[kind].tolist()
         low = [part + row[layout.LO_X + k] for k, part in enumerate(position)]
         return low + [part + row[layout.SIZE_X + k] for k, part in enumerate(low)]
 
     def _near(self, but: int, box: list[int]) -> layout.Int64s:
-        """The candidates of the kernel for a box (`but`: a row left out, or -1), [n, 7]."""
+        """Returns the kernel's candidates for a box, [n, 7], without the row `but` (-1: none is left out)."""
         end = self.kernel.gather(self._bound, but, True, *box)
         return self._candidates[: end // layout.CANDIDATE]
 
     def _overlapping(self, but: int, box: list[int]) -> list[int]:
-        """The ids of the solid entities that overlap a box, ascending (`but`: a row left out, or -1)."""
+        """Returns the ids of the solid entities that overlap a box, ascending, without the row `but` (-1: none)."""
         near = self._near(but, box)
         low, high = np.array(box[:3]), np.array(box[3:])
         hits = (near[:, :3] < high).all(axis=1) & (near[:, 3:6] > low).all(axis=1)
@@ -656,7 +755,7 @@ class World:
         return self._meets(kind) and bool(self._overlapping(row, box))
 
     def _meets(self, kind: int) -> bool:
-        """Whether entities of a template are stopped by solid entities."""
+        """Returns whether solid entities stop the entities of a template."""
         return bool(self._parameters[layout.PAIRS] and self._templates[kind, layout.SOLID])
 
     def _free_place(self, row: int, kind: int, position: object, push: bool) -> list[int]:
@@ -671,7 +770,7 @@ class World:
         return min(pushed, key=lambda moved: sum(abs(a - b) for a, b in zip(moved, at, strict=True)))
 
     def _pushed(self, row: int, kind: int, at: list[int], axis: int, sign: int) -> list[int] | None:
-        """The nearest free position along one axis, at most a block away."""
+        """Returns the nearest free position in one direction, at most a block away; None if there is none."""
         start = self._box_at(kind, at)
         stops = self._stops(row, kind, start, axis, sign)
         for stop in stops:
@@ -685,7 +784,7 @@ class World:
         return None
 
     def _stops(self, row: int, kind: int, box: list[int], axis: int, sign: int) -> list[int]:
-        """The faces within a block that a pushed box could come to rest against, nearest first."""
+        """Returns the faces within a block that could stop a pushed box, nearest first, in grid steps."""
         face = box[axis] if sign > 0 else box[axis + 3]
         first = -(-face // BLOCK) if sign > 0 else face // BLOCK
         faces = [first * BLOCK, (first + sign) * BLOCK]
@@ -697,24 +796,24 @@ class World:
         return sorted(set(faces), reverse=sign < 0)
 
     def _wake_segment(self, index: Cell) -> None:
-        """Wakes what overlaps or touches a segment."""
+        """Wakes the entities that overlap or touch a segment."""
         low = [part * SEGMENT * BLOCK for part in index]
         self.kernel.wake_in(self._bound, *low, *(part + SEGMENT * BLOCK for part in low))
 
     def _leave(self, row: int) -> None:
-        """Wakes what stands on an entity that is about to go or to change."""
+        """Wakes the entities that stand on an entity that is about to be removed or changed."""
         box = self._box_at(int(self._entities[row, TEMPLATE]), self._entities[row, X : X + 3].tolist())
         self.kernel.wake_on(self._bound, row, box[0], box[1], box[3], box[4], box[5])
 
 
 def hash_of(tick: int, segments: layout.Int64s, digests: npt.NDArray[np.uint8], states: layout.Int64s) -> bytes:
-    """The hash of a world from its parts.
+    """Returns the state hash of a world, computed from its parts.
 
     Args:
-        tick: the tick it has reached.
-        segments: [n, 3], the indices of its segments in any order.
-        digests: [n, 16], the digests of those segments.
-        states: [m, 12], the states of its entities, ascending by id.
+        tick: the tick of the world.
+        segments: [n, 3], the indices of the world's segments in any order.
+        digests: [n, 16], the digests of these segments.
+        states: [m, 12], the states of the world's entities, ascending by id.
     """
     order = np.lexsort((segments[:, 2], segments[:, 1], segments[:, 0]))
     digest = hashlib.blake2b(struct.pack("<qqq", tick, len(segments), len(states)), digest_size=HASH_BYTES)
@@ -727,10 +826,10 @@ def hash_of(tick: int, segments: layout.Int64s, digests: npt.NDArray[np.uint8], 
 LISTS = (
     ("_awake", layout.N_AWAKE), ("_woken", layout.N_WOKEN), ("_changed", layout.N_CHANGED), ("_fell", layout.N_FELL),
 )  # fmt: skip
-"""What a world lists between two steps, and where the length of each list is kept."""
+"""Names of the lists that a world keeps between two steps, with the place of each list's length in `_lengths`."""
 
 PUSHES = ((2, 1), (0, -1), (0, 1), (1, -1), (1, 1), (2, -1))
-"""Where an overlapping box is pushed, in the order of preference at equal distance: axis and sign."""
+"""Directions in which an overlapping box may be pushed, as axis and sign, by preference at equal distance."""
 
 
 def _velocity(velocity: object) -> list[int]:
