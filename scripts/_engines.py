@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from scripts import _variants
-from scripts._slabs import Slabs
+from scripts.experiments.slabs import Slabs
 from shared.inputs import JUMP, MOVE_MAX, Input
 from shared.layout import FLAGS, MOVE_X, VX, X
 from shared.scene import Scene

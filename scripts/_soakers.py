@@ -15,8 +15,8 @@ import numpy as np
 
 from client_sdk.prediction.confirmed import Confirmed
 from client_sdk.replica import check_scene
-from scripts._generator import REQUEST, frame
 from scripts._progress import Progress
+from scripts.loadgen.generator import REQUEST, frame
 from shared import edits, messages
 from shared.messages import Bye, Command, Hello, Inputs, Ping, Snapshot, Welcome, decode_from_server, encode
 from shared.snapshot import VERDICT

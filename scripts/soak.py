@@ -6,7 +6,7 @@
 One server process saves its world; a third of the honest players lose their connections every few seconds, the others
 stay for up to 90 s, then leave or are cut off; all come back by themselves. Players of the SDK, one for each ten of
 them, walk all the time. Meanwhile the server is killed (SIGKILL)
-and started again, suspended for some seconds (SIGSTOP), and attacked (`_hostile.py`). In the last 40 % of the time it
+and started again, suspended for some seconds (SIGSTOP), and attacked (`hostile.py`). In the last 40 % of the time it
 is not killed any more, so that its memory can be watched. Every edit that a player was told is done must be in the
 world that is read from the directory in the end. Exits with 1 if one is lost, or an error is unexplained. That a
 player's inputs are not used, or that a player of the SDK does not move, more than 2 s after a stall or a return, is an
@@ -168,7 +168,8 @@ async def abuse(port: int, seed: int, seconds: float, made: Counter[str], errors
     complaints = Stderr()
     try:
         process = await asyncio.create_subprocess_exec(
-            *(sys.executable, str(ROOT / "scripts" / "_hostile.py"), json.dumps(order)),
+            *(sys.executable, "-m", "scripts.loadgen.hostile", json.dumps(order)),
+            cwd=ROOT,
             stdin=asyncio.subprocess.PIPE,
             stdout=asyncio.subprocess.PIPE,
             stderr=complaints.pipe,

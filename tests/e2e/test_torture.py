@@ -50,7 +50,8 @@ class Script:
 
     def __init__(self, name: str, order: dict[str, Any]) -> None:
         self.process = subprocess.Popen(
-            [sys.executable, str(ROOT / "scripts" / name), json.dumps(order)],
+            [sys.executable, "-m", name, json.dumps(order)],
+            cwd=ROOT,
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             text=True,
@@ -104,12 +105,12 @@ def window(address: tuple[str, int], honest: Script) -> tuple[float, float]:
 def storm(server: ServerProcess, attack: dict[str, Any], tick_ms: float) -> None:
     address = server.address()
     order = {"port": address[1], "seed": 1, "rate": round(1000 / tick_ms), "joins_per_s": 100}
-    with script("_generator.py", order) as honest:
+    with script("scripts.loadgen.generator", order) as honest:
         honest.tell(f"clients {HONEST}")
         honest.hear("playing", HONEST)
         share_before, late_before = window(address, honest)
         rss = stats(address)["rss_mb"]
-        with script("_hostile.py", {"port": address[1], "seed": 1} | attack) as hostile:
+        with script("scripts.loadgen.hostile", {"port": address[1], "seed": 1} | attack) as hostile:
             time.sleep(1.0)  # they are at it
             share, late = 0.0, 0.0
             for _ in range(WINDOWS):  # others on this machine can only make it worse
@@ -149,7 +150,7 @@ def test_a_neighbour_that_takes_all_the_processor_delays_and_breaks_nothing() ->
     with running("--port", "0", "--scene", "flat", "--tick-rate", "32") as server, contextlib.ExitStack() as stack:
         address = server.address()
         order = {"port": address[1], "seed": 1, "rate": 32, "joins_per_s": 100}
-        honest = stack.enter_context(script("_generator.py", order))
+        honest = stack.enter_context(script("scripts.loadgen.generator", order))
         honest.tell(f"clients {HONEST}")
         honest.hear("playing", HONEST)
         before, _ = window(address, honest)

@@ -11,7 +11,10 @@ from tests.readme.pages import PAGES, ROOT, headings
 LINK = re.compile(r"\]\(([^)\s]+)\)")
 FILE = re.compile(r"(?<![\w./-])(?:client_sdk|docs|scripts|server|shared|sovereign_netcode|tests)/[\w./-]*\w")
 FLAG = re.compile(r"(?<![\w-])--[a-z][a-z-]+")
-SOURCES = [*(ROOT / "scripts").glob("*"), *(ROOT / "server").rglob("*.py"), *(ROOT / "sovereign_netcode").rglob("*.py")]
+SOURCES = [
+    *(ROOT / "scripts").glob("*"),  # some commands have no suffix
+    *(path for folder in ("scripts", "server", "sovereign_netcode") for path in (ROOT / folder).rglob("*.py")),
+]
 
 each_page = pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 

@@ -5,9 +5,7 @@ import tracemalloc
 
 import pytest
 
-from scripts import _bench_bytes as wire
-from scripts import _bench_entities as entities
-from scripts import _bench_memory as memory
+from scripts.benchmarks import entities, memory, wire
 
 
 @pytest.mark.parametrize(("motion", "most"), [("wander", 7_500), ("run-and-jump", 9_500), ("restless", 21_000)])

@@ -6,9 +6,8 @@ from typing import Any, cast
 
 import pytest
 
-from scripts import _bench_jitter as jitter
-from scripts import _bench_rss as rss
-from scripts import _bench_server as bench
+from scripts.benchmarks import jitter, rss
+from scripts.benchmarks import server as bench
 from shared.scene import Scene
 
 needs_linux = pytest.mark.skipif(sys.platform != "linux", reason="the generator polls with epoll")

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from scripts import _bench_server as bench
+from scripts.benchmarks import server as bench
 from sovereign_netcode.loadtest.processes import CannotStartError, cause, child, own_server
 from sovereign_netcode.play import own_server as play
 from sovereign_netcode.stderr import Stderr
@@ -86,13 +86,19 @@ def test_the_window_names_why_there_is_no_server() -> None:
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="the generator polls with epoll")
-@pytest.mark.parametrize(("broken", "error"), [("_busy_server.py", "the server did not start"), ("_generator.py", "")])
+@pytest.mark.parametrize(
+    ("broken", "error"),
+    [("benchmarks/busy_server.py", "the server did not start"), ("loadgen/generator.py", "")],
+)
 def test_the_benchmark_names_what_is_missing(
     broken: str, error: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     scripts = tmp_path / "scripts"
-    scripts.mkdir()
-    (scripts / "_busy_server.py").write_text("print('listening on ws://127.0.0.1:1', flush=True)\ninput()\n")
+    for name in ("benchmarks", "loadgen"):
+        (scripts / name).mkdir(parents=True)
+    (scripts / "__init__.py").touch()
+    listening = "print('listening on ws://127.0.0.1:1', flush=True)\ninput()\n"
+    (scripts / "benchmarks" / "busy_server.py").write_text(listening)
     (scripts / broken).write_text(MISSING)
     monkeypatch.setattr(bench, "ROOT", tmp_path)
     monkeypatch.setattr(bench, "PATIENCE_S", 3.0)

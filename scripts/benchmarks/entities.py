@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from scripts._bench_memory import Sink
+from scripts.benchmarks.memory import Sink
 from server.game import Game
 from server.game.session import Session
 from shared import messages

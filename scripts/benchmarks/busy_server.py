@@ -1,14 +1,16 @@
 """The servers that the benchmarks measure. `bench.py server` and others start them as processes.
 
-_busy_server.py game SCENE         the product
-_busy_server.py profile SCENE      the product, its stack sampled by CPU time; /stats shows the seconds of each part
-_busy_server.py product SCENE      the product; /stats shows the CPU time of its ticks and of garbage collections
-_busy_server.py default SCENE      like "product", but objects are not frozen after the start
-_busy_server.py off SCENE          like "product", without garbage collection
-_busy_server.py asyncio SCENE      like "product", on asyncio's own event loop
-_busy_server.py churn SCENE        the product with rules that add and remove entities and segments all the time
-_busy_server.py echo SCENE BYTES   the product's gateway and ticker without a game: the bound. It ignores inputs, and
-                                   sends each client a message of BYTES bytes in every tick
+    python -m scripts.benchmarks.busy_server KIND SCENE [BYTES]
+
+game      the product
+profile   the product, its stack sampled by CPU time; /stats shows the seconds of each part
+product   the product; /stats shows the CPU time of its ticks and of garbage collections
+default   like "product", but objects are not frozen after the start
+off       like "product", without garbage collection
+asyncio   like "product", on asyncio's own event loop
+churn     the product with rules that add and remove entities and segments all the time
+echo      the product's gateway and ticker without a game: the bound. It ignores inputs, and sends each client a message
+          of BYTES bytes in every tick
 """
 
 import asyncio

@@ -23,10 +23,10 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+from scripts.environment import ROOT
 from server.observability.histogram import between
 from sovereign_netcode.stderr import Stderr
 
-ROOT = Path(__file__).resolve().parent.parent
 RATE = 30
 PER_SEGMENT = 5
 """Players per segment of 32 x 32 blocks. A client sees nine segments or more, so it sees about 50 players."""
@@ -74,8 +74,8 @@ class Rig:
     """A server process and a process that generates load."""
 
     def __init__(self, kind: str, scene: Path, *more: str, seed: int = 1) -> None:
-        script = ("_echo_picows.py",) if kind == ECHO_PICOWS else ("_busy_server.py", kind)
-        self._server, errors = self._start(*script, str(scene), *more)
+        child = ("benchmarks.echo_picows",) if kind == ECHO_PICOWS else ("benchmarks.busy_server", kind)
+        self._server, errors = self._start(*child, str(scene), *more)
         assert self._server.stdout is not None
         line = self._server.stdout.readline()
         if not line.startswith("listening on "):
@@ -83,7 +83,7 @@ class Rig:
             raise RigError(f"the server did not start: {errors.cause(self._server.returncode)}")
         self.port = int(line.rpartition(":")[2])
         order = {"port": self.port, "seed": seed, "rate": RATE, "joins_per_s": JOINS_PER_S}
-        self._generator, self._errors = self._start("_generator.py", json.dumps(order))
+        self._generator, self._errors = self._start("loadgen.generator", json.dumps(order))
         self._said: queue.Queue[Figures] = queue.Queue()
         threading.Thread(target=self._listen, daemon=True).start()
 
@@ -182,8 +182,8 @@ class Rig:
                     pipe.close()
 
     @staticmethod
-    def _start(script: str, *arguments: str) -> tuple[subprocess.Popen[str], Stderr]:
-        command, errors = (sys.executable, str(ROOT / "scripts" / script), *arguments), Stderr()
+    def _start(module: str, *arguments: str) -> tuple[subprocess.Popen[str], Stderr]:
+        command, errors = (sys.executable, "-m", f"scripts.{module}", *arguments), Stderr()
         try:
             process = subprocess.Popen(
                 command, cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=errors.pipe, text=True

@@ -25,7 +25,7 @@ from picows import (
     ws_create_server,
 )
 
-from scripts._busy_server import Echo
+from scripts.benchmarks.busy_server import Echo
 from server.runtime import event_loop
 from server.runtime.ticker import Ticker, best_alarm
 

@@ -15,7 +15,7 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
-from scripts import _bench_server as server
+from scripts.benchmarks import server
 from server.observability.histogram import between
 
 VARIANTS = {

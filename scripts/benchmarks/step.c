@@ -1,5 +1,5 @@
 /* The step of shared/kernel.py in C: the same algorithm on the same arrays, as a measure of the kernel's speed.
-   scripts/_step_c.py builds and calls it. Only scripts/bench.py uses it, and checks that both reach the same hash. */
+   step_c.py builds and calls it. Only scripts/bench.py uses it, and checks that both reach the same hash. */
 #include <stdint.h>
 
 typedef int64_t i64;

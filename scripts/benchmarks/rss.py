@@ -9,7 +9,7 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-from scripts import _bench_server as server
+from scripts.benchmarks import server
 
 FEW, MANY = 200, 400
 HOLD_S = 3.0

@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from scripts import _step_c
-from scripts._crowds import Samples, crowd, hills, take_turns, wishes
-from scripts._slabs import Slabs, boxes_on, dense_hits
+from scripts.benchmarks import step_c
+from scripts.benchmarks.crowds import Samples, crowd, hills, take_turns, wishes
+from scripts.experiments.slabs import Slabs, boxes_on, dense_hits
 from shared.scene import Scene, Template
 from shared.units import SEGMENT
 from shared.world import World
@@ -33,7 +33,7 @@ def _run(world: World, ticks: int = TICKS) -> float:
 
 def _run_in_c(world: World, ticks: int = TICKS) -> float:
     turns = world.awake_count * ticks
-    _step_c.run(world, ticks)
+    step_c.run(world, ticks)
     return turns
 
 
@@ -41,8 +41,8 @@ def walk(rounds: int, *, pairs: bool) -> Found:
     """Measures 10,000 walkers on hills, all awake: the product and the same step in C. Compares their hashes."""
     ours = crowd(hills(pairs=pairs), WALKERS, compiled=True)
     worlds, work = [ours], {"ours": lambda: _run(ours)}
-    if _step_c.available():
-        _step_c.library()
+    if step_c.available():
+        step_c.library()
         theirs = ours.copy()
         worlds.append(theirs)
         work["c"] = lambda: _run_in_c(theirs)

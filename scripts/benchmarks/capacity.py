@@ -1,4 +1,4 @@
-"""`bench.py server`: runs the searches of `_bench_server.py` one after the other, and prints their table."""
+"""`bench.py server`: runs the searches of `scripts.benchmarks.server` one after the other, and prints their table."""
 
 import argparse
 import os
@@ -8,7 +8,7 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
-from scripts import _bench_server as server
+from scripts.benchmarks import server
 from scripts.environment import lacking
 
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from shared.world import World
 
-SOURCE = Path(__file__).with_name("bench_step.c")
+SOURCE = Path(__file__).with_name("step.c")
 FLAGS = ("-O2", "-ffp-contract=off", "-shared", "-fPIC")
 
 
@@ -23,7 +23,7 @@ def available() -> bool:
 @functools.cache
 def library() -> ctypes.CDLL:
     with tempfile.TemporaryDirectory() as folder:
-        built = Path(folder) / "bench_step.so"
+        built = Path(folder) / "step.so"
         subprocess.run(["gcc", *FLAGS, "-o", str(built), str(SOURCE)], check=True)
         return ctypes.CDLL(str(built))
 

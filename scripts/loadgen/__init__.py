@@ -1,0 +1,1 @@
+"""Processes that put load on a server: many simple players, and hostile peers."""
