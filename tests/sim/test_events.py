@@ -14,6 +14,7 @@ from server.players.player import Player as Seat
 from server.rules import Rules
 from shared.inputs import NEUTRAL, Input
 from shared.scene import Scene, load_scene
+from tests.lengths import long, long_but
 from tests.match import Match, Path, Player, wander
 
 FLAT = load_scene("flat")
@@ -79,7 +80,10 @@ class Born(Rules):
 # -- known, then told ------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("path", [Path(), Path(0.02), *PRESETS.values()], ids=["none", "short", *PRESETS])
+@pytest.mark.parametrize(
+    "path",
+    long_but([Path(), *(PRESETS[name] for name in ("far", "wifi", "outage"))], [Path(), Path(0.02), *PRESETS.values()]),
+)
 def test_an_entity_is_there_when_an_event_tells_of_it(path: Path) -> None:
     match, core = Match(FLAT, seed=1, rules=Born()), Watched()
     match.join(wander, path, core)
@@ -88,7 +92,7 @@ def test_an_entity_is_there_when_an_event_tells_of_it(path: Path) -> None:
     assert core.unknown == 0
 
 
-@pytest.mark.parametrize("rate", [30e3, 60e3])
+@pytest.mark.parametrize("rate", [30e3, *long(60e3)])
 def test_an_entity_is_there_when_an_event_tells_of_it_where_not_all_fits_into_a_snapshot(rate: float) -> None:
     rules = Born()
     rules.crowd = 120
@@ -124,7 +128,7 @@ def test_an_entity_is_there_when_an_event_told_while_one_was_away_speaks_of_it()
 # -- Joined, then the rest --------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("path", [Path(), *PRESETS.values()], ids=["none", *PRESETS])
+@pytest.mark.parametrize("path", long_but([Path(), PRESETS["lan"], PRESETS["thin"]], [Path(), *PRESETS.values()]))
 def test_joined_is_the_first_event_and_what_was_said_before_comes_behind_it(path: Path) -> None:
     match = Match(FLAT, seed=4, rules=Born())
     player = match.join(still, path)
@@ -224,13 +228,15 @@ def test_of_more_than_can_wait_the_client_says_how_many_are_missing() -> None:
     assert sum(isinstance(event, Joined) for event in player.events) == 1
 
 
-@pytest.mark.parametrize("preset", ["thin", "dip", "outage"])
-def test_of_more_than_goes_over_a_line_the_client_hears_how_many_are_missing(preset: str) -> None:
+@pytest.mark.parametrize(
+    ("preset", "seconds"), [("outage", 10), ("thin", 10), *long(("dip", 90), ("thin", 90), ("outage", 90))]
+)
+def test_of_more_than_goes_over_a_line_the_client_hears_how_many_are_missing(preset: str, seconds: float) -> None:
     rules = Loud()
     match = Match(FLAT, seed=9, rules=rules)
     player = match.join(still, PRESETS[preset])
     playing(match, player)
-    match.run(90)
+    match.run(seconds)
     rules.per_tick = 0
     match.run(30)
     assert player.core.state == "playing"
@@ -243,7 +249,7 @@ def test_of_more_than_goes_over_a_line_the_client_hears_how_many_are_missing(pre
     assert match.game.counters.events_dropped == missed
 
 
-@pytest.mark.parametrize("per_tick", [1, 20])
+@pytest.mark.parametrize("per_tick", [20, *long(1)])
 def test_after_lost_connections_the_client_hears_how_many_are_missing(per_tick: int) -> None:
     rules = Loud()
     rules.per_tick = per_tick

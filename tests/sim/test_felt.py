@@ -17,7 +17,7 @@ def settled(match: Match, *players: Player) -> None:
     match.run_until(lambda: all(player.core.state == "playing" for player in players), 60)
 
 
-@pytest.mark.parametrize("seconds", [45, *long(240)])
+@pytest.mark.parametrize("seconds", [20, *long(240)])
 @pytest.mark.parametrize("preset", PRESETS)
 def test_a_lone_player_is_only_ever_corrected_after_a_late_input(preset: str, seconds: float) -> None:
     match = Match(load_scene("hills"), 11)
@@ -32,7 +32,7 @@ def test_a_lone_player_is_only_ever_corrected_after_a_late_input(preset: str, se
     assert player.closed is None
 
 
-@pytest.mark.parametrize("seconds", [45, *long(120)])
+@pytest.mark.parametrize("seconds", [25, *long(120)])
 @pytest.mark.parametrize("preset", PRESETS)
 def test_held_keys_survive_every_stall(preset: str, seconds: float) -> None:
     match = Match(load_scene("arena"), 12)
@@ -67,8 +67,8 @@ def ages(preset: str, seconds: float) -> list[float]:
 @pytest.mark.parametrize(
     ("preset", "seconds"),
     [
-        ("regional", 15),
-        ("outage", 15),
+        ("regional", 8),
+        ("outage", 8),
         *long(*((preset, 120) for preset in ("lan", "regional", "typical", "far", "wifi", "outage"))),
     ],
 )
@@ -86,7 +86,7 @@ def test_snapshots_are_as_fresh_as_the_link_delivers(
 
 @pytest.mark.parametrize(
     ("preset", "seconds"),
-    [("typical", 15), ("thin", 15), *long(("lan", 60), ("typical", 60), ("dip", 60), ("thin", 60))],
+    [("thin", 10), *long(("lan", 60), ("typical", 60), ("dip", 60), ("thin", 60))],
 )
 def test_where_the_system_cannot_tell_what_is_on_the_way_the_acknowledgements_do(
     preset: str, seconds: float, monkeypatch: pytest.MonkeyPatch
@@ -112,7 +112,8 @@ def test_a_thin_link_stays_connected_and_sees_fresh_snapshots(seconds: float) ->
     assert found[-1] <= 1000
 
 
-def test_on_a_thin_link_nobody_is_starved() -> None:
+@pytest.mark.parametrize("seconds", [8, *long(20)])
+def test_on_a_thin_link_nobody_is_starved(seconds: float) -> None:
     """Ten players see each other; what waits longest has been told of a second ago at the most."""
     match = Match(load_scene("hills"), 16)
     players = [match.join(wander, PRESETS["thin"]) for _ in range(10)]
@@ -126,11 +127,11 @@ def test_on_a_thin_link_nobody_is_starved() -> None:
             waits.append(player.session.stream.sight.waits(match.game.world.tick))
 
     match.on_tick.append(look)
-    match.run(20)
+    match.run(seconds)
     assert 4 < max(waits) <= 32
 
 
-@pytest.mark.parametrize("seconds", [100, *long(300)])
+@pytest.mark.parametrize("seconds", [50, *long(300)])
 def test_corrections_tell_their_story(seconds: float) -> None:
     match = Match(load_scene("hills"), 14)
     player = match.join(wander, PRESETS["far"])
@@ -149,7 +150,7 @@ def test_the_same_seed_tells_the_same_story() -> None:
     def story() -> list[object]:
         match = Match(load_scene("hills"), 15)
         players = [match.join(wander, PRESETS[preset]) for preset in ("wifi", "far")]
-        match.run(30)
+        match.run(10)
         return [player.events for player in players] + [match.game.world.state_hash()]
 
     assert story() == story()

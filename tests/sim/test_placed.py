@@ -2,6 +2,7 @@
 
 import dataclasses
 import random
+from itertools import product
 from typing import Any
 
 import pytest
@@ -15,7 +16,7 @@ from server.rules import Rules
 from shared.checks import Vec
 from shared.inputs import NEUTRAL, Input
 from shared.scene import Scene, load_scene
-from tests.lengths import long
+from tests.lengths import long, long_but
 from tests.match import Match, Path, Player
 
 FLAT = load_scene("flat")
@@ -100,8 +101,9 @@ def join(match: Match, path: Path, kind: type[Player] = Player) -> Player:
 # -- others ---------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("rate", [32, 60, 240])
-@pytest.mark.parametrize("far", [0.25, 1.75, 10.0, 25.0])
+@pytest.mark.parametrize(
+    ("far", "rate"), long_but([(0.25, 60), (1.75, 32), (25.0, 240)], product([0.25, 1.75, 10.0, 25.0], [32, 60, 240]))
+)
 def test_an_entity_that_is_placed_is_never_drawn_elsewhere(far: float, rate: int) -> None:
     rules = Acts()
     rules.far = far
@@ -118,9 +120,14 @@ def test_an_entity_that_is_placed_is_never_drawn_elsewhere(far: float, rate: int
     assert drawn == {"one": {70.0, 70.0 + far}, "steps": {79.0, 82.0, 85.0}}
 
 
-@pytest.mark.parametrize("rate", [32, *long(128)])
 @pytest.mark.parametrize(
-    "path", [Path(), Path(0.02), Path(0.01, loss=0.01), *[PRESETS[name] for name in ("lan", "regional", "wifi")]]
+    ("path", "rate"),
+    long_but(
+        [(Path(0.01, loss=0.01), 32), (PRESETS["wifi"], 32)],
+        product(
+            [Path(), Path(0.02), Path(0.01, loss=0.01), PRESETS["lan"], PRESETS["regional"], PRESETS["wifi"]], [32, 128]
+        ),
+    ),
 )
 def test_a_shot_at_what_is_drawn_hits(path: Path, rate: int) -> None:
     rules = Acts()
@@ -135,7 +142,7 @@ def test_a_shot_at_what_is_drawn_hits(path: Path, rate: int) -> None:
     assert rules.misses == []
 
 
-@pytest.mark.parametrize("path", [Path(), Path(0.02, 0.01)])
+@pytest.mark.parametrize("path", [Path(0.02, 0.01), *long(Path())])
 def test_a_shot_at_what_is_drawn_between_snapshots_that_are_far_apart_hits(path: Path) -> None:
     rules = Acts()
     match = Match(FLAT, seed=4, rules=rules)
@@ -228,14 +235,20 @@ def drawn_in_loopback(fps: float, link: str | Path | None, delay: int) -> set[fl
     return drawn
 
 
-@pytest.mark.parametrize("delay", [0, 1, 3])
-@pytest.mark.parametrize("fps", [24.0, 60.0, 144.0])
+@pytest.mark.parametrize(
+    ("fps", "delay"), long_but([(24.0, 3), (60.0, 0), (144.0, 1)], product([24.0, 60.0, 144.0], [0, 1, 3]))
+)
 def test_i_am_never_drawn_between_where_i_was_and_where_i_was_put(fps: float, delay: int) -> None:
     assert drawn_in_loopback(fps, None, delay) <= {64.0, 74.0}
 
 
-@pytest.mark.parametrize("delay", [0, 3])
-@pytest.mark.parametrize("link", ["lan", "regional", "typical", "wifi", Path(0.002), Path(0.016)])
+@pytest.mark.parametrize(
+    ("link", "delay"),
+    long_but(
+        [("lan", 3), ("typical", 0), (Path(0.016), 3)],
+        product(["lan", "regional", "typical", "wifi", Path(0.002), Path(0.016)], [0, 3]),
+    ),
+)
 def test_i_am_never_drawn_between_on_any_line(link: str | Path, delay: int) -> None:
     assert drawn_in_loopback(60.0, link, delay) == {64.0, 74.0}
 

@@ -24,8 +24,10 @@ def ahead(player: Player) -> int:
     return player.core.prediction.predicted.tick - player.core.prediction.confirmed.tick
 
 
-@pytest.mark.parametrize("frames_per_s", [5, 12, 30, 60, 144])
-def test_any_frame_rate_plays(frames_per_s: int) -> None:
+@pytest.mark.parametrize(
+    ("frames_per_s", "seconds"), [(12, 20), (60, 20), *long((5, 60), (12, 60), (30, 60), (60, 60), (144, 60))]
+)
+def test_any_frame_rate_plays(frames_per_s: int, seconds: float) -> None:
     match = Match(load_scene("hills"), 3)
     player = match.join(wander, Path(0.05, 0.01))
     player.frame_s = 1 / frames_per_s
@@ -33,13 +35,13 @@ def test_any_frame_rate_plays(frames_per_s: int) -> None:
     match.run(5)  # the lead has learned how long a frame is
     stats = player.core.stats
     substituted, corrections = stats.inputs_substituted, stats.corrections
-    match.run(60)
+    match.run(seconds)
     if frames_per_s >= 30:
         assert stats.corrections == corrections
         assert stats.inputs_substituted == substituted
-    assert stats.inputs_substituted - substituted < 0.01 * 60 * 32
+    assert stats.inputs_substituted - substituted < 0.01 * seconds * 32
     assert stats.resyncs == 0
-    assert stats.inputs_sent >= 60 * 32
+    assert stats.inputs_sent >= seconds * 32
     assert set(stats.corrections_by_cause) <= {"late input"}
     # A replay comes with new terrain only.
     assert stats.repredictions <= sum(isinstance(event, SegmentLoaded) for event in player.events)
@@ -53,7 +55,7 @@ class Counted(Core):
         super().update(now)
 
 
-@pytest.mark.parametrize("preset", ["lan", "typical", "wifi"])
+@pytest.mark.parametrize("preset", ["typical", *long("lan", "wifi")])
 def test_who_sleeps_until_something_is_due_wakes_up_once_per_tick_and_ping(preset: str) -> None:
     match, core = Match(load_scene("hills"), 6), Counted()
     player = match.join(wander, PRESETS[preset], core)
@@ -66,7 +68,7 @@ def test_who_sleeps_until_something_is_due_wakes_up_once_per_tick_and_ping(prese
     assert core.updates - updates <= 1.05 * sent + 20
 
 
-@pytest.mark.parametrize("seconds", [0.3, 1.0, 2.0, 5.0, 12.0])
+@pytest.mark.parametrize("seconds", [0.3, 2.0, 12.0, *long(1.0, 5.0)])
 def test_a_suspended_program_begins_anew_without_a_spiral(seconds: float) -> None:
     match = Match(load_scene("hills"), 4)
     player = match.join(wander, Path(0.05, 0.01))
@@ -113,7 +115,7 @@ def test_the_input_delay_changes_in_mid_play_without_a_correction() -> None:
     depths = {}
     for ticks in (0, 3, 1, 2, 0):
         player.core.set_input_delay(ticks)
-        match.run(20)
+        match.run(10)
         depths[ticks] = ahead(player)
     assert depths[3] < depths[0]
     assert player.core.stats.corrections == 0
@@ -121,7 +123,7 @@ def test_the_input_delay_changes_in_mid_play_without_a_correction() -> None:
         player.core.set_input_delay(4)
 
 
-@pytest.mark.parametrize("preset", ["typical", "far"])
+@pytest.mark.parametrize("preset", ["typical", *long("far")])
 def test_a_command_tells_what_was_drawn_when_it_was_given(preset: str) -> None:
     """At 60 frames/s: the picture drawn last, not that of the update in between; never 100 ms beyond what is known."""
     match = Match(load_scene("flat"), 21)

@@ -63,7 +63,7 @@ def stop_clock(match: Match, player: Player, seconds: float) -> None:
 
 
 @pytest.mark.parametrize(
-    ("rate", "stall_s"), long_but([(1, 10.0), (32, 1.0), (240, 3.5)], product(RATES, (0.5, 1.0, 3.5, 10.0)))
+    ("rate", "stall_s"), long_but([(1, 10.0), (32, 1.0), (128, 3.5)], product(RATES, (0.5, 1.0, 3.5, 10.0)))
 )
 def test_every_tick_has_its_input_again_after_the_server_stood_still(rate: int, stall_s: float) -> None:
     match, player = at(rate)
@@ -77,7 +77,7 @@ def test_every_tick_has_its_input_again_after_the_server_stood_still(rate: int, 
 
 
 @pytest.mark.parametrize(
-    ("rate", "asleep_s"), long_but([(1, 8.0), (32, 1.0), (240, 3.0)], product(RATES, (0.5, 1.0, 3.0, 8.0)))
+    ("rate", "asleep_s"), long_but([(1, 8.0), (32, 1.0), (128, 3.0)], product(RATES, (0.5, 1.0, 3.0, 8.0)))
 )
 def test_every_tick_has_its_input_again_after_the_clients_clock_stood_still(rate: int, asleep_s: float) -> None:
     match, player = at(rate)
@@ -98,9 +98,7 @@ def test_every_tick_has_its_input_again_after_the_clients_clock_leapt(rate: int,
     causes(player)
 
 
-@pytest.mark.parametrize(
-    ("seed", "step_s"), long_but([(2, -4.0), (2, 4.0)], product(range(2, 9), (-4.0, -1.0, 1.0, 4.0)))
-)
+@pytest.mark.parametrize(("seed", "step_s"), long_but([(2, -4.0)], product(range(2, 9), (-4.0, -1.0, 1.0, 4.0))))
 def test_a_step_on_a_bad_line_ends_in_no_more_late_inputs_than_before(seed: int, step_s: float) -> None:
     match, player = at(32, PRESETS["far"], seed)
     match.run(30)
@@ -149,8 +147,8 @@ def test_an_input_is_a_duplicate_only_of_one_that_was_accepted() -> None:
 @pytest.mark.parametrize(
     ("rate", "fps"),
     [
-        (1, 60), (32, 1.9), (240, 14),
-        *long((1, 1), (5, 1), (20, 1.3), (32, 1), (32, 1000), (60, 1.5), (128, 7), (240, 1), (240, 1000)),
+        (1, 60), (32, 1.9), (128, 7),
+        *long((1, 1), (5, 1), (20, 1.3), (32, 1), (32, 1000), (60, 1.5), (240, 1), (240, 14), (240, 1000)),
     ],
 )  # fmt: skip
 def test_any_frame_rate_plays(rate: int, fps: float) -> None:

@@ -33,7 +33,7 @@ def above_oracle(row: league.Row) -> float:
     return float(row["fair_latency_ms"] - row["fair_oracle_ms"]) / TICK_MS
 
 
-@pytest.mark.parametrize(("seed", "minutes"), [(11, 4.0), *long((11, MINUTES), (12, MINUTES), (13, MINUTES))])
+@pytest.mark.parametrize(("seed", "minutes"), [(11, 2.0), *long((11, MINUTES), (12, MINUTES), (13, MINUTES))])
 @pytest.mark.parametrize(
     ("preset", "late", "added_ticks", "above_ticks"),
     [
@@ -66,7 +66,7 @@ def test_after_a_spike_all_is_well_within_250_ms() -> None:
     assert sum(run.leads[tick] for tick in soon) / len(soon) < PRESETS["wifi"].rtt_s / 2 * league.RATE + 0.75
 
 
-@pytest.mark.parametrize("minutes", [4.0, *long(MINUTES)])
+@pytest.mark.parametrize("minutes", [2.0, *long(MINUTES)])
 @pytest.mark.parametrize("preset", PRESETS)
 @pytest.mark.parametrize("name", ["Unity N4E", "DDNet"])
 def test_the_nearest_rivals_are_not_both_less_late_and_less_ahead(name: str, preset: str, minutes: float) -> None:

@@ -63,10 +63,11 @@ def other_chain(scene: str, form: str, ticks: int) -> str:
     return subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, check=True).stdout.strip()
 
 
-def test_a_copy_and_a_restored_world_go_on_alike() -> None:
+@pytest.mark.parametrize("ticks", [2_000, *long(TICKS)])
+def test_a_copy_and_a_restored_world_go_on_alike(ticks: int) -> None:
     world, other = start(True), start(True)
     rng = random.Random(3)
-    for tick, wishes in zip(range(TICKS), inputs(7), strict=False):
+    for tick, wishes in zip(range(ticks), inputs(7), strict=False):
         if tick % 500 == 0:
             other = world.copy()
         elif rng.random() < 0.01:  # diverge, then come back
@@ -78,10 +79,11 @@ def test_a_copy_and_a_restored_world_go_on_alike() -> None:
         assert world.state_hash() == other.state_hash(), tick
 
 
-def test_going_back_eight_ticks_every_tick_and_replaying_changes_nothing() -> None:
+@pytest.mark.parametrize("ticks", [800, *long(3_000)])
+def test_going_back_eight_ticks_every_tick_and_replaying_changes_nothing(ticks: int) -> None:
     world, restless = start(True), start(True)
     past: list[tuple[World, dict[int, Input]]] = []
-    for tick, wishes in zip(range(3000), inputs(11), strict=False):
+    for tick, wishes in zip(range(ticks), inputs(11), strict=False):
         past.append((restless.copy(), wishes))
         del past[:-8]
         restless.restore(past[0][0])
