@@ -1,4 +1,4 @@
-"""Commands of players: filed as they come, carried out in their tick, answered when no crash can undo it any more."""
+"""Commands of players: queued when they arrive, carried out in their tick, answered when no crash can undo them."""
 
 from collections import deque
 from collections.abc import Iterator
@@ -16,10 +16,14 @@ from shared.messages import Command
 
 
 class Orders:
-    """All commands of one game.
+    """The commands of all players of one game.
 
     Args:
-        saves: where the world is saved, if it is.
+        world: the world.
+        stage: the game API, which calls the rules.
+        limits: the limits.
+        faults: where exceptions in commands are reported.
+        saves: the store of the world; None: the world is not saved.
     """
 
     def __init__(
@@ -28,22 +32,22 @@ class Orders:
         self._world, self._stage, self._limits, self._faults, self._saves = world, stage, limits, faults, saves
         self._ahead = bounds(world.scene.tick_rate).ahead
         self._unanswered: deque[tuple[int, Player, int, int]] = deque()
-        """Verdicts that are not on disk yet: tick, player, number, verdict."""
+        """Verdicts that are not durable yet: tick, player, number, verdict."""
 
     @property
     def trouble(self) -> bool:
-        """Whether nothing can be saved just now."""
+        """Whether nothing can be saved at the moment."""
         return self._saves is not None and bool(self._saves.trouble)
 
     @property
     def durable_tick(self) -> int:
-        """The newest tick that no crash can undo any more."""
+        """Newest tick that no crash can undo."""
         return self._world.tick if self._saves is None else self._saves.durable_tick
 
     def file(self, player: Player, command: Command) -> None:
-        """A command has come; one that is known already is answered again, if it has been answered."""
+        """Queues a command that has arrived. A known command is not queued again; its verdict is sent again."""
         if command.number <= player.command:
-            if command.number in player.settled:  # asked again after a lost connection
+            if command.number in player.settled:  # the client has sent it again after a lost connection
                 player.verdicts.append((command.number, player.settled[command.number]))
             return
         player.command = command.number
@@ -53,7 +57,7 @@ class Orders:
             player.commands.append(command)
 
     def carry_out(self) -> None:
-        """What players do at the start of this tick, in the order in which they joined."""
+        """Carries out the due commands of all players, in the order in which the players joined."""
         tick = self._world.tick + 1
         rate = self._limits.edits_per_s
         for player in tuple(self._stage.players.values()):
@@ -75,14 +79,14 @@ class Orders:
                 self._world.note([persisted_state.ANSWERED, player.entity, command.number, verdict])
 
     def answer(self) -> None:
-        """Tells the verdicts that will last."""
+        """Queues the verdicts that are durable now to be sent to the players."""
         durable = self.durable_tick
         while self._unanswered and self._unanswered[0][0] <= durable:
             _, player, number, verdict = self._unanswered.popleft()
             player.settle(number, verdict)
 
     def notes(self) -> Iterator[list[Any]]:
-        """The verdicts that wait, as notes."""
+        """Yields the verdicts that are not durable yet, as notes for a checkpoint."""
         for _, player, number, verdict in self._unanswered:
             if player.entity in self._stage.players:
                 yield [persisted_state.ANSWERED, player.entity, number, verdict]

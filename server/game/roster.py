@@ -1,7 +1,8 @@
-"""Who plays: joins at a spawn, is kept for a while without a connection, comes back by a token, leaves.
+"""The roster: the list of players, from their join at a spawn point to their end, with reconnects between.
 
-A token is worth one return. Each welcome has a new one; the one before is good until the client has been heard from
-over the new connection, for it may never have got the welcome. Only digests are kept.
+A resume token allows one reconnect. Each welcome has a new token. The former token stays valid until the client has
+acknowledged a snapshot over the new connection, because the welcome may have been lost. Only digests of tokens are
+kept.
 """
 
 import hashlib
@@ -21,35 +22,50 @@ from shared.bounds import bounds
 from shared.messages import RESUME_BYTES
 
 UNHEARD_S = 2.0
-"""Who is cut off before it has acknowledged anything is kept for no longer than this."""
+"""Seconds that a new player may take to reconnect if its client has not acknowledged anything yet."""
 
 
 class Roster:
-    """The players of one game, and where they stand when they come."""
+    """The players of one game.
+
+    Args:
+        world: the world.
+        stage: the game API, which is notified of joins and leaves.
+        limits: the limits.
+        counters: where joins and leaves are counted.
+    """
 
     def __init__(self, world: RecordedWorld, stage: Stage, limits: Limits, counters: Counters) -> None:
         self.players: dict[int, Player] = stage.players
-        """By entity, in the order in which they joined; also those whose connection is lost, for a while."""
+        """Players by entity, in the order in which they joined, including those who may still reconnect."""
         self._world, self._stage, self._limits, self._counters = world, stage, limits, counters
         self._bounds = bounds(world.scene.tick_rate)
         self._spawns = Spawns(world)
         self._fallen: list[int] = []
-        for player in self.players.values():  # of a game that goes on
+        for player in self.players.values():  # players of a restored game
             player.inputs = InputQueue(self._bounds)
 
     @property
     def connected(self) -> int:
-        """How many have a connection, if only one whose loss has not been noticed yet."""
+        """Number of players with a connection, including connections whose loss has not been noticed yet."""
         return sum(player.session is not None for player in self.players.values())
 
     def enter(self, session: Session, name: str) -> Player | None:
-        """A new player at a spawn, with that connection; ask between two ticks. None: there is no room."""
+        """Adds a new player at a spawn point. Call it before the step of a tick.
+
+        Args:
+            session: the connection of the player.
+            name: the name of the player.
+
+        Returns:
+            The player, or None if there is no room.
+        """
         self._make_room()
         entity = self._spawns.spawn()
         if entity is None:
             return None
         player = self.players[entity] = Player(entity, name, session.subject, self._bounds)
-        player.edits_left = 0.0  # else leaving and joining anew would give a burst each time
+        player.edits_left = 0.0  # otherwise each leave and new join would give another burst
         player.announced = False
         self._counters.joined += 1
         try:
@@ -61,31 +77,38 @@ class Roster:
         return player
 
     def issue(self, player: Player) -> bytes:
-        """A token with which that player may come back."""
+        """Makes a new resume token for a player and returns it."""
         token = secrets.token_bytes(RESUME_BYTES)
         player.tokens.append(_digest(token))
         self._world.note(persisted_state.note_of(player))
         return token
 
     def expel(self, player: Player) -> None:
-        """Takes back a join that has failed: nothing of it stays."""
+        """Undoes a join that has failed."""
         if player.session is not None:
             player.session.vacate()
         self._let_go([player])
 
     def find(self, token: bytes, subject: str) -> Player | None:
-        """The player who was given that token, which is used up with this; it may still have a connection."""
+        """Returns the player with a resume token and a subject, or None. The token is used up by this.
+
+        The player may still have a connection.
+
+        Args:
+            token: the token from the client's hello; empty if it has none.
+            subject: the subject of the client.
+        """
         wanted = _digest(token)
         for player in self.players.values() if token else ():
             if player.session is not None and player.session.stream.acked >= 0:
                 player.heard()
             if wanted in player.tokens and player.subject == subject:
-                player.tokens[:] = [wanted]  # the ones before it are used up, and one after it was never heard of
+                player.tokens[:] = [wanted]  # an older token is used up, and the client never got a newer one
                 return player
         return None
 
     def lost(self, session: Session, now: float) -> None:
-        """The connection of a session is gone: its player has some time to come back."""
+        """Handles a lost connection: starts the time in which its player can reconnect."""
         player = session.player
         if player is None or player.session is not session:
             return
@@ -96,39 +119,39 @@ class Roster:
         player.away_until = now + (self._limits.resume_s if known else min(UNHEARD_S, self._limits.resume_s))
 
     def dismiss(self, session: Session) -> None:
-        """The player of this connection is not kept for a return."""
+        """Makes the player of a session leave in the next tick, without a chance to reconnect."""
         if session.player is not None and session.player.session is session:
             session.player.session = None
             session.player.away_until = -math.inf
 
     def excuse(self, seconds: float, now: float) -> None:
-        """In that time nobody could come back: it is added to what is left of theirs."""
+        """Extends the time to reconnect of all players by a pause of the server, in which nobody could reconnect."""
         for player in self.players.values():
             if player.session is None:
                 player.away_until = min(player.away_until + seconds, now + self._limits.resume_s)
 
     def leave(self, now: float) -> None:
-        """Whose time to come back is over leaves."""
+        """Removes the players whose time to reconnect is over."""
         away = [player for player in self.players.values() if player.session is None]
         for player in away:
-            if player.away_until == math.inf:  # the server has been away
+            if player.away_until == math.inf:  # the player of a restored game
                 player.away_until = now + self._limits.resume_s
         self._let_go([player for player in away if now >= player.away_until])
 
     def fell_out(self) -> None:
-        """Who is below the floor comes back at a spawn, in the next tick, unless the rules have other plans."""
+        """Takes note of the entities that fell out of the world in this step, for `revive` in the next tick."""
         self._fallen = self._world.fell
         self._counters.fell_out += len(self._fallen)
 
     def revive(self) -> None:
-        """Those who fell out in the last tick come back."""
+        """Puts the entities that fell out in the last tick at spawn points, unless the rules deal with them."""
         for entity in self._fallen:
             if entity in self._world and not self._stage.fell_out(entity):
                 self._spawns.put_back(entity)
         self._fallen.clear()
 
     def _make_room(self) -> None:
-        """Lets go of those whose time to come back ends first, where there are as many players as there may be."""
+        """Removes players without a connection if the game is full; first the one with the least time left."""
         excess = len(self.players) + 1 - self._limits.clients_max
         if excess > 0:
             away = [player for player in self.players.values() if player.session is None]
@@ -143,5 +166,5 @@ class Roster:
 
 
 def _digest(token: bytes) -> bytes:
-    """What is kept of a token: enough to know it again, not enough to show it."""
+    """Returns the digest of a token: it recognises the token, but cannot be used in its place."""
     return hashlib.sha256(token).digest()

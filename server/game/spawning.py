@@ -1,4 +1,4 @@
-"""Where players appear, and appear again."""
+"""Spawning: finds free places at and around the spawn points for players that join and entities that fell out."""
 
 from collections.abc import Iterator
 
@@ -11,8 +11,9 @@ from shared.units import BLOCK, BLOCK_SHIFT, to_position
 from shared.world import OverlapError, World
 
 RINGS = 24
-"""Where a spawn is taken, others are tried in rings around it, so many blocks apart:"""
+"""Number of rings of places that are tried around a spawn point, including the point itself."""
 APART = 2
+"""Distance of neighbouring places and rings, in blocks."""
 OFFSETS = tuple(
     (i, j)
     for ring in range(1, RINGS)
@@ -20,10 +21,11 @@ OFFSETS = tuple(
     for j in range(-ring, ring + 1)
     if max(abs(i), abs(j)) == ring
 )
+"""Offsets of the places around a spawn point in steps of `APART` blocks, the nearest rings first."""
 
 
 class Spawns:
-    """The free places at and around the spawns of a world's scene."""
+    """The free places at and around the spawn points of a world's scene."""
 
     def __init__(self, world: World) -> None:
         self._world = world
@@ -32,7 +34,7 @@ class Spawns:
         self._full: tuple[int, int, int] | None = None
 
     def spawn(self) -> int | None:
-        """A new player's entity; None: there is no room."""
+        """Adds the entity of a new player and returns its number; None: there is no room."""
         player = self._world.scene.player
         for place in self._places(self._world.scene.index_of[player]):
             try:
@@ -42,7 +44,7 @@ class Spawns:
         return None
 
     def put_back(self, entity: int) -> bool:
-        """Puts an entity at a spawn, at rest; False: there is no room."""
+        """Puts an entity at a spawn point, at rest. Returns False if there is no room."""
         for place in self._places(self._world.state(entity)[TEMPLATE]):
             try:
                 self._world.place(entity, place)
@@ -53,11 +55,14 @@ class Spawns:
         return False
 
     def _places(self, kind: int) -> Iterator[Vec]:
-        """Where to try for an entity of a template: the scene's spawns in turn, then ever wider around one of them.
+        """Yields the places to try for an entity: the spawn points in turn, then rings around one of them.
 
-        Where somebody is, is tried last: a crowd of 360 at the spawn made a join cost 40 ms otherwise. Where a block
-        is, nothing is tried: spawns that players had walled up made it cost 180 ms (now 16). And that there is no room
-        is found once a tick, not by everybody who needs some.
+        Places near other entities are tried last; without that, a join cost 40 ms in a crowd of 360 at the spawn point.
+        Places in blocks are not tried; without that, it cost 180 ms (now 16 ms) at spawn points that players had walled
+        up. If there is no room at all, that is found out only once per tick.
+
+        Args:
+            kind: index of the entity's template.
         """
         now = (self._world.tick, len(self._world), kind)
         if now == self._full:
@@ -76,7 +81,7 @@ class Spawns:
         self._full = now
 
     def _built(self, kind: int, place: Vec) -> bool:
-        """Whether a block is in the way of an entity there, or none is known."""
+        """Returns whether a block, or a segment that is not loaded, is in the way of an entity at a place."""
         box = self._boxes[kind]
         low = [to_position(part, "spawn") + reach for part, reach in zip(place, box, strict=False)]
         spans = [
@@ -85,7 +90,7 @@ class Spawns:
         return any(self._world.blocks.get(x, y, z) != AIR for z in spans[2] for y in spans[1] for x in spans[0])
 
     def _taken(self, x: float, y: float) -> set[tuple[int, int]]:
-        """The offsets from a spawn next to which there is somebody, at whatever height."""
+        """Returns the offsets from a spawn point (in steps of `APART`) with an entity nearby, at any height."""
         matrix = self._world.matrix
         places = matrix[matrix[:, ID] != 0][:, (X, Y)]
         offsets = np.rint((places / BLOCK - (x, y)) / APART)

@@ -1,7 +1,7 @@
-"""Listening sockets: one for each address of a host, all on one port.
+"""Listening sockets: one for each address of a host, all on the same port.
 
-asyncio's own servers make every IPv6 socket refuse IPv4, and give each address of a host a port of its own where the
-system picks it. So the sockets are opened here.
+The sockets are not opened by asyncio's own servers for two reasons: those make every IPv6 socket refuse IPv4, and with
+port 0 they get a different port for each address.
 """
 
 import asyncio
@@ -9,19 +9,21 @@ import errno
 import socket
 
 EVERY_INTERFACE = "::"
-"""The IPv6 address that stands for all of this machine's addresses."""
+"""IPv6 address that stands for all of this machine's addresses."""
 TRIES = 16
-"""Attempts to find a port that is free on all addresses, where the system picks the port."""
+"""Attempts to find a port that is free on all addresses, if the system picks the port."""
 LACKING = (errno.EAFNOSUPPORT, errno.EADDRNOTAVAIL)
 """Errors of an address whose family this system does not have, or has switched off."""
 _Found = list[tuple[int, tuple[str | int, ...]]]
 
 
 async def listeners(host: str, port: int, backlog: int) -> list[socket.socket]:
-    """Opens a listening socket on each address of a host (empty: every interface).
+    """Opens a listening socket on each address of a host. An address whose family this system lacks is left out.
 
-    `::` takes IPv4 as well. An address whose family this system lacks is left out. With port 0 the system picks one
-    port for all.
+    Args:
+        host: a host name or an address; empty: every interface. `::` accepts IPv4, too.
+        port: the port; 0: the system picks one, the same for all addresses.
+        backlog: connections that may wait to be accepted.
 
     Raises:
         OSError: no address can be used, or one of them is in use.
@@ -37,7 +39,7 @@ async def listeners(host: str, port: int, backlog: int) -> list[socket.socket]:
 
 
 async def _addresses(host: str) -> _Found:
-    """Family and address of each, without the port."""
+    """Returns the family and the address, without the port, of each address of a host."""
     loop = asyncio.get_running_loop()
     if host == EVERY_INTERFACE and not socket.has_dualstack_ipv6():
         return [(socket.AF_INET6, ("::",)), (socket.AF_INET, ("0.0.0.0",))]
@@ -46,7 +48,7 @@ async def _addresses(host: str) -> _Found:
 
 
 def bracketed(host: str) -> str:
-    """A host as it stands in a URL."""
+    """Returns a host in the notation of a URL: an IPv6 address gets brackets."""
     return f"[{host}]" if ":" in host else host
 
 

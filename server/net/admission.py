@@ -1,13 +1,13 @@
-"""Who may come in: the decisions on connections that a gateway asks for before there is a player.
+"""Admission: decides which connections and HTTP requests are accepted, before there is a player.
 
-A gateway tells `arrive` of each connection, asks `answer` what to do with its request, and tells `leave` when it is
-gone. A request for a WebSocket that is refused gets an HTTP status and a reason; nothing has been set up for it by
-then. Pages are answered even when the server is full, so that whoever watches it does not take it for dead: `SPARE`
-connections beyond the limits get that far, and those beyond them are dropped without a word.
+The gateway calls `arrive` for each connection, `answer` for its request, and `leave` when the connection is gone. A
+refused request for a WebSocket gets an HTTP status and a reason; at that point no WebSocket has been set up. Pages are
+served even if the server is full, so that monitoring does not take it for dead: `SPARE` connections beyond the limits
+are accepted for them. Connections beyond these are dropped without an answer.
 
-A page in a browser may come from a name that somebody else has pointed at this machine (DNS rebinding); the browser
-then lets that page read what this server answers. So a request for a page is refused if it calls the server by a name
-that is not its own. A request for a WebSocket is judged by its origin: clients that are no browsers send none.
+A page in a browser may come from a foreign host name that points at this machine (DNS rebinding). The browser would let
+that page read the answers of this server. Therefore a request for a page is refused if its `Host` is not a name of this
+server. A request for a WebSocket is checked by its `Origin`, which only browsers send.
 """
 
 import math
@@ -22,20 +22,24 @@ from server.config.limits import Limits
 from server.observability.pages import Page, Pages, line
 
 SPARE = 32
-"""Connections beyond the limit in total that are answered,"""
+"""Connections beyond `Limits.connections_max` that are accepted to serve pages."""
 SPARE_PER_ADDRESS = 4
-"""and of one address."""
+"""Connections beyond `Limits.connections_per_address` that are accepted to serve pages."""
 BURST_S = 2.0
+"""Seconds whose allowed joins may happen at once."""
 RETRY_S = "2"
+"""Value of the header Retry-After in seconds, for clients that are refused because of a limit."""
 NOT_OWN = "is not a name of this server; its operator can add it to allowed_hosts"
+"""End of the answer to a request with a foreign host name."""
 HOST = re.compile(r"(?:\[([^]]*)\]|([^]:%[]*))(?::\d*)?")
-"""The header `Host`: an IPv6 address in brackets, or a name or IPv4 address; and a port."""
+"""Pattern of the header `Host`: an IPv6 address in brackets, or a name or IPv4 address; then perhaps a port."""
 
 
 class Request(NamedTuple):
-    """What matters of an HTTP request.
+    """The parts of an HTTP request that matter for admission.
 
-    `host` is the header, empty if there is none; `upgrade`: the request asks for a WebSocket.
+    `host` is the header `Host`, empty if there is none. `origin` is the header `Origin`, None if there is none.
+    `upgrade` says whether the request asks for a WebSocket.
     """
 
     method: str
@@ -46,13 +50,15 @@ class Request(NamedTuple):
 
 
 class Door:
-    """Counts connections, and answers requests.
+    """The admission control of one server: counts connections, and answers requests.
 
     Args:
-        figures: whose addresses may see the private pages: none, loopback, private or all.
-        origins: see `Settings.allowed_origins`.
-        hosts: names by which a page may be asked for; see `Settings.allowed_hosts`.
-        closing: the seconds after which to come back once the server is going down; None while it is not.
+        limits: the limits; None: the default ones.
+        pages: the pages to serve; None: only `/` and `/healthz`.
+        figures: addresses that may see the private pages: none, loopback, private or all.
+        origins: origins of web pages that may open a WebSocket, as in `Settings.allowed_origins`.
+        hosts: host names under which pages are served, as in `Settings.allowed_hosts`.
+        closing: returns the seconds after which clients should reconnect if the server is going down, otherwise None.
     """
 
     def __init__(
@@ -74,13 +80,13 @@ class Door:
         self._hosts = frozenset(host.removesuffix(".").lower() for host in hosts)
         self._closing = closing
         self.total = 0
-        """Connections that have come and not gone."""
+        """Number of present connections."""
         self._by_network: Counter[str] = Counter()
-        self._joins = math.inf  # that is: the whole burst
+        self._joins = math.inf  # WebSockets that may be opened now; at first the whole burst
         self._joins_at = 0.0
 
     def arrive(self, address: str) -> bool:
-        """A connection has come from an address; if False, drop it at once (and do not call `leave`)."""
+        """Counts a new connection. Returns False if it is to be dropped at once; then `leave` must not be called."""
         limits, network = self.limits, network_of(address)
         if self.total >= limits.connections_max + SPARE:
             self.refused["connections"] += 1
@@ -93,7 +99,7 @@ class Door:
         return True
 
     def leave(self, address: str) -> None:
-        """A connection that had arrived is gone."""
+        """Counts the end of a connection for which `arrive` returned True."""
         network = network_of(address)
         self.total -= 1
         self._by_network[network] -= 1
@@ -101,7 +107,13 @@ class Door:
             del self._by_network[network]
 
     def answer(self, request: Request, address: str, now: float) -> Page | None:
-        """What to answer to a request; None: let it have its WebSocket."""
+        """Returns the page that answers a request; None: the request may open its WebSocket.
+
+        Args:
+            request: the request.
+            address: the peer's address.
+            now: the current time in seconds.
+        """
         if not request.upgrade:
             if request.host and ANY not in self._hosts and not self._own(request.host):
                 self.refused["host"] += 1
@@ -118,7 +130,8 @@ class Door:
             retry = str(max(1, round(wait)))
             return "closing", line(HTTPStatus.SERVICE_UNAVAILABLE, "the server is going down", retry_after=retry)
         if not self._welcome(request):
-            return "origin", line(HTTPStatus.FORBIDDEN, f"not from pages of {str(request.origin)[:100]}")
+            reason = f"web pages of {str(request.origin)[:100]} may not connect; see allowed_origins"
+            return "origin", line(HTTPStatus.FORBIDDEN, reason)
         if self.total > limits.connections_max:
             reason = f"the server is full ({limits.connections_max} connections)"
             return "connections", line(HTTPStatus.SERVICE_UNAVAILABLE, reason, retry_after=RETRY_S)
@@ -141,14 +154,14 @@ class Door:
         return True
 
     def _welcome(self, request: Request) -> bool:
-        """Whether the origin, which only browsers send, is an allowed one or a page of this server itself."""
+        """Returns whether the origin is allowed: none (not a browser), an allowed one, or a page of this server."""
         if request.origin is None or ANY in self._origins:
             return True
         origin, host = request.origin.lower(), request.host.lower()
         return origin in self._origins or (self._own(host) and origin.partition("://")[2] == host)
 
     def _own(self, host: str) -> bool:
-        """Whether the header `Host`, with or without a port, is an IP address, localhost or a name of this server."""
+        """Returns whether a header `Host` names this server: by an IP address, localhost or one of its names."""
         found = HOST.fullmatch(host)
         if found is None:
             return False
@@ -159,7 +172,7 @@ class Door:
         return not (self.limits.loopback_exempt and is_loopback(address))
 
     def trusted(self, address: str) -> bool:
-        """Whether an address may see the private pages."""
+        """Returns whether an address may see the private pages."""
         match self._figures:
             case "all":
                 return True

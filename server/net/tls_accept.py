@@ -1,8 +1,8 @@
-"""TLS in front of a gateway: a connection is counted from the moment it is accepted.
+"""Accepting of TLS connections, which are counted from the moment they are accepted.
 
-asyncio's own servers tell of a connection once its handshake is over. Who never finishes one is nobody's until then:
-it has a descriptor, and up to 0.3 MB, that no limit counts. So connections are accepted here, and whoever counts them
-is asked first.
+asyncio's own servers report a connection only when its TLS handshake is over. A peer that never finishes the handshake
+would hold a file descriptor and up to 0.3 MB that no limit counts. Therefore connections are accepted here, and
+admission is asked before the handshake.
 """
 
 import asyncio
@@ -12,47 +12,48 @@ from abc import abstractmethod
 from collections.abc import Callable
 
 AGAIN_S = 1.0
-"""Where nothing can be accepted (no descriptor is left, for one), the next try is so much later."""
+"""Seconds until the next attempt after nothing could be accepted, for example because no file descriptor was free."""
 
 
 class Guest(asyncio.Protocol):
-    """The protocol of one connection, which hears of its transport once the handshake is over."""
+    """The protocol of one accepted socket. It gets its transport when the handshake is over."""
 
     @abstractmethod
     def enter(self, address: str) -> bool:
-        """Counts the connection; False: it is to be dropped."""
+        """Counts the connection. Returns False if it is to be dropped."""
 
     @abstractmethod
     def leave(self) -> None:
-        """The connection is gone; after the first time, nothing happens."""
+        """Counts the end of the connection. Further calls do nothing."""
 
 
 class Handshakes:
-    """Accepts connections and has them shake hands.
+    """Accepts connections and runs their TLS handshakes.
 
     Args:
         guest: makes the protocol of a connection.
-        context: the server's TLS.
-        limit_s: for one handshake.
+        context: the TLS context of the server.
+        limit_s: maximum time of one handshake, in seconds.
     """
 
     def __init__(self, guest: Callable[[], Guest], context: ssl.SSLContext, limit_s: float) -> None:
         self._guest, self._context, self._limit_s = guest, context, limit_s
         self._loop = asyncio.get_running_loop()
         self._tasks: set[asyncio.Task[None]] = set()
-        """What accepts, and every handshake that has begun: cancelled before, it would have no end of its own."""
+        """Tasks that accept, and those of handshakes that have begun. A task that is cancelled before it begins would
+        not clean up, so it is not in the set."""
         self._closed = False
         self.sockets: list[socket.socket] = []
-        """Those that listen."""
+        """Listening sockets."""
 
     def listen(self, sockets: list[socket.socket]) -> None:
-        """Begins to accept on sockets that listen already and do not block."""
+        """Starts to accept connections. The sockets must be listening and non-blocking."""
         self.sockets = sockets
         for listener in sockets:
             self._keep(self._loop.create_task(self._accept(listener)))
 
     def close(self) -> None:
-        """No further connection; handshakes under way are cut off."""
+        """Stops accepting, and ends the handshakes that are under way."""
         self._closed = True
         for task in self._tasks:
             task.cancel()
@@ -63,7 +64,7 @@ class Handshakes:
         while True:
             try:
                 sock, peer = await self._loop.sock_accept(listener)
-            except ConnectionError:  # gone already
+            except ConnectionError:  # the peer has disconnected already
                 await asyncio.sleep(0)
                 continue
             except OSError as error:
@@ -72,10 +73,10 @@ class Handshakes:
                 continue
             guest = self._guest()
             if guest.enter(str(peer[0])):
-                self._loop.create_task(self._shake(sock, guest))  # is kept once it has begun
+                self._loop.create_task(self._shake(sock, guest))  # the task adds itself to `_tasks` when it begins
             else:
                 sock.close()
-            await asyncio.sleep(0)  # asyncio's `sock_accept` does not wait while there is one: others have their turn
+            await asyncio.sleep(0)  # `sock_accept` does not yield if a connection waits, so let other tasks run
 
     async def _shake(self, sock: socket.socket, guest: Guest) -> None:
         if self._closed:
@@ -89,7 +90,7 @@ class Handshakes:
             )
         except BaseException as error:
             guest.leave()  # asyncio closes the socket
-            if not isinstance(error, OSError):  # of TLS and of time, too: the peer's affair
+            if not isinstance(error, OSError):  # TLS errors and timeouts are OSErrors, too, and the peer's fault
                 raise
 
     def _keep(self, task: asyncio.Task[None] | None) -> None:

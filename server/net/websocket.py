@@ -1,14 +1,15 @@
-"""WebSockets to calls of the game and back; the only file of the server that knows websockets.
+"""The gateway between WebSockets and the game; the only file of the server that uses the library websockets.
 
-websockets parses (its Sans-I/O `ServerProtocol`; only plain messages are cut out here), asyncio moves bytes, and there
-is no task and no await per connection but for its TLS handshake: what arrives is handed to the game in the call that
-brings it, what the game sends is written in the call that sends it. Nothing here waits for a client. asyncio's flow
-control (`pause_writing`) has no effect: the game looks at `outstanding()` before it sends. What the game does not get,
-and so cannot count (pings, fragments, whatever comes after the end), is bounded here: who sends too much of it is
-aborted.
+Theory of operation. websockets parses the protocol (with its Sans-I/O `ServerProtocol`); only plain messages are parsed
+here. asyncio moves the bytes. Except for the TLS handshake there is no task and no await per connection: a message is
+passed to the game in the callback that brings it, and what the game sends is written in the call that sends it. Nothing
+here waits for a client. asyncio's flow control (`pause_writing`) has no effect, because the game checks `outstanding()`
+before it sends. Frames that the game does not get and so cannot count (pings, fragments, frames after the close) are
+limited here; a peer that exceeds these limits is aborted.
 
-The life of a connection: handshake (or an HTTP page) -> `game.open` -> `game.receive` ... -> `game.lost`, exactly
-once, as soon as the peer has closed, broken the protocol or gone. A stage that has a peer to wait for has a limit.
+A connection goes through these stages: handshake (or an HTTP page), `game.open`, `game.receive` for each message, and
+exactly once `game.lost`, as soon as the peer has closed, violated the protocol or disconnected. Every stage that waits
+for the peer has a time limit.
 """
 
 import asyncio
@@ -37,33 +38,36 @@ from shared.messages import CLIENT_MESSAGE_MAX
 
 try:
     from websockets.speedups import apply_mask
-except ImportError:  # the same, plain
+except ImportError:  # the same function in Python
     from websockets.utils import apply_mask
 if sys.platform == "linux":
     import fcntl
     from termios import TIOCOUTQ as SIOCOUTQ
 
 CLOSE_S = 2.0
-"""A peer that does not finish closing by then is aborted."""
+"""Seconds in which a peer must finish closing before it is aborted."""
 EXTRAS_PER_S = 256
-"""So are one that sends more pings, pongs and fragments, of 6 us each,"""
+"""Pings, pongs and fragments per second, at 6 us each, beyond which a peer is aborted."""
 DEAF_BYTES_MAX = 64 * 1024
-"""and one that sends more than this after its connection has been closed."""
+"""Bytes that a peer may send after its connection was closed before it is aborted."""
 OPCODES = frozenset(Opcode)
+"""All valid opcodes."""
 FINAL_BINARY = 0x82
+"""First byte of an unfragmented binary message, the only frame that clients need."""
 MASKED = 0x80
-"""First byte of the only frame that clients have a reason to send; bit of the second that it must have."""
+"""Bit of the second byte of a frame that every client must set."""
 REASON_BYTES_MAX = 123
-"""A close frame has room for no more."""
+"""Maximum bytes of the reason in a close frame."""
 ACCEPT_BACKLOG = 1024
+"""Connections that may wait to be accepted."""
 
 logger = logging.getLogger(__name__)
 _quiet = logging.getLogger(f"{__name__}.websockets")
-_quiet.setLevel(logging.WARNING)  # two lines per connection otherwise
+_quiet.setLevel(logging.WARNING)  # otherwise websockets logs two lines per connection
 
 
 def _frame_head(size: int) -> bytes:
-    """What goes before an unmasked binary message of so many bytes."""
+    """Returns the header of an unmasked binary message of `size` bytes."""
     if size < 126:
         return bytes((FINAL_BINARY, size))
     if size < 1 << 16:
@@ -78,25 +82,25 @@ def _response(page: Page) -> Response:
 
 
 class Events(Protocol):
-    """What the gateway tells the game."""
+    """The functions of a game that the gateway calls. `now` is the current time in seconds."""
 
     def open(self, link: "Connection", now: float) -> Any:
-        """A WebSocket is open; what is returned (not None) stands for it from here on."""
+        """Handles an open WebSocket. Returns an object (not None) that identifies it in later calls."""
 
     def receive(self, session: Any, data: bytes, now: float) -> None:
-        """One binary message."""
+        """Handles one binary message."""
 
     def lost(self, session: Any, now: float) -> None:
-        """The WebSocket is no more; once per session."""
+        """Handles the end of a WebSocket. Called once per session."""
 
 
 class Gateway:
-    """Listens, and keeps the set of connections.
+    """The listener and the set of its connections.
 
     Args:
-        game: told of every event.
-        door: decides who comes in, and has the pages.
-        faults: told of exceptions that the game raised.
+        game: gets every event.
+        door: decides which connections are accepted, and answers requests for pages.
+        faults: where exceptions of the game are reported.
     """
 
     def __init__(self, game: Events, door: Door | None = None, faults: Faults | None = None) -> None:
@@ -109,13 +113,18 @@ class Gateway:
         self._closing = False
 
     async def listen(self, host: str, port: int, tls: ssl.SSLContext | None = None) -> tuple[str, int]:
-        """Starts to accept on every address of a host, in TLS if there is a context for it.
+        """Starts to accept connections on every address of a host.
+
+        Args:
+            host: a host name or an address; empty: every interface.
+            port: the port; 0: the system picks one.
+            tls: the TLS context; None: no TLS.
 
         Returns:
-            The first of the host's addresses, and the port (with port 0, the one that the system picked).
+            The first of the host's addresses, and the port.
 
         Raises:
-            OSError: see `listeners`.
+            OSError: no address can be used, or one of them is in use.
         """
         loop = asyncio.get_running_loop()
         sockets = await listeners(host, port, ACCEPT_BACKLOG)
@@ -131,7 +140,7 @@ class Gateway:
         return address
 
     def stop_listening(self) -> None:
-        """No new connection, and an end to those that have not become WebSockets."""
+        """Stops accepting, and aborts the connections that have not become WebSockets."""
         self._closing = True
         for server in self._servers:
             server.close()
@@ -140,7 +149,7 @@ class Gateway:
                 connection.abort()
 
     async def drained(self) -> None:
-        """Returns when no WebSocket is left."""
+        """Waits until no WebSocket is left."""
         while any(connection.opened for connection in self.connections):
             self._fewer.clear()
             await self._fewer.wait()
@@ -156,7 +165,7 @@ class Gateway:
 
 
 class Connection(Guest):
-    """One accepted socket; to the game it is a `server.game.session.Link`."""
+    """One accepted socket, which the game uses as a `server.replication.client_stream.Link`."""
 
     def __init__(self, gateway: Gateway, loop: asyncio.AbstractEventLoop) -> None:
         self.opened = False
@@ -164,30 +173,33 @@ class Connection(Guest):
         self._loop = loop
         self._protocol = ServerProtocol(max_size=CLIENT_MESSAGE_MAX, logger=_quiet)
         self._transport: asyncio.Transport | None = None
-        self._address: str | None = None  # None: it has not been let in
+        self._address: str | None = None  # None: admission has not counted it
         self._fd = -1
         self._unacknowledged = bytearray(4)  # a C int that the kernel fills in
         self._timer: asyncio.TimerHandle | None = None
         self._timer_is_last = False
         self._session: Any = None
-        self._live = False  # whether the protocol's state is OPEN: looking that up took 1 us of a client's tick
-        self._deaf = False  # set when this side closes: what still comes is not the game's business
-        self._unheard = 0  # bytes that have come since then
-        self._extras, self._extras_since = 0, 0.0  # frames that are no plain message, in a second that began then
-        self._plain = True  # false from the first frame on that only websockets may judge
-        self._tail = b""  # of a plain stream: the beginning of a frame
+        self._live = False  # whether the protocol's state is OPEN; the look-up would take 1 us per client and tick
+        self._deaf = False  # set when this side closes: later messages are not passed to the game
+        self._unheard = 0  # bytes received since then
+        self._extras, self._extras_since = 0, 0.0  # frames other than plain messages, and the start of their second
+        self._plain = True  # False from the first unusual frame on: then websockets parses everything
+        self._tail = b""  # the beginning of a frame that is not complete yet
         self._fragments = bytearray()
         self._fragmented = False
 
     # -- the link, as the game sees it ---------------------------------------------------------------------
 
     def send(self, message: bytes) -> None:
-        """Queues one binary message; nothing happens if the WebSocket is not open any more."""
+        """Queues one binary message. Does nothing if the WebSocket is no longer open."""
         if self._live and self._transport is not None:
             self._transport.write(_frame_head(len(message)) + message)
 
     def outstanding(self) -> int | None:
-        """Bytes that the peer's kernel has not acknowledged (not on Linux: that ours has not taken, and None for 0)."""
+        """Returns the bytes that the peer's kernel has not acknowledged.
+
+        On other systems than Linux: the bytes that our kernel has not taken, or None (unknown) if there are none.
+        """
         if self._transport is None:
             return 0
         waiting = self._transport.get_write_buffer_size()
@@ -197,7 +209,7 @@ class Connection(Guest):
         return waiting + int.from_bytes(self._unacknowledged, sys.byteorder)
 
     def close(self, code: int, reason: str) -> None:
-        """Closes once what was sent has gone out, with an abort if the peer does not finish within `CLOSE_S`."""
+        """Closes the WebSocket after everything that was sent. Aborts if the peer does not finish within `CLOSE_S`."""
         self._deaf = True
         if self._live:
             self._protocol.send_close(code, reason.encode()[:REASON_BYTES_MAX].decode(errors="ignore"))
@@ -240,7 +252,7 @@ class Connection(Guest):
     def eof_received(self) -> None:
         self._protocol.receive_eof()
         self._flush()
-        self._last_limit()  # asyncio closes the socket once everything is written, which may be never
+        self._last_limit()  # asyncio closes the socket only after everything is written, which may never happen
         self._lose()
 
     def connection_lost(self, exc: Exception | None) -> None:
@@ -254,13 +266,13 @@ class Connection(Guest):
     # -- inside --------------------------------------------------------------------------------------------
 
     def enter(self, address: str) -> bool:
-        """See `Guest`."""
+        """Counts the connection in admission. Returns False if it is to be dropped."""
         if self._gateway.door.arrive(address):
             self._address = address
         return self._address is not None
 
     def leave(self) -> None:
-        """See `Guest`."""
+        """Counts the end of the connection in admission, once."""
         if self._address is not None:
             self._gateway.door.leave(self._address)
             self._address = None
@@ -270,9 +282,9 @@ class Connection(Guest):
             self._transport.abort()
 
     def _shake_hands(self, data: bytes) -> bytes:
-        """Handles the request, and returns what came after it (clients that do not wait for the answer may speak).
+        """Handles the HTTP request. Returns the bytes after it, from clients that do not wait for the answer.
 
-        Line by line, for websockets would parse what follows the request before the request is answered.
+        The request is passed on line by line, because websockets would parse the bytes after it before it is answered.
         """
         protocol, start = self._protocol, 0
         while start < len(data):
@@ -283,7 +295,7 @@ class Connection(Guest):
             if events:
                 self._answer(cast("HttpRequest", events[0]))
                 break
-            if isinstance(protocol.handshake_exc, InvalidMessage):  # of itself websockets only hangs up
+            if isinstance(protocol.handshake_exc, InvalidMessage):  # websockets alone would only close
                 response = protocol.reject(HTTPStatus.BAD_REQUEST, "this is not an HTTP request\n")
                 protocol.writes.insert(0, response.serialize())
             if protocol.eof_sent:
@@ -313,9 +325,10 @@ class Connection(Guest):
             self.close(CloseCode.INTERNAL_ERROR, "internal error")
 
     def _cut(self, data: bytes) -> None:
-        """Delivers whole plain messages at once (0.7 us instead of 3.4 by way of websockets) and has it parse the rest.
+        """Passes complete plain messages to the game directly, in 0.7 us each instead of 3.4 us through websockets.
 
-        It gets pings, fragments and the like frame by frame, and everything from the first oddity on: then it decides.
+        Pings, fragments and close frames go to websockets one by one. From the first unusual frame on, websockets
+        parses everything and decides whether it is an error.
         """
         if self._tail:
             data, self._tail = self._tail + data, b""
@@ -343,7 +356,7 @@ class Connection(Guest):
                 return
             else:
                 self._parse(data[at:end])
-                if self._protocol.eof_sent:  # from here on it throws away what comes
+                if self._protocol.eof_sent:  # from here on websockets discards all data
                     self._plain = False
                     self._parse(data[end:])
                     return
@@ -351,7 +364,7 @@ class Connection(Guest):
         self._tail = data[at:]
 
     def _floods(self) -> bool:
-        """Counts a frame that is no plain message; whether that is one too many."""
+        """Counts a frame that is not a plain message. Returns whether there are too many of them."""
         now = time.monotonic()
         if now - self._extras_since >= 1:
             self._extras, self._extras_since = 0, now
@@ -359,21 +372,21 @@ class Connection(Guest):
         return self._extras > EXTRAS_PER_S
 
     def _parse(self, data: bytes) -> None:
-        """Has websockets parse: it answers pings and closes where it must, and the game gets the messages."""
+        """Parses data with websockets, which answers pings and closes. Passes the messages to the game."""
         self._protocol.receive_data(data)
         self._flush()
         for event in self._protocol.events_received():
             self._take(cast("Frame", event))
 
     def _take(self, frame: Frame) -> None:
-        """One frame that websockets found in order; it has answered pings and the peer's closing by then."""
+        """Handles a valid frame. websockets has already answered pings and the peer's close frame."""
         if frame.opcode not in (Opcode.TEXT, Opcode.BINARY, Opcode.CONT):
             return
         was, self._fragmented = self._fragmented, not frame.fin
         if self._deaf:
             return
         if frame.opcode is Opcode.TEXT:
-            self.close(CloseCode.UNSUPPORTED_DATA, "text message: binary ones only")
+            self.close(CloseCode.UNSUPPORTED_DATA, "text message: only binary messages are allowed")
         elif frame.fin and not was:
             self._deliver(bytes(frame.data))
         else:
@@ -391,7 +404,7 @@ class Connection(Guest):
             self.close(CloseCode.INTERNAL_ERROR, "internal error")
 
     def _flush(self) -> None:
-        """Writes what websockets wants written."""
+        """Writes the data that websockets wants to send."""
         transport = self._transport
         writes = self._protocol.data_to_send()
         self._live = self._protocol.state is OPEN
@@ -408,7 +421,7 @@ class Connection(Guest):
             self._last_limit()
 
     def _lose(self) -> None:
-        """Tells the game, once, that the session is over."""
+        """Reports the end of the session to the game, once."""
         session, self._session = self._session, None
         if session is None:
             return
@@ -418,7 +431,7 @@ class Connection(Guest):
             self._gateway.faults.report("lost")
 
     def _last_limit(self) -> None:
-        """The end has begun: from now on the peer has `CLOSE_S`, whatever else it does."""
+        """Aborts the connection in `CLOSE_S` seconds, regardless of what the peer does meanwhile."""
         if not self._timer_is_last:
             self._timer_is_last = True
             self._abort_in(CLOSE_S)

@@ -1,4 +1,4 @@
-"""Exceptions that are our own mistake: each one costs what it happened in and no more, is counted, and is told of."""
+"""Faults: exceptions in our own code. They are counted and logged, and end only the operation in which they occur."""
 
 import logging
 import sys
@@ -8,10 +8,10 @@ logger = logging.getLogger(__name__)
 
 
 class Faults:
-    """Counts exceptions by the place where they were raised; of each place the 1st, 10th, 100th, ... are logged.
+    """Counts exceptions by the place where they were raised, and logs the 1st, 10th, 100th, ... of each place.
 
     Args:
-        whose: begins the line in the log.
+        whose: beginning of the line in the log.
     """
 
     def __init__(self, whose: str = "internal error") -> None:
@@ -20,7 +20,11 @@ class Faults:
         self._places: Counter[tuple[str, str, int]] = Counter()
 
     def report(self, where: str) -> None:
-        """To be called where an exception is being handled; `where` says what has been given up because of it."""
+        """Counts the exception that is being handled. Call it in an `except` block.
+
+        Args:
+            where: the operation that the exception has ended, for the log.
+        """
         self.total += 1
         error = sys.exception()
         trace = error.__traceback__ if error is not None else None

@@ -2,10 +2,10 @@
 
 Theory of operation. Once per tick `serve` is called for each session. If more bytes are on the way to the client than
 flow control allows (`flow_control`), the tick is left out; the next snapshot has the union of the changes. The client
-view (`client_view`) chooses the segments of a snapshot. `change_log` encodes the changes of a segment, once
-for all clients. Shared values and game events follow the snapshot; an event is not sent before a snapshot that has the
-entities it names (`server.players.outbox`). The blocks of new segments follow last, in pieces, as far as there is room, so
-terrain never delays a snapshot.
+view (`client_view`) chooses the segments of a snapshot. The change log (`change_log`) encodes the changes of a segment,
+once for all clients. Shared values and game events follow the snapshot; an event is not sent before a snapshot that has
+the entities it names (`server.players.outbox`). The blocks of new segments follow last, in pieces, as far as there is
+room, so terrain never delays a snapshot.
 """
 
 from collections import deque

@@ -1,4 +1,4 @@
-"""What a server process asks of its interpreter and its system: an event loop, signals, memory, a terminal."""
+"""The process: its event loop, signals, garbage collection, memory, and a notice on its terminal."""
 
 import asyncio
 import contextlib
@@ -13,12 +13,13 @@ from types import FrameType
 from typing import TextIO
 
 COMPILING = "compiling the physics for this machine, which takes 5 to 20 s the first time"
+"""Notice that is shown while the kernel is compiled."""
 
 logger = logging.getLogger(__name__)
 
 
 def announce_compiling(stream: TextIO) -> None:
-    """Says why the first start takes long: on a terminal as plain text, else in the log."""
+    """Reports that the first start takes longer: on a terminal as plain text, otherwise in the log."""
     if stream.isatty():
         print(f"{COMPILING} ...", file=stream, flush=True)
     else:
@@ -26,17 +27,17 @@ def announce_compiling(stream: TextIO) -> None:
 
 
 def freeze() -> None:
-    """Takes everything that exists by now out of the garbage collector's rounds: it stays until the end anyway.
+    """Excludes all present objects from garbage collection; they stay until the end anyway.
 
-    With 200 clients a full collection takes 3 to 4 ms then instead of 53 to 61; the young ones are 1.2 ms at most and
-    0.03 % of a core either way (`scripts/bench.py jitter`), for which other thresholds gained nothing.
+    With 200 clients a full collection then takes 3 to 4 ms instead of 53 to 61 ms. Collections of young objects take at
+    most 1.2 ms and 0.03 % of a core either way (`scripts/bench.py jitter`); other thresholds did not improve that.
     """
     gc.collect()
     gc.freeze()
 
 
 def rss_mb() -> float:
-    """Memory of this process that is in RAM, in MB; where the system does not say, the most it ever was, or 0."""
+    """Returns the memory of this process in RAM, in MB. On other systems than Linux: its peak, or 0 on Windows."""
     try:
         return int(Path("/proc/self/statm").read_bytes().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
     except OSError:  # not Linux
@@ -50,7 +51,7 @@ def rss_mb() -> float:
 
 
 def loop_factory() -> Callable[[], asyncio.AbstractEventLoop]:
-    """What makes the event loop: uvloop where it is installed."""
+    """Returns the function that makes the event loop: uvloop's if it is installed, otherwise asyncio's."""
     try:
         import uvloop
     except ImportError:
@@ -59,10 +60,10 @@ def loop_factory() -> Callable[[], asyncio.AbstractEventLoop]:
 
 
 def signals() -> list[signal.Signals]:
-    """The signals that end a server: SIGINT, SIGTERM, Ctrl-Break on Windows, and SIGHUP (its terminal has closed).
+    """Returns the signals that stop a server: SIGINT, SIGTERM, SIGHUP (its terminal has closed), Ctrl-Break on Windows.
 
-    SIGINT counts even where the starter had it ignored, as a shell does for what a script starts in the background. An
-    ignored SIGHUP stays ignored: that is what `nohup` is for.
+    SIGINT counts even if the parent process made it ignored, as a shell does for background processes of a script. An
+    ignored SIGHUP stays ignored, because `nohup` asks for that.
     """
     names = ("SIGINT", "SIGTERM", "SIGBREAK", "SIGHUP")
     there = [signal.Signals(getattr(signal, name)) for name in names if hasattr(signal, name)]
@@ -70,13 +71,13 @@ def signals() -> list[signal.Signals]:
 
 
 def leave(number: int, frame: FrameType | None) -> None:
-    """Before there are clients, nobody has to be told."""
+    """Handles a signal before there are clients: ends the process at once, with exit code 0."""
     raise SystemExit(0)
 
 
 @contextlib.contextmanager
 def on_signals(loop: asyncio.AbstractEventLoop, stop: Callable[[str], None]) -> Iterator[None]:
-    """Calls `stop(name)` for the first signal; from then on signals do what they do by default: end at once."""
+    """Calls `stop` with the name of the first signal. Later signals have their default effect: they end the process."""
 
     def first(number: signal.Signals) -> None:
         for each in signals():

@@ -1,4 +1,4 @@
-"""`sovereign-server check`: whether a server is ready, as an exit code, for containers and service managers."""
+"""The command `sovereign-server check`: asks a server whether it is ready, for containers and service managers."""
 
 import http.client
 import os
@@ -11,13 +11,17 @@ from server.config.options import Parser, SettingsError
 from server.net.addresses import bracketed, reachable
 
 TIME_OUT_S = 3.0
+"""Seconds that the check waits for an answer."""
 
 
 def main(arguments: Sequence[str], environment: Mapping[str, str] = os.environ) -> int:
-    """Asks a server's `/readyz`; 0 if it is ready, else 1. Prints what it says.
+    """Runs `sovereign-server check`: requests `/readyz` of a server and prints the answer.
+
+    Returns:
+        The exit code: 0 if the server is ready, otherwise 1.
 
     Raises:
-        SettingsError: the address is none.
+        SettingsError: the given address is not a URL.
     """
     host = bracketed(reachable(environment.get("SOVEREIGN_HOST", "127.0.0.1").strip("[]")))
     port = environment.get("SOVEREIGN_PORT", "8765")
@@ -26,9 +30,9 @@ def main(arguments: Sequence[str], environment: Mapping[str, str] = os.environ) 
         prog="sovereign-server check", description="Exit code 0 if the server is ready for players.", allow_abbrev=False
     )
     default = f"{scheme}://{host}:{port}/readyz"
-    parser.add_argument("--url", default=default, help=f"what to ask, or just ws://HOST:PORT (default: {default})")
+    parser.add_argument("--url", default=default, help=f"page to request, or only ws://HOST:PORT (default: {default})")
     url = page(parser.flags(arguments)["url"])
-    # It asks whether the server works, often by another name than the one in its certificate: nothing is kept secret.
+    # The certificate is not checked: the check often uses another name than the certificate's, and sends no secrets.
     trusting = ssl.create_default_context()
     trusting.check_hostname, trusting.verify_mode = False, ssl.CERT_NONE
     opener = urllib.request.build_opener(urllib.request.ProxyHandler({}), urllib.request.HTTPSHandler(context=trusting))
@@ -45,7 +49,11 @@ def main(arguments: Sequence[str], environment: Mapping[str, str] = os.environ) 
 
 
 def page(url: str) -> str:
-    """The address of a page: of `/readyz` where none is named, also for an address that players use."""
+    """Returns the URL of a page; `/readyz` if the given URL names none. Accepts ws:// and wss://, too.
+
+    Raises:
+        SettingsError: it is not a URL of these kinds.
+    """
     scheme, colon, rest = url.partition("://")
     scheme = {"ws": "http", "wss": "https"}.get(scheme, scheme)
     host, _, path = rest.partition("/")

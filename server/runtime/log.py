@@ -1,7 +1,7 @@
-"""Logs of one line each, for people or for machines; the standard library's loggers end up in the same stream.
+"""The log: one line per event, for people or for machines. Loggers of the standard library write to the same stream.
 
-What is logged happens once, or rarely: nothing per tick, nothing per message, nothing per connection. Tokens are left
-out twice: values under the names of secrets, and whatever in a finished line looks like a JSON Web Token.
+Only rare events are logged: nothing per tick, per message or per connection. Tokens are hidden in two ways: values with
+the names of secrets, and everything in a finished line that looks like a JSON Web Token.
 """
 
 import logging
@@ -12,18 +12,27 @@ import structlog
 from structlog.typing import EventDict, Processor, WrappedLogger
 
 SECRETS = frozenset({"token", "resume", "key", "secret", "authorization", "cookie"})
+"""Names of values that are hidden."""
 JWT = re.compile(r"eyJ[\w-]+\.[\w-]+\.[\w-]*")
+"""Pattern of a JSON Web Token."""
 HIDDEN = "[hidden]"
+"""Text in place of a hidden value."""
 
 
 def set_up(level: str, form: str, stream: TextIO) -> None:
-    """Sends everything from `level` on to a stream, in one of `server.config.settings.LOG_FORMATS`."""
+    """Sets up logging to a stream.
+
+    Args:
+        level: lowest level to log.
+        form: format of a line, one of `server.config.settings.LOG_FORMATS`.
+        stream: the stream.
+    """
     first: list[Processor] = [
         structlog.stdlib.add_log_level,
         structlog.stdlib.add_logger_name,
         structlog.processors.TimeStamper(fmt="iso", utc=True),
         structlog.processors.StackInfoRenderer(),
-        structlog.processors.format_exc_info,  # plain: a richer one would show local variables, and so secrets
+        structlog.processors.format_exc_info,  # a richer format would show local variables, which may be secrets
         _without_secrets,
     ]
     if form == "json":

@@ -1,11 +1,11 @@
-"""Fixed ticks against absolute deadlines.
+"""The ticker: runs ticks at a fixed rate, with absolute deadlines.
 
-Overrun policy. Ticks are due at `start + n / rate`, whatever became of the ones before, so nothing drifts. A tick
-whose time has passed runs at once, with one pass of the event loop between two of them, so that what has arrived
-meanwhile is taken in. At most `limits.catch_up_ticks` run in a row that way. Of more missed deadlines the earliest are
-dropped, before any of the row runs, and counted as skipped time: so the deadline that a tick is handed always says what
-time it is on the server. A server at 32 Hz that was stopped for 3 s runs 4 ticks at once and goes on; one that is too
-slow for its rate is never more than that behind, and says so in `skipped_s`.
+Overrun policy. The deadline of tick n is `start + n / rate`, regardless of earlier ticks, so the schedule does not
+drift. A tick whose deadline has passed runs at once. Between two such ticks the event loop runs once, so that messages
+that arrived meanwhile are received. At most `limits.catch_up_ticks` ticks run in a row that way. If more deadlines were
+missed, the earliest are dropped before any of the others runs, and counted as skipped time. So the deadline that a tick
+gets always agrees with the server time. A server at 32 Hz that was stopped for 3 s runs 4 ticks at once and goes on. A
+server that is too slow for its rate is never further behind than that, and shows it in `skipped_s`.
 """
 
 import asyncio
@@ -22,35 +22,40 @@ from server.observability.errors import Faults
 from server.observability.histogram import Histogram
 
 FAILURES_MAX = 10
-"""So many ticks that raise in a row break the ticker."""
+"""Number of ticks in a row that may raise before the ticker stops."""
 
 
 class Schedule:
-    """Which tick is due when. Deadlines are computed from whole numbers, so they do not drift."""
+    """The deadlines of all ticks. They are computed from whole numbers, so they do not drift.
+
+    Args:
+        rate: ticks per second.
+        start: the first deadline, in seconds.
+    """
 
     def __init__(self, rate: int, start: float) -> None:
         self.rate = rate
         self.start = start
         self.skipped = 0
-        """Ticks that were dropped."""
+        """Number of ticks that were dropped."""
         self.late_s = 0.0
-        """How long the latest tick taken had been due, before any were dropped."""
+        """Seconds by which the next deadline had passed at the latest `take`, before any ticks were dropped."""
         self._catch_up = catch_up_ticks(rate)
         self._slot = 0
         self._in_a_row = 0
 
     @property
     def deadline(self) -> float:
-        """When the next tick is due."""
+        """Deadline of the next tick, in seconds."""
         return self.start + self._slot / self.rate
 
     @property
     def skipped_s(self) -> float:
-        """Time that no tick stands for."""
+        """Seconds of all dropped ticks."""
         return self.skipped / self.rate
 
     def take(self, now: float) -> float | None:
-        """The deadline of the tick to run now, or None if none is due."""
+        """Takes the tick to run now. Returns its deadline, or None if no tick is due."""
         deadline = self.deadline
         if deadline > now:
             self._in_a_row = 0
@@ -63,8 +68,8 @@ class Schedule:
         return deadline
 
     def _drop(self, now: float, keep: int) -> None:
-        """Drops the earliest of the deadlines that have passed, but for `keep` of them."""
-        to_come = max(self._slot, int((now - self.start) * self.rate))  # may be one off, either way
+        """Drops all passed deadlines except for the latest `keep` of them."""
+        to_come = max(self._slot, int((now - self.start) * self.rate))  # may be too large or too small by one
         while self.start + (to_come - 1) / self.rate > now:
             to_come -= 1
         while self.start + to_come / self.rate <= now:
@@ -75,17 +80,17 @@ class Schedule:
 
 
 class Alarm(Protocol):
-    """Calls back once, at or after a time of `time.monotonic()`."""
+    """A timer that calls a function once, at or after a time of `time.monotonic()`."""
 
     def set(self, at: float) -> None:
-        """Replaces the time set before; one that has passed is now."""
+        """Sets the time in seconds and replaces the one set before. A time in the past means now."""
 
     def close(self) -> None:
-        """It does not ring any more."""
+        """Stops the timer."""
 
 
 class LoopAlarm:
-    """An alarm of the event loop: there everywhere, about 0.6 ms late (p99 1.5) at a timer resolution of 1 ms."""
+    """A timer of the event loop. Exists everywhere; about 0.6 ms late (p99 1.5 ms) at a timer resolution of 1 ms."""
 
     def __init__(self, loop: asyncio.AbstractEventLoop, ring: Callable[[], None]) -> None:
         self._loop = loop
@@ -102,12 +107,12 @@ class LoopAlarm:
 
 
 class TimerfdAlarm:
-    """A Linux timerfd that the event loop reads: about 0.1 ms late (p99 0.3).
+    """A Linux timerfd that the event loop reads. About 0.1 ms late (p99 0.3 ms).
 
-    By ctypes, since `os.timerfd_create` needs Python 3.13.
+    It is created with ctypes because `os.timerfd_create` needs Python 3.13.
 
     Raises:
-        OSError: the system has none.
+        OSError: the system has no timerfd.
     """
 
     def __init__(self, loop: asyncio.AbstractEventLoop, ring: Callable[[], None]) -> None:
@@ -122,7 +127,7 @@ class TimerfdAlarm:
         loop.add_reader(self._fd, self._read)
 
     def set(self, at: float) -> None:
-        # struct itimerspec: interval (none: it rings once) and value, in seconds and nanoseconds; a value of 0 disarms.
+        # struct itimerspec: interval (0: fires once) and value, each in seconds and nanoseconds; a value of 0 disarms.
         seconds, ns = divmod(max(1, int(at * 1e9)), 1_000_000_000)
         spec = (ctypes.c_long * 4)(0, 0, seconds, ns)
         timer_abstime = 1
@@ -138,13 +143,13 @@ class TimerfdAlarm:
     def _read(self) -> None:
         try:
             os.read(self._fd, 8)
-        except BlockingIOError:  # set anew since it was reported ready
+        except BlockingIOError:  # the timer was set again after it was reported ready
             return
         self._ring()
 
 
 def best_alarm(loop: asyncio.AbstractEventLoop, ring: Callable[[], None]) -> Alarm:
-    """The most punctual alarm that this system and this loop have."""
+    """Returns the most punctual timer that this system and this event loop offer."""
     try:
         return TimerfdAlarm(loop, ring)
     except (OSError, AttributeError, NotImplementedError):
@@ -152,12 +157,15 @@ def best_alarm(loop: asyncio.AbstractEventLoop, ring: Callable[[], None]) -> Ala
 
 
 class Ticker:
-    """Runs `tick(deadline, now)` by a `Schedule`, and measures how late ticks start and how long they take.
+    """Runs ticks by a `Schedule`, and measures how late they begin and how long they take.
 
     Args:
-        broken: called once when `FAILURES_MAX` ticks in a row have raised; no tick runs after that.
-        alarm: makes an alarm that calls the function handed to it.
-        faults: told of ticks that raise.
+        rate: ticks per second.
+        tick: the function to run, called with its deadline and the current time, in seconds.
+        broken: called once when `FAILURES_MAX` ticks in a row have raised. No tick runs after that.
+        alarm: makes a timer that calls the given function.
+        faults: where ticks that raise are reported.
+        clock: returns the current time in seconds.
     """
 
     def __init__(
@@ -175,7 +183,7 @@ class Ticker:
         self.ticks_late = 0
         self.failures = 0
         self.latest = -math.inf
-        """When the latest tick began."""
+        """Time in seconds at which the latest tick began."""
         self._tick = tick
         self._broken = broken
         self._faults = faults or Faults()
@@ -187,13 +195,13 @@ class Ticker:
         self._alarm.set(self._schedule.deadline)
 
     def stop(self) -> None:
-        """No tick runs after this."""
+        """Stops the ticker. No tick runs after this."""
         if not self._stopped:
             self._stopped = True
             self._alarm.close()
 
     def stats(self) -> dict[str, Any]:
-        """What it has counted. Times are since the start; for those of a window, see `histogram.between`."""
+        """Returns the figures of the ticker since the start. `histogram.between` computes those of a period."""
         return {
             "ticks": self.ticks,
             "ticks_late": self.ticks_late,

@@ -1,6 +1,6 @@
-"""A game in miniature before the real one: what takes longer the first time has happened before anybody can see it.
+"""The warm-up: a short game before the real one, so that nothing is slow because it runs for the first time.
 
-Python itself is quicker the second time, and where no kernel is prebuilt, one is compiled here. So scratch clients do
+Python code is faster the second time, and a kernel that is not prebuilt is compiled here. Therefore scratch clients do
 everything that a client can make a server do.
 """
 
@@ -14,11 +14,11 @@ from shared.scene import Scene
 from shared.units import SEGMENT
 
 TICKS = 40
-"""Of a segment's checksum, which comes every 32 ticks, there is at least one."""
+"""Length of the warm-up in ticks: more than 32, so that a checksum of a segment is sent at least once."""
 
 
 class _Void:
-    """A link to nobody, that takes everything."""
+    """A link that discards everything."""
 
     def send(self, message: bytes) -> None: ...
 
@@ -29,13 +29,13 @@ class _Void:
 
 
 def warm_up(scene: Scene) -> RecordedWorld:
-    """Joins, walks, jumps, builds, digs, falls out, shoots into the past and leaves, in a world of its own.
+    """Plays a short game in a scratch world: clients join, walk, jump, build, dig, fall out, shoot and leave.
 
     Returns:
-        A new world of the scene, untouched: generating its terrain is half of the work.
+        A new, unused world of the scene. Generating its terrain is half of the work.
 
     Raises:
-        SceneError: nobody could ever join.
+        SceneError: there is no room for a player at any spawn point, so no client could ever join.
     """
     fresh, scratch = RecordedWorld(scene), RecordedWorld(scene)
     fresh.load_terrain()
@@ -58,13 +58,13 @@ def warm_up(scene: Scene) -> RecordedWorld:
     tick()  # inputs count from here on
     joined = [session for session in sessions if session.entity]
     if not joined:
-        raise SceneError(f"spawns = {scene.spawns}: no room for a {scene.player!r} at any of them, or near")
+        raise SceneError(f"spawns = {scene.spawns}: no room for a {scene.player!r} at or near any of them")
     shooter, other = joined[0], joined[-1]
     x, y, z = (int(part // 1) for part in game.world.position(shooter.entity))
     for n in range(TICKS):
         at = game.world.tick
         say(Inputs(at + 1, at, bytes((127, 0, n % 2))), Ping(now))
-        # Into the block in which they stand, on which they stand, and one above them: refused, dug, placed.
+        # Edits of the block in which they stand (refused), on which they stand (dug), and above them (placed).
         cell = (x, y, z + (0, -1, 3)[n % 3])
         for kind in (1, 0):
             say(Command(2 * n + 1 - kind, at + 1, at - 1.5, edits.NAME, edits.pack(edits.Edit(*cell, kind))))
@@ -72,7 +72,7 @@ def warm_up(scene: Scene) -> RecordedWorld:
         past = game.rewind.at(game.world.tick - 2.5, shooter.entity)
         past.ray((x, y, z + 1.0), (1.0, 0.25, -0.125), 32.0)
         past.box((x - 2.0, y - 2.0, z - 2.0), (x + 2.0, y + 2.0, z + 2.0))
-    game.world.place(other.entity, (x, y, scene.origin[2] * SEGMENT - 64.0))  # comes back at a spawn
+    game.world.place(other.entity, (x, y, scene.origin[2] * SEGMENT - 64.0))  # falls out, and is put at a spawn
     say(Resync())
     tick()
     tick()

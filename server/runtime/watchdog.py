@@ -1,7 +1,7 @@
-"""A thread that says when the event loop has stalled, and where: in code of ours the stack of the main thread shows it.
+"""The watchdog: a thread that logs when the event loop has stalled, with the stack of the main thread.
 
-The loop sets a time ten times a second; the thread looks at it as often. If the thread itself did not run either, the
-process was suspended, or code that does not let go of the interpreter ran: CPU time tells which.
+The loop notes the time ten times per second, and the thread checks it as often. If the thread itself did not run
+either, then the process was suspended, or code held the interpreter lock. The CPU time tells which.
 """
 
 import asyncio
@@ -13,16 +13,24 @@ import traceback
 import structlog
 
 BEAT_S = 0.1
+"""Seconds between two checks."""
 STALL_S = 0.5
-"""A loop that has done nothing for so long has stalled."""
+"""Seconds without a sign of life after which the loop counts as stalled."""
 QUIET_S = 10.0
-"""Stacks are logged at most so often; stalls are counted anyway."""
+"""Minimum time between two logged stacks, in seconds. Every stall is counted."""
 
 logger = structlog.stdlib.get_logger(__name__)
 
 
 class Watchdog:
-    """Watches the loop in which it is made, from the thread in which it is made, until `stop`."""
+    """Watches an event loop until `stop`. Create it in the thread that runs the loop.
+
+    Args:
+        loop: the event loop.
+        stall_s: seconds after which the loop counts as stalled.
+        asleep_s: seconds after which the watching thread itself counts as stalled.
+        beat_s: seconds between two checks.
+    """
 
     def __init__(
         self,
@@ -54,14 +62,14 @@ class Watchdog:
 
     def _watch(self) -> None:
         woken, cpu = time.monotonic(), time.process_time()
-        excused = counted = told = -1.0  # times of a beat, each
+        excused = counted = told = -1.0  # times at which the loop was last alive: excused, counted and logged
         quiet_until = woken
         while not self._stopped.wait(self._beat_s):
             before, cpu_before = woken, cpu
             woken, cpu = time.monotonic(), time.process_time()
             if woken - before > self._asleep_s:
                 self._say_asleep(woken - before, cpu - cpu_before)
-                excused = woken  # the loop had no turn either
+                excused = woken  # the loop could not run, either
             latest = max(self._latest, excused)
             if told >= 0 and latest != told:
                 logger.warning("the event loop goes on", stalled_s=round(latest - told, 3))
