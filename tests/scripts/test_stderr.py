@@ -116,7 +116,7 @@ def test_a_benchmark_that_fails_says_so_in_a_line(tmp_path: Path) -> None:
     )
     for program, expected in (
         (
-            "from scripts import accuracy; sys.exit(accuracy.main(['--plot', 'x.png']))",
+            "from scripts.experiments import accuracy; sys.exit(accuracy.main(['--plot', 'x.png']))",
             "error: --plot: matplotlib is not installed",
         ),
         (

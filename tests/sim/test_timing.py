@@ -13,22 +13,22 @@ import pytest
 from client_sdk.core import Core
 from client_sdk.netsim.links import PRESETS
 from client_sdk.timing.clock import PricedLead
-from scripts import league
+from scripts.experiments import lead_trial, league
 from shared.inputs import Input
 from shared.scene import load_scene
 from tests.lengths import long
 from tests.match import Match
 
 MINUTES = 10.0
-TICK_MS = league.TICK_MS
+TICK_MS = lead_trial.TICK_MS
 
 
 @cache
-def played(preset: str, seed: int, minutes: float) -> league.Row:
-    return league.trial(preset, league.OURS, minutes, seed)
+def played(preset: str, seed: int, minutes: float) -> lead_trial.Row:
+    return lead_trial.trial(preset, lead_trial.OURS, minutes, seed)
 
 
-def above_oracle(row: league.Row) -> float:
+def above_oracle(row: lead_trial.Row) -> float:
     """Ticks."""
     return float(row["fair_latency_ms"] - row["fair_oracle_ms"]) / TICK_MS
 
@@ -56,47 +56,47 @@ def test_must_hold(preset: str, late: float, added_ticks: float, above_ticks: fl
 
 
 def test_after_a_spike_all_is_well_within_250_ms() -> None:
-    run = league.Trial("wifi", PricedLead(), seed=11)
+    run = lead_trial.Trial("wifi", PricedLead(), seed=11)
     run.run(300)
     ends = [end for _, end, _ in run.weather.spikes if end < 295]
     assert len(ends) > 20
     after = [tick for tick, made in run.made.items() for end in ends if end + 0.25 <= made < end + 3]
     assert sum(run.margins[tick] < 0 for tick in after) <= 0.02 * len(after)
     soon = [tick for tick, made in run.made.items() for end in ends if end + 1 <= made < end + 2]
-    assert sum(run.leads[tick] for tick in soon) / len(soon) < PRESETS["wifi"].rtt_s / 2 * league.RATE + 0.75
+    assert sum(run.leads[tick] for tick in soon) / len(soon) < PRESETS["wifi"].rtt_s / 2 * lead_trial.RATE + 0.75
 
 
 @pytest.mark.parametrize("minutes", [2.0, *long(MINUTES)])
 @pytest.mark.parametrize("preset", PRESETS)
 @pytest.mark.parametrize("name", ["Unity N4E", "DDNet"])
 def test_the_nearest_rivals_are_not_both_less_late_and_less_ahead(name: str, preset: str, minutes: float) -> None:
-    ours, row = played(preset, 11, minutes), league.trial(preset, name, minutes, 11)
+    ours, row = played(preset, 11, minutes), lead_trial.trial(preset, name, minutes, 11)
     less_late = row["late_inputs_share"] <= ours["late_inputs_share"]
     assert not (less_late and row["added_latency_ms"] < ours["added_latency_ms"] - league.TIE_MS)
 
 
 @pytest.mark.parametrize("ppm", [-200, 0, 200])
 def test_the_clock_drifts_without_harm(ppm: int) -> None:
-    run = league.Trial("regional", PricedLead(), 3)
+    run = lead_trial.Trial("regional", PricedLead(), 3)
     run._drift = ppm * 1e-6
     run.run(300)
-    row = run.row("regional", league.OURS, 3)
+    row = run.row("regional", lead_trial.OURS, 3)
     assert row["late_inputs_share"] <= 0.005
     assert above_oracle(row) <= 0.5
 
 
 def test_the_oracle_is_the_least_constant_lead_with_that_share() -> None:
-    run = league.Trial("typical", PricedLead(), 2)
+    run = lead_trial.Trial("typical", PricedLead(), 2)
     run.run(120)
     late, _, _, oracle = run.figures(run.margins)
-    lead = oracle + PRESETS["typical"].rtt_s / 2 * league.RATE
+    lead = oracle + PRESETS["typical"].rtt_s / 2 * lead_trial.RATE
     needs = [run.leads[tick] - run.margins[tick] for tick in run.margins]
     assert sum(need > lead for need in needs) == round(late * len(needs))
     assert sum(need > lead - 1e-6 for need in needs) > round(late * len(needs))
 
 
 def test_one_seed_is_one_trial() -> None:
-    rows = [league.trial("wifi", league.OURS, 0.5, seed) for seed in (1, 1, 2)]
+    rows = [lead_trial.trial("wifi", lead_trial.OURS, 0.5, seed) for seed in (1, 1, 2)]
     assert rows[0] == rows[1] != rows[2]
 
 
@@ -142,7 +142,7 @@ def test_least_latency_at_equal_late_share(preset: str) -> None:
 def test_over_several_seeds_each_rule_is_compared_with_ours_on_the_same_run() -> None:
     rows = []
     for seed, ours, its in ((1, 10.0, 13.0), (2, 20.0, 21.0), (3, 30.0, None)):
-        for controller, needs in ((league.OURS, ours), ("naia", its)):
+        for controller, needs in ((lead_trial.OURS, ours), ("naia", its)):
             row = {"preset": "far", "controller": controller, "seed": seed, "late_inputs_share": 0.01}
             rows.append(row | {"added_latency_ms": ours, "its_latency_ms": needs})
     told = [list(column.cells) for column in league.summary(rows).columns]

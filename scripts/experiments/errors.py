@@ -7,8 +7,20 @@ from collections.abc import Callable
 import numpy as np
 import numpy.typing as npt
 
-from scripts import _variants
-from scripts._engines import GRAVITY, JUMP_SPEED, LOW, SIDES, WALK, Choice, Engine, Floats, Kinds, engine, slabs_of
+from scripts.experiments import variants
+from scripts.experiments.engines import (
+    GRAVITY,
+    JUMP_SPEED,
+    LOW,
+    SIDES,
+    WALK,
+    Choice,
+    Engine,
+    Floats,
+    Kinds,
+    engine,
+    slabs_of,
+)
 from shared.inputs import MOVE_MAX
 from shared.terrain import generate
 
@@ -121,7 +133,7 @@ def inside(choice: Choice, count: int, ticks: int) -> tuple[float, float]:
     def look() -> None:
         depths = np.zeros(count)
         low, high = it.boxes()
-        _variants.depths(terrain, low, high, depths)
+        variants.depths(terrain, low, high, depths)
         found.append(depths)
 
     play([it], count, ticks, look)

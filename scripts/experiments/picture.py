@@ -8,7 +8,7 @@ mpl.use("Agg")
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from scripts._conclusion import Row
+from scripts.experiments.conclusion import Row
 
 OURS, OTHER, FAINT, INK = "#0b7a75", "#c8553d", "#b9b4ad", "#2b2d33"
 NAMES = {"rewind": "back along the velocity", "impact": "time of impact", "clamp": "clamp per axis"}

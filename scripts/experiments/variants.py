@@ -2,7 +2,7 @@
 
 The product uses none of this. It exists so that the product's choices can be measured against their alternatives. Each
 entity meets only blocks. Numbers are floats of either width; a grid is floats that hold only whole steps. Loaded a
-second time as `_variants_fast`, this source is compiled with fastmath, and stands for a machine whose compiler
+second time as `variants_fast`, this source is compiled with fastmath, and stands for a machine whose compiler
 contracts and reorders operations. The two builds differ in nothing else.
 """
 

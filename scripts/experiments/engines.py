@@ -10,7 +10,7 @@ from typing import Any, Protocol
 import numpy as np
 import numpy.typing as npt
 
-from scripts import _variants
+from scripts.experiments import variants
 from scripts.experiments.slabs import Slabs
 from shared.inputs import JUMP, MOVE_MAX, Input
 from shared.layout import FLAGS, MOVE_X, VX, X
@@ -29,9 +29,9 @@ SIDES = np.array([0.6, 0.6, 1.8])
 FORMATS = {"float32": (np.float32, 0), "float64": (np.float64, 0)} | {
     f"grid 2^-{bits}": (np.float64, bits) for bits in (16, 20, 24)
 }
-INTEGRATORS = {"semi": _variants.SEMI, "explicit": _variants.EXPLICIT, "mean": _variants.MEAN}
-MOVERS = {"clamp": _variants.CLAMP, "rewind": _variants.REWIND, "impact": _variants.IMPACT}
-OBSTACLES = {"cells": _variants.CELLS, "slabs": _variants.SLABS}
+INTEGRATORS = {"semi": variants.SEMI, "explicit": variants.EXPLICIT, "mean": variants.MEAN}
+MOVERS = {"clamp": variants.CLAMP, "rewind": variants.REWIND, "impact": variants.IMPACT}
+OBSTACLES = {"cells": variants.CELLS, "slabs": variants.SLABS}
 
 
 @dataclass(frozen=True)
@@ -69,22 +69,22 @@ class Engine(Protocol):
 
 
 class Variant:
-    """An engine of `_variants`. `fast` selects the build that stands for another machine."""
+    """An engine of `variants`. `fast` selects the build that stands for another machine."""
 
     def __init__(self, choice: Choice, kinds: Kinds, spots: Floats, shift: int = 0, *, fast: bool = False) -> None:
-        self._module = _fast() if fast else _variants
+        self._module = _fast() if fast else variants
         self._type, bits = FORMATS[choice.format]
         grid = SPEED if bits else 0
         self._shift = np.array([shift, 0, 0])
         origin = self._shift.astype(np.int64)
         rectangles, starts = slabs_of(kinds)
         self.terrain = (kinds, rectangles, starts, origin)
-        f = np.zeros(_variants.NUMBERS)
-        f[_variants.GRAVITY] = _on(GRAVITY / choice.tick_rate, grid)
-        f[_variants.TERMINAL], f[_variants.JUMP] = TERMINAL, JUMP_SPEED
-        f[_variants.STEP], f[_variants.HALF], f[_variants.SCALE] = 1 / choice.tick_rate, 0.5, 2.0**bits if bits else 0
-        f[_variants.LO : _variants.LO + 3] = [_on(part, 2.0**bits if bits else 0) for part in LOW]
-        f[_variants.SIZE : _variants.SIZE + 3] = [_on(part, 2.0**bits if bits else 0) for part in SIDES]
+        f = np.zeros(variants.NUMBERS)
+        f[variants.GRAVITY] = _on(GRAVITY / choice.tick_rate, grid)
+        f[variants.TERMINAL], f[variants.JUMP] = TERMINAL, JUMP_SPEED
+        f[variants.STEP], f[variants.HALF], f[variants.SCALE] = 1 / choice.tick_rate, 0.5, 2.0**bits if bits else 0
+        f[variants.LO : variants.LO + 3] = [_on(part, 2.0**bits if bits else 0) for part in LOW]
+        f[variants.SIZE : variants.SIZE + 3] = [_on(part, 2.0**bits if bits else 0) for part in SIDES]
         self._f = f.astype(self._type)
         self._walk = np.array([_on(WALK * move / MOVE_MAX, grid) for move in range(-MOVE_MAX, MOVE_MAX + 1)])
         self._switches = np.array(
@@ -112,8 +112,8 @@ class Variant:
         return places
 
     def boxes(self) -> tuple[Floats, Floats]:
-        low = self._places + self._f[_variants.LO : _variants.LO + 3]
-        high = low + self._f[_variants.SIZE : _variants.SIZE + 3]
+        low = self._places + self._f[variants.LO : variants.LO + 3]
+        high = low + self._f[variants.SIZE : variants.SIZE + 3]
         return low.astype(np.float64), high.astype(np.float64)
 
     def state(self) -> npt.NDArray[Any]:
@@ -197,8 +197,8 @@ def _on(value: float, scale: float) -> float:
 
 @cache
 def _fast() -> ModuleType:
-    name = "_variants_fast"
-    spec = importlib.util.spec_from_file_location(name, _variants.__file__)
+    name = "scripts.experiments.variants_fast"
+    spec = importlib.util.spec_from_file_location(name, variants.__file__)
     assert spec is not None
     assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
