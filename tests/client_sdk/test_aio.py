@@ -18,11 +18,12 @@ from client_sdk.transports import connection
 from client_sdk.transports.connection import ConnectError
 from shared import messages
 from tests.client_sdk.servers import accept, real_server, scripted_server, silent_server
+from tests.lengths import long
 
 pytestmark = pytest.mark.e2e
 
 Run = Callable[[Coroutine[Any, Any, None]], None]
-LOOPS = ["asyncio"] if sys.platform == "win32" else ["asyncio", "uvloop"]
+LOOPS = ["asyncio"] if sys.platform == "win32" else ["asyncio", *long("uvloop")]
 
 
 @pytest.fixture(scope="module")

@@ -17,6 +17,7 @@ from shared import messages
 from shared.messages import Bye, Hello, Inputs, Ping, decode_from_client, encode
 from shared.scene import load_scene
 from tests.client_sdk.servers import real_server
+from tests.lengths import long
 from tests.match import Match, wander
 
 FAR = Path(0.125)
@@ -167,7 +168,7 @@ def test_while_a_slow_line_is_busy_nothing_more_is_read() -> None:
     assert core.appetite == SLOW_READ_BYTES
 
 
-@pytest.mark.parametrize("link", ["typical", "wifi", "outage"])
+@pytest.mark.parametrize("link", ["wifi", *long("typical", "outage")])
 def test_a_match_over_it_is_as_one_over_a_real_path(link: str) -> None:
     match = Match(load_scene("hills"), 3)
     core = LinkedCore()

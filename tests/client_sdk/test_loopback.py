@@ -13,6 +13,7 @@ from shared import messages
 from shared.scene import load_scene
 from sovereign_netcode.examples.freeze import Freeze
 from sovereign_netcode.examples.tag import Tag
+from tests.lengths import long
 
 FRAMES_PER_S = 64
 
@@ -81,7 +82,7 @@ def test_one_seed_is_one_story() -> None:
     assert story() == story()
 
 
-@pytest.mark.parametrize("link", ["far", "thin"])
+@pytest.mark.parametrize("link", ["thin", *long("far")])
 def test_a_link_is_felt_and_the_game_sees_it(link: str) -> None:
     program = Program(tag())
     client = program.join("Ann", link=link)

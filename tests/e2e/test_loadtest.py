@@ -120,9 +120,8 @@ def playing(request: pytest.FixtureRequest) -> Iterator[tuple["subprocess.Popen[
 @pytest.mark.parametrize(
     ("number", "playing"),
     [
-        (signal.SIGTERM, ()),
         (signal.SIGINT, (signal.SIGINT,)),  # as a script's background job
-        *long((signal.SIGINT, ()), (signal.SIGTERM, (signal.SIGINT,))),
+        *long((signal.SIGTERM, ()), (signal.SIGINT, ()), (signal.SIGTERM, (signal.SIGINT,))),
     ],
     indirect=["playing"],
 )
@@ -136,7 +135,8 @@ def test_a_signal_leaves_nothing_behind(
 
 @needs_linux
 @pytest.mark.parametrize(
-    ("killed", "name"), [("loadtest.swarm\0", "a process of bots"), ("sovereign_netcode.server\0", "the server")]
+    ("killed", "name"),
+    [("loadtest.swarm\0", "a process of bots"), *long(("sovereign_netcode.server\0", "the server"))],
 )
 def test_the_death_of_a_process_ends_it_at_once_with_nothing_left_behind(
     playing: tuple["subprocess.Popen[str]", dict[int, str]], killed: str, name: str

@@ -36,6 +36,7 @@ from tests.e2e.processes import (
     stats,
     until,
 )
+from tests.lengths import long
 
 pytestmark = pytest.mark.e2e
 
@@ -100,7 +101,7 @@ def mute(address: tuple[str, int]) -> Iterator[socket.socket]:
         yield link
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+@pytest.mark.parametrize("number", [signal.SIGTERM, *long(signal.SIGINT)])
 def test_a_client_that_does_not_answer_does_not_keep_it(number: signal.Signals) -> None:
     with running("--port", "0", "--scene", "flat") as server:
         address = server.address()
@@ -184,7 +185,7 @@ def test_who_is_beyond_a_limit_is_told_so_before_the_websocket_opens() -> None:
 
 
 @pytest.mark.skipif(os.name == "nt", reason="there is no such signal")
-@pytest.mark.parametrize("rate", [32, 128])
+@pytest.mark.parametrize("rate", [32, *long(128)])
 def test_a_suspended_server_goes_on_and_so_do_its_clients(rate: int) -> None:
     """After 3 s without a turn some ticks are made up for, the rest is given up. Nobody has to come back, and within
     two seconds the players move again."""
@@ -222,7 +223,7 @@ def test_a_second_signal_ends_it_at_once() -> None:
 
 
 @pytest.mark.skipif(os.name == "nt", reason="a signal ends a process there")
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", [signal.SIGINT, *long(signal.SIGTERM)])
 def test_a_signal_ends_it_that_its_starter_had_it_ignore(number: signal.Signals) -> None:
     """A shell does so with SIGINT for what a script starts in the background."""
     with inheriting(signal.SIG_IGN, number), running("--port", "0", "--scene", "flat") as server:
@@ -261,7 +262,7 @@ def catches_sigterm(server: ServerProcess) -> bool:
     return found is not None and bool(int(found[1], 16) >> (signal.SIGTERM - 1) & 1)
 
 
-@pytest.mark.parametrize("host", ["::1", "localhost"])
+@pytest.mark.parametrize("host", ["localhost", *long("::1")])
 def test_other_hosts(host: str) -> None:
     if host == "::1":
         try:

@@ -74,10 +74,10 @@ def test_a_terminal_gets_plain_text_and_anything_else_a_line_of_the_log(caplog: 
 
 
 PAGE_IS = [
-    ((), "http://127.0.0.1:{port}/"),
     (("--host", "::1"), "http://[::1]:{port}/"),
     (("--page", "false"), None),
     *long(
+        ((), "http://127.0.0.1:{port}/"),
         (("--host", "localhost"), "http://localhost:{port}/"),
         (("--host", "0.0.0.0", "--auth", "none"), "http://127.0.0.1:{port}/"),
         (("--host", "0.0.0.0", "--auth", "none", "--figures", "loopback"), "http://127.0.0.1:{port}/"),
@@ -158,19 +158,47 @@ def test_nothing_advises_to_install_a_name_that_is_on_no_index() -> None:
     assert [path for path in own if path != Path(__file__) and advised.search(path.read_text("utf-8"))] == []
 
 
-def broken(tmp_path: Path, text: str) -> str:
-    path = tmp_path / "broken.toml"
+def broken(tmp_path: Path, name: str, text: str) -> str:
+    path = tmp_path / f"{name}.toml"
     path.write_text(text)
     return str(path)
 
 
-def fails(*arguments: str, **environment: str) -> str:
-    """The one line that a process prints before it ends with exit code 2."""
-    with running(*arguments, **environment) as server:
-        assert server.end() == 2
-        assert server.rest() == []
-        assert len(server.errors) == 1, server.errors
-        return server.errors[0]
+Start = tuple[tuple[str, ...], dict[str, str]]
+"""Arguments of `python -m server`, and variables of its environment."""
+STARTS = """
+import contextlib, io, json, os, sys
+from server.app import main
+told = []
+for arguments, variables in json.load(sys.stdin):
+    out, err = io.StringIO(), io.StringIO()
+    os.environ.update(variables)
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+        code = main(arguments)
+    for name in variables:
+        del os.environ[name]
+    told.append([code, out.getvalue(), err.getvalue()])
+json.dump(told, sys.stdout)
+"""
+"""Does what a process with each of these starts does, one after another."""
+
+
+def start(*arguments: str, **variables: str) -> Start:
+    return arguments, variables
+
+
+def fail(*cases: tuple[Start, str]) -> None:
+    """Checks that each start ends with exit code 2 and prints one line, which has this text."""
+    clean = {name: value for name, value in os.environ.items() if not name.startswith("SOVEREIGN_")}
+    done = subprocess.run(
+        (sys.executable, "-c", STARTS), cwd=ROOT, env=clean, input=json.dumps([case for case, _ in cases]),
+        capture_output=True, text=True, check=True,
+    )  # fmt: skip
+    for (code, out, err), (case, text) in zip(json.loads(done.stdout), cases, strict=True):
+        assert (code, out) == (2, ""), case
+        assert text in err, case
+        assert err.startswith("error: "), case
+        assert err.count("\n") == 1, err
 
 
 def test_the_log_tells_a_new_world_from_one_that_goes_on(tmp_path: Path) -> None:
@@ -181,44 +209,59 @@ def test_the_log_tells_a_new_world_from_one_that_goes_on(tmp_path: Path) -> None
             assert server.log()[0]["event"] == event
 
 
+def test_a_bad_start_is_one_line_and_exit_code_2() -> None:
+    with running("--port", "x") as server:
+        assert server.end() == 2
+        assert server.rest() == []
+        assert server.errors == ["error: port = 'x' (from --port): must be a whole number from 0 to 65535\n"]
+
+
 def test_bad_settings(tmp_path: Path) -> None:
-    assert fails("--port", "x") == "error: port = 'x' (from --port): must be a whole number from 0 to 65535\n"
-    assert "--prot 1 (did you mean --port?)" in fails("--prot", "1")
-    assert "SOVEREIGN_PROT: there is no such setting (did you mean SOVEREIGN_PORT?)" in fails(SOVEREIGN_PROT="1")
-    assert "tick_rate = 0 (from SOVEREIGN_TICK_RATE)" in fails(SOVEREIGN_TICK_RATE="0")
-    assert "neither auth_key_file nor" in fails("--auth", "token")
-    assert "auth = 'no.such:thing': cannot be used" in fails("--auth", "no.such:thing")
-    assert "tls_cert = 'nowhere'" in fails("--tls-cert", "nowhere", "--tls-key", "nowhere")
-    assert "no_such" in fails("--config", broken(tmp_path, "no_such = 1"))
+    fail(
+        (start("--prot", "1"), "--prot 1 (did you mean --port?)"),
+        (start(SOVEREIGN_PROT="1"), "SOVEREIGN_PROT: there is no such setting (did you mean SOVEREIGN_PORT?)"),
+        (start(SOVEREIGN_TICK_RATE="0"), "tick_rate = 0 (from SOVEREIGN_TICK_RATE)"),
+        (start("--auth", "token"), "neither auth_key_file nor"),
+        (start("--auth", "no.such:thing"), "auth = 'no.such:thing': cannot be used"),
+        (start("--tls-cert", "nowhere", "--tls-key", "nowhere"), "tls_cert = 'nowhere'"),
+        (start("--config", broken(tmp_path, "config", "no_such = 1")), "no_such"),
+    )
 
 
 def test_bad_commands() -> None:
-    assert fails("chek") == (
+    unknown = (
         "error: 'chek': no such command (did you mean check?); the commands are token and check; "
         "to start a server, give only flags (--help)\n"
     )
-    assert fails("my_game:Tag").startswith("error: 'my_game:Tag': no such command; the commands are")
-    assert "are required: --subject; --help lists all flags" in fails("token")
-    assert "--urk x (did you mean --url?)" in fails("check", "--urk", "x")
+    fail(
+        (start("chek"), unknown),
+        (start("my_game:Tag"), "error: 'my_game:Tag': no such command; the commands are"),
+        (start("token"), "are required: --subject; --help lists all flags"),
+        (start("check", "--urk", "x"), "--urk x (did you mean --url?)"),
+    )
 
 
 def test_bad_scenes(tmp_path: Path) -> None:
-    assert "'nowhere'" in fails("--scene", "nowhere")
-    assert "not valid TOML" in fails("--scene", broken(tmp_path, "x ="))
-    assert "gravity" in fails("--scene", broken(tmp_path, 'gravity = "much"'))
-    assert "gravity" in fails("--scene", broken(tmp_path, "gravity = 0.0001"), "--tick-rate", "240")
+    fail(
+        (start("--scene", "nowhere"), "'nowhere'"),
+        (start("--scene", broken(tmp_path, "text", "x =")), "not valid TOML"),
+        (start("--scene", broken(tmp_path, "type", 'gravity = "much"')), "gravity"),
+        (start("--scene", broken(tmp_path, "range", "gravity = 0.0001"), "--tick-rate", "240"), "gravity"),
+    )
 
 
 def test_bad_addresses() -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = str(taken.getsockname()[1])
-        line = fails("--scene", "flat", "--port", port)
-        assert line == (
+        in_use = (
             f"error: host = '127.0.0.1', port = {port}: in use by another program; end that one or choose another "
             "--port (0: any free one)\n"
         )
-    assert "no.such.host.invalid" in fails("--scene", "flat", "--host", "no.such.host.invalid")
-    assert "a..b" in fails("--scene", "flat", "--host", "a..b")
+        fail(
+            (start("--scene", "flat", "--port", port), in_use),
+            (start("--scene", "flat", "--host", "no.such.host.invalid"), "no.such.host.invalid"),
+            (start("--scene", "flat", "--host", "a..b"), "a..b"),
+        )
 
 
 def test_check_says_whether_a_server_is_ready() -> None:

@@ -12,6 +12,7 @@ import pytest
 
 from shared import freshness, kernels
 from shared.kernels import AUTO, NUMBA, PLAIN, PREBUILT
+from tests.lengths import long
 
 ROOT = Path(__file__).parent.parent.parent
 here = pytest.mark.skipif(bool(kernels.trouble()), reason=f"no prebuilt kernel runs here: {kernels.trouble()}")
@@ -68,11 +69,13 @@ REFUSED = "from shared import kernels; print([kernels.chosen(), kernels.trouble(
     ("file", "old", "new"),
     [
         ("kernel.py", "return least", "return key"),
-        ("bulk.py", "ROW_BYTES = 33", "ROW_BYTES = 34"),
-        ("layout.py", "STOP_X, STOP_Y, STOP_Z, GO_X", "STOP_Y, STOP_X, STOP_Z, GO_X"),
         ("units.py", "SEGMENT_SHIFT = 5", "SEGMENT_SHIFT = 6"),
-        ("inputs.py", "MOVE_MAX = 127", "MOVE_MAX = 126"),
-        ("exports.py", '"unlink": "wn"', '"unlink": "wnn"'),
+        *long(
+            ("bulk.py", "ROW_BYTES = 33", "ROW_BYTES = 34"),
+            ("layout.py", "STOP_X, STOP_Y, STOP_Z, GO_X", "STOP_Y, STOP_X, STOP_Z, GO_X"),
+            ("inputs.py", "MOVE_MAX = 127", "MOVE_MAX = 126"),
+            ("exports.py", '"unlink": "wn"', '"unlink": "wnn"'),
+        ),
     ],
 )
 def test_a_change_of_what_it_does_makes_it_stale(copy: Path, file: str, old: str, new: str) -> None:
@@ -103,7 +106,7 @@ def test_a_program_without_sources_has_the_ones_it_was_frozen_with(copy: Path) -
 
 
 @here
-@pytest.mark.parametrize("damage", ["missing", "cut", "of another platform"])
+@pytest.mark.parametrize("damage", ["cut", *long("missing", "of another platform")])
 def test_a_library_that_cannot_be_loaded_is_not_used(copy: Path, damage: str) -> None:
     place = copy / "shared" / "prebuilt"
     library = place / kernels.TARGETS[sys.platform, platform.machine().lower()]

@@ -17,6 +17,7 @@ import pytest
 
 from hatch_build import FOLDERS
 from tests.client_sdk.servers import real_server
+from tests.lengths import long
 from tests.packaging.bare import ROOT, build, environment, run
 from tests.packaging.test_rewriting import imported
 from tests.readme.pages import programs
@@ -167,7 +168,7 @@ def test_the_physics_is_prebuilt(installed: Installed) -> None:
     assert said == "prebuilt \n" or "no prebuilt kernel for" in said
 
 
-@pytest.mark.parametrize("name", COMMANDS)
+@pytest.mark.parametrize("name", [*long(*COMMANDS[:-1]), COMMANDS[-1]])
 def test_a_command_runs_as_a_module_too(installed: Installed, name: str) -> None:
     said = installed.command(f"sovereign-{name}", "--help")
     assert "usage: " in said
@@ -209,9 +210,7 @@ def test_a_match(installed: Installed) -> None:
     assert "over: 30" in installed.run("-c", program)
 
 
-@pytest.mark.parametrize(
-    "name", [*LOOPS, ENGINES[0], *(pytest.param(name, marks=pytest.mark.slow) for name in ENGINES[1:])]
-)
+@pytest.mark.parametrize("name", [LOOPS[0], *long(*LOOPS[1:], *ENGINES)])
 def test_a_program_with_a_loop(installed: Installed, name: str) -> None:
     assert "walked" in installed.run("-m", "tests.readme.run_snippet", name)
 

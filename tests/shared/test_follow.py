@@ -2,6 +2,7 @@
 
 import random
 import struct
+from itertools import product
 from types import SimpleNamespace
 from typing import Any
 
@@ -39,6 +40,7 @@ from shared.scene import Scene, load_scene
 from shared.snapshot import News, decode_parts, encode_rows, join_part
 from shared.units import BLOCK, SEGMENT
 from shared.world import OverlapError, World
+from tests.lengths import long_but
 from tests.worlds import EAST, JUMP, WEST, build, floor, steps
 
 SIDE = SEGMENT * BLOCK
@@ -83,9 +85,13 @@ def crowd(made: Scene, n: int, rng: random.Random, compiled: bool) -> World:
     return world
 
 
-@pytest.mark.parametrize("name", ["hills", "arena", "topdown"])
-@pytest.mark.parametrize("rate", [20, 32])
-@pytest.mark.parametrize("integrator", ["mean", "semi"])
+@pytest.mark.parametrize(
+    ("name", "rate", "integrator"),
+    long_but(
+        [("hills", 20, "mean"), ("arena", 32, "semi"), ("topdown", 32, "mean")],
+        product(["hills", "arena", "topdown"], [20, 32], ["mean", "semi"]),
+    ),
+)
 def test_a_crowd_that_is_told_of_is_the_crowd(name: str, rate: int, integrator: str, compiled: bool) -> None:
     """Walls, steps, each other, blocks that come and go, throws and teleports; every tick, every bit."""
     rng = random.Random(f"{name} {rate}")
