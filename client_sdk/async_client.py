@@ -13,14 +13,12 @@ import ssl
 import time
 from collections.abc import Callable
 from types import TracebackType
-from typing import Any, cast
+from typing import TYPE_CHECKING, Any, cast
 
-from client_sdk.base import BaseClient
+from client_sdk.base import BaseClient, set_link
 from client_sdk.compiling import COMPILER
 from client_sdk.core import READ_BYTES, Core
 from client_sdk.events import Event
-from client_sdk.netsim.linked import LinkedCore
-from client_sdk.netsim.links import Path
 from client_sdk.pending_events import PendingEvents
 from client_sdk.transports.connection import (
     CLOSE_S,
@@ -35,6 +33,10 @@ from client_sdk.transports.connection import (
 from client_sdk.view import View
 from shared.checks import duration
 from shared.scene import Scene
+
+if TYPE_CHECKING:
+    from client_sdk.netsim.links import Path
+
 
 TIMEOUT_S = 5.0
 """Time that a handshake may take, in seconds."""
@@ -59,7 +61,7 @@ class AsyncClient(BaseClient):
 
     def __init__(
         self,
-        core: LinkedCore,
+        core: Core,
         url: str,
         before_update: Callable[[Core], None] | None = None,
         tls: ssl.SSLContext | None = None,
@@ -90,7 +92,7 @@ class AsyncClient(BaseClient):
         patience_s: float = 30.0,
         timeout: float = TIMEOUT_S,
         tls: ssl.SSLContext | None = None,
-        link: str | Path | None = None,
+        link: "str | Path | None" = None,
         before_update: Callable[[Core], None] | None = None,
     ) -> "AsyncClient":
         """Connects to a server. Returns as soon as the server has answered; the client then joins by itself.
@@ -113,8 +115,8 @@ class AsyncClient(BaseClient):
             ConnectError: there is no connection; the text says why, and what to do.
         """
         COMPILER.begin()
-        core = LinkedCore(name, scene, token=token, patience_s=patience_s)
-        core.link = link
+        core = Core(name, scene, token=token, patience_s=patience_s)
+        set_link(core, link)
         client = cls(core, url, before_update, checked_tls(tls))
         connection = client._connection
         try:
@@ -205,7 +207,7 @@ class AsyncClient(BaseClient):
     def _made(self, transport: asyncio.Transport) -> None:
         self._transport = transport
         transport.set_write_buffer_limits(UNSENT_MAX)
-        if self.core.appetite < READ_BYTES:  # with a slow simulated link, unread bytes wait at the server
+        if self.core.port.appetite < READ_BYTES:  # with a slow simulated link, unread bytes wait at the server
             transport.get_extra_info("socket").setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 0)
         self._pump(time.monotonic())
 
@@ -214,12 +216,12 @@ class AsyncClient(BaseClient):
         self._connection.receive(data, now)
         self._read_on()
         self._pump(now)
-        if self.core.next_update(now) < self._due - WAIT_S_MIN:
+        if self.core.port.next_update(now) < self._due - WAIT_S_MIN:
             self._schedule(now)
 
     def _read_on(self) -> None:
         """Pauses reading while the core's `appetite` is 0, and resumes it afterwards."""
-        transport, hungry = self._transport, self.core.appetite > 0
+        transport, hungry = self._transport, self.core.port.appetite > 0
         if transport is None or hungry == transport.is_reading():
             return
         if hungry:
@@ -279,7 +281,7 @@ class AsyncClient(BaseClient):
         core = self.core
         if self._transport is not None:
             self._connection.look(now)
-        core.update(now)
+        core.port.update(now)
         self._read_on()
         if core.state == "away" and self._transport is None and now >= core.comeback.retry_at:
             core.comeback.trying()
@@ -290,7 +292,7 @@ class AsyncClient(BaseClient):
     def _schedule(self, now: float) -> None:
         """Sets the timer for the next update."""
         if self._state != "closed":
-            self._due = now + min(max(self.core.next_update(now) - now, WAIT_S_MIN), WAIT_S_MAX)
+            self._due = now + min(max(self.core.port.next_update(now) - now, WAIT_S_MIN), WAIT_S_MAX)
             self._set_timer(self._due - now, self._update)
 
     def _pump(self, now: float) -> None:

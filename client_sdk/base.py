@@ -1,12 +1,15 @@
 """The part that `Client` and `AsyncClient` have in common: the player's side of a core."""
 
 from collections.abc import Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any, cast
 
-from client_sdk.netsim.linked import LinkedCore
-from client_sdk.netsim.links import Path
+from client_sdk.core import Core
 from client_sdk.stats import Stats
 from shared.inputs import make_input
+
+if TYPE_CHECKING:
+    from client_sdk.netsim.linked import LinkedPort
+    from client_sdk.netsim.links import Path
 
 
 class BaseClient:
@@ -16,7 +19,7 @@ class BaseClient:
         core: the client's state machine; read it for what this class does not offer.
     """
 
-    def __init__(self, core: LinkedCore) -> None:
+    def __init__(self, core: Core) -> None:
         self.core = core
 
     @property
@@ -66,7 +69,7 @@ class BaseClient:
         return self.core.stats.text()
 
     @property
-    def link(self) -> Path | None:
+    def link(self) -> "Path | None":
         """The simulated link on top of the real connection, to try a bad network: `client.link = "wifi"`.
 
         It may be set at any time: to the name of a preset of `client_sdk.netsim.links`, to a `Path`, or to None for no
@@ -75,11 +78,11 @@ class BaseClient:
         Raises:
             ValueError: no preset has that name.
         """
-        return self.core.link
+        return None if self.core.port is self.core else cast("LinkedPort", self.core.port).link
 
     @link.setter
-    def link(self, link: str | Path | None) -> None:
-        self.core.link = link
+    def link(self, link: "str | Path | None") -> None:
+        set_link(self.core, link)
 
     def set_input(self, x: float, y: float, *, jump: bool = False) -> None:
         """Sets the player's input from now on. May be called at any time, also several times per tick.
@@ -109,3 +112,18 @@ class BaseClient:
             ValueError: `ticks` is not 0 to 3.
         """
         self.core.set_input_delay(ticks)
+
+
+def set_link(core: Core, link: "str | Path | None") -> None:
+    """Puts a simulated link in front of a core, or changes it. Without a link, the simulator is not even loaded.
+
+    Raises:
+        ValueError: no preset has the name in `link`.
+    """
+    if core.port is core:
+        if link is None:
+            return
+        from client_sdk.netsim.linked import LinkedPort
+
+        core.port = LinkedPort(core)
+    cast("LinkedPort", core.port).link = link

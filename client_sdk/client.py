@@ -12,18 +12,21 @@ with Client.connect("ws://localhost:8765", name="Ann") as client:
 import ssl
 import time
 from types import TracebackType
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
-from client_sdk.base import BaseClient
+from client_sdk.base import BaseClient, set_link
 from client_sdk.compiling import COMPILER
+from client_sdk.core import Core
 from client_sdk.events import Event
-from client_sdk.netsim.linked import LinkedCore
-from client_sdk.netsim.links import Path
 from client_sdk.transports.connection import Connection, checked_tls
 from client_sdk.transports.polling import PollingTransport
 from client_sdk.view import View
 from shared.checks import duration, finite
 from shared.scene import Scene
+
+if TYPE_CHECKING:
+    from client_sdk.netsim.links import Path
+
 
 PATIENCE_S = 30.0
 """Time for which a client tries to reconnect, in seconds: enough for a server to restart."""
@@ -56,7 +59,7 @@ class Client(BaseClient):
         transport: moves the client's messages.
     """
 
-    def __init__(self, core: LinkedCore, transport: Transport) -> None:
+    def __init__(self, core: Core, transport: Transport) -> None:
         super().__init__(core)
         self._transport = transport
 
@@ -71,7 +74,7 @@ class Client(BaseClient):
         patience_s: float = PATIENCE_S,
         timeout: float = 5.0,
         tls: ssl.SSLContext | None = None,
-        link: str | Path | None = None,
+        link: "str | Path | None" = None,
     ) -> "Client":
         """Connects to a server. Returns as soon as the server has answered; `poll` and `update` then join the game.
 
@@ -93,8 +96,8 @@ class Client(BaseClient):
             ConnectError: there is no connection; the text says why, and what to do.
         """
         COMPILER.begin()
-        core = LinkedCore(name, scene, token=token, patience_s=patience_s)
-        core.link = link
+        core = Core(name, scene, token=token, patience_s=patience_s)
+        set_link(core, link)
         return cls(core, PollingTransport(Connection(url, core), duration(timeout, "timeout"), checked_tls(tls)))
 
     def poll(self, now: float | None = None) -> list[Event]:
@@ -143,7 +146,7 @@ class Client(BaseClient):
     def update(self, now: float | None = None) -> None:
         """Predicts every tick that is due, and sends its input. Starts the play once the world has arrived."""
         now = _time(now)
-        self.core.update(now)
+        self.core.port.update(now)
         self._transport.send(now)
 
     def view(self, now: float | None = None) -> View:

@@ -13,7 +13,7 @@
 
 import math
 from collections import deque
-from typing import Any, SupportsIndex
+from typing import Any, Protocol, SupportsIndex
 
 from client_sdk.advice import advised
 from client_sdk.commands import Orders
@@ -52,6 +52,39 @@ READ_BYTES = 64 * 1024
 """Number of bytes that a transport reads at once from a connection without a simulated link."""
 
 
+class Port(Protocol):
+    """The side of a core that a transport talks to: the core itself, or a simulated link in front of it."""
+
+    @property
+    def appetite(self) -> int:
+        """The number of bytes that the transport should read at once; 0: it should not read now."""
+        ...
+
+    def open(self, now: float) -> None:
+        """Takes a new connection, and sends Hello."""
+
+    def receive(self, data: bytes, now: float) -> None:
+        """Takes one message of the server."""
+
+    def lost(self, code: int, reason: str, now: float) -> None:
+        """Takes the loss of the connection."""
+
+    def update(self, now: float) -> None:
+        """Does what is due."""
+
+    def next_update(self, now: float) -> float:
+        """Returns the local time at which `update` has something to do; `inf`: not before a message arrives."""
+        ...
+
+    def outgoing(self) -> list[bytes]:
+        """Returns the messages to send, and forgets them."""
+        ...
+
+    def outstanding(self) -> int:
+        """Returns the bytes on the way to this client that have not reached the core yet."""
+        ...
+
+
 class Core:
     """The client as a state machine.
 
@@ -83,6 +116,8 @@ class Core:
             raise SceneError(f"scene = {shown(scene)}: must be a `Scene`, or None for the server's")
         self.scene = scene
         self.state = "joining"
+        self.port: Port = self
+        """The object that a transport talks to; `client_sdk.netsim.linked` puts a simulated link in front."""
         self.close_request: tuple[int, str] | None = None
         """Close code and reason with which the transport has to close the connection now; None: it must not."""
         self.stats = Stats()
@@ -139,9 +174,18 @@ class Core:
         return self._play.world if self._play else self._filled
 
     @property
+    def connected(self) -> bool:
+        """Whether there is a connection, as far as the core knows."""
+        return self._open
+
+    @property
     def appetite(self) -> int:
-        """The number of bytes that the transport should read at once; 0: it should not read now."""
+        """The number of bytes that the transport should read at once."""
         return READ_BYTES
+
+    def outstanding(self) -> int:
+        """Returns 0, because without a simulated link, no bytes wait between the transport and the core."""
+        return 0
 
     # -- what comes in -------------------------------------------------------------------------------------
 

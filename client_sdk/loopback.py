@@ -9,13 +9,17 @@ the world: the missed ticks are dropped, and the players reconnect as after a lo
 """
 
 import math
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
+from client_sdk.base import set_link
 from client_sdk.client import PATIENCE_S, Client
-from client_sdk.netsim.linked import LinkedCore
-from client_sdk.netsim.links import Path
+from client_sdk.core import Core
 from shared.checks import SceneError, shown
 from shared.scene import Scene
+
+if TYPE_CHECKING:
+    from client_sdk.netsim.links import Path
+
 
 LEAP_S = 2.0
 """Time without a call after which the program counts as having stood still, in seconds."""
@@ -56,7 +60,7 @@ class Loopback:
         self._began = -math.inf
         self._ticks = 0
 
-    def join(self, name: str = "", *, token: str = "", link: str | Path | None = None) -> Client:
+    def join(self, name: str = "", *, token: str = "", link: "str | Path | None" = None) -> Client:
         """Adds a player and returns its client, which joins within about half a second of polls and updates.
 
         Args:
@@ -67,8 +71,8 @@ class Loopback:
         Raises:
             ValueError: no preset has the name in `link`; or UTF-8 cannot hold the name or the token.
         """
-        core = LinkedCore(name, token=token, patience_s=PATIENCE_S)
-        core.link = link
+        core = Core(name, token=token, patience_s=PATIENCE_S)
+        set_link(core, link)
         seat = _Seat(self, core)
         self._seats.append(seat)
         return Client(core, seat)
@@ -92,7 +96,7 @@ class Loopback:
 class _Wire:
     """The connection to a client, as the game sees it."""
 
-    def __init__(self, core: LinkedCore) -> None:
+    def __init__(self, core: Core) -> None:
         self._core = core
         self.inbox: list[bytes] = []
         self.over: tuple[int, str] | None = None
@@ -101,7 +105,7 @@ class _Wire:
         self.inbox.append(message)
 
     def outstanding(self) -> int:
-        return sum(map(len, self.inbox)) + self._core.outstanding()
+        return sum(map(len, self.inbox)) + self._core.port.outstanding()
 
     def close(self, code: int, reason: str) -> None:
         self.over = code, reason
@@ -110,7 +114,7 @@ class _Wire:
 class _Seat:
     """The transport of one client."""
 
-    def __init__(self, loopback: Loopback, core: LinkedCore) -> None:
+    def __init__(self, loopback: Loopback, core: Core) -> None:
         self._loopback, self._game, self._core = loopback, loopback.game, core
         self._wire = _Wire(core)
         self._session: Any = None
@@ -129,7 +133,7 @@ class _Seat:
             core.comeback.trying()
             self._wire = _Wire(core)
             self._session = self._game.open(self._wire, now)
-            core.open(now)
+            core.port.open(now)
         self._read(now)
         self.send(now)
 
@@ -137,7 +141,7 @@ class _Seat:
         self._advance(now)
         if self._session is None:
             return
-        for message in self._core.outgoing():
+        for message in self._core.port.outgoing():
             self._game.receive(self._session, message, now)
         if self._core.close_request or self._core.state == "closed":
             self._end(now)
@@ -150,7 +154,7 @@ class _Seat:
         """Ends the connection of a client that plays, because the program stood still; the client reconnects."""
         if self._session is not None and self._core.state == "playing":
             self._end(now)
-            self._core.lost(GONE, "the program stood still", now)
+            self._core.port.lost(GONE, "the program stood still", now)
 
     def _advance(self, now: float) -> None:
         self._now = now
@@ -160,10 +164,10 @@ class _Seat:
         wire = self._wire
         messages, wire.inbox = wire.inbox, []
         for message in messages:
-            self._core.receive(message, now)
+            self._core.port.receive(message, now)
         if wire.over is not None and self._session is not None:
             self._end(now)
-            self._core.lost(*wire.over, now)
+            self._core.port.lost(*wire.over, now)
 
     def _end(self, now: float) -> None:
         self._game.lost(self._session, now)

@@ -1,4 +1,4 @@
-"""A core behind a simulated link, to try bad connections while developing.
+"""A simulated link between a core and its transport, to try bad connections while developing.
 
 Theory of operation. Whole messages are held back, in order, between the core and its transport. Each direction is a
 `links.Wire`, the model of TCP that the network lab measures with. Its time is the `now` of the calls. So there is no
@@ -24,17 +24,23 @@ SLOW_READ_BYTES = 1152
 """Number of bytes that a slow line takes at once."""
 
 
-class LinkedCore(Core):
-    """A `Core` with a simulated `link`, which may change at any time; without a link it behaves like `Core`.
+class LinkedPort:
+    """A core's `Port` behind a simulated link, which may change at any time.
 
-    All chance on a link comes from `seed`. The arguments are those of `Core`.
+    Install it as `core.port`. While there is no link, it passes everything on at once.
+
+    Args:
+        core: the core behind the link.
+        seed: all chance on the link comes from it.
     """
 
-    seed = 1
-    _link: Path | None = None
-    _line: "_Line | None" = None
-    _now = 0.0
-    _opened = False
+    def __init__(self, core: Core, seed: int = 1) -> None:
+        self.core = core
+        self._seed = seed
+        self._link: Path | None = None
+        self._line: _Line | None = None
+        self._now = 0.0
+        self._opened = core.connected
 
     @property
     def link(self) -> Path | None:
@@ -49,14 +55,14 @@ class LinkedCore(Core):
     def link(self, link: str | Path | None) -> None:
         self._link = named(link)
         if self._line is not None:  # messages on the old link arrive before those on the new one
-            self._line.follow(self._link or CLEAR, self.seed)
+            self._line.follow(self._link or CLEAR, self._seed)
 
     @property
     def appetite(self) -> int:
         """The number of bytes that the transport should read at once; 0 while a slow line is busy."""
         link, line = self._link, self._line
         if link is None or (link.rate == math.inf and link.dip is None):
-            return super().appetite
+            return self.core.appetite
         return 0 if line is not None and line.down.busy else SLOW_READ_BYTES
 
     def open(self, now: float) -> None:
@@ -64,13 +70,13 @@ class LinkedCore(Core):
         self._opened = True
         self._off()
         self._on(now)
-        super().open(now)
+        self.core.open(now)
 
     def receive(self, data: bytes, now: float) -> None:
         """Takes one message of the server, which the core gets at the end of the line."""
         line = self._on(now)
         if line is None or data == LOST:  # an empty message is malformed; the core refuses it at once
-            super().receive(data, now)
+            self.core.receive(data, now)
         else:
             line.down.send(data)
             line.advance(now)
@@ -80,7 +86,7 @@ class LinkedCore(Core):
         line = self._on(now) if self._opened else None
         if line is None:
             self._opened = False
-            super().lost(code, reason, now)
+            self.core.lost(code, reason, now)
         else:
             line.losses.append((code, reason))
             line.down.send(LOST)
@@ -91,23 +97,23 @@ class LinkedCore(Core):
         line = self._on(now)
         if line and self._link is None and line.down.idle and line.up.idle and not line.ready:
             self._off()
-        super().update(now)
+        self.core.update(now)
 
     def next_update(self, now: float) -> float:
         """Returns the local time at which `update` has something to do, for the core or for the line."""
-        due = super().next_update(now)
+        due = self.core.next_update(now)
         return due if self._line is None else max(min(due, self._line.due), now)
 
     def outgoing(self) -> list[bytes]:
         """Returns the messages that have come through the line, as of the latest `now` of another call."""
-        out, line = super().outgoing(), self._line
+        out, line = self.core.outgoing(), self._line
         if line is None:
             return out
         for message in out:
             line.up.send(message)
         line.advance(self._now)
         ready, line.ready = line.ready, []
-        if self.state == "closed":  # the Bye leaves at once, with everything that waits in front of it
+        if self.core.state == "closed":  # the Bye leaves at once, with everything that waits in front of it
             ready += line.up.waiting()
             self._off()
         return ready
@@ -121,8 +127,8 @@ class LinkedCore(Core):
         self._now = now
         if self._line is not None:
             self._line.advance(now)
-        if self._line is None and self._link is not None and self._opened and self.state != "closed":
-            self._line = _Line(self._link, self.seed, now, self)
+        if self._line is None and self._link is not None and self._opened and self.core.state != "closed":
+            self._line = _Line(self._link, self._seed, now, self)
         return self._line
 
     def _off(self) -> None:
@@ -138,9 +144,9 @@ class LinkedCore(Core):
             code, reason = self._line.losses[0]
             self._opened = False
             self._off()
-            super().lost(code, reason, self._now)
+            self.core.lost(code, reason, self._now)
         else:
-            super().receive(message, self._now)
+            self.core.receive(message, self._now)
 
     def _gone(self, message: bytes) -> None:
         if self._line is not None:
@@ -150,11 +156,11 @@ class LinkedCore(Core):
 class _Line:
     """Both directions of a link, with their own time, which is 0 when the line is created."""
 
-    def __init__(self, path: Path, seed: int, now: float, core: LinkedCore) -> None:
+    def __init__(self, path: Path, seed: int, now: float, port: LinkedPort) -> None:
         self.agenda = Agenda(0.0)
         self.weather = Weather(path, seed)
-        self.up = Wire(self.agenda, self.weather, seed + 1, core._gone)
-        self.down = Wire(self.agenda, self.weather, seed + 2, core._arrived)
+        self.up = Wire(self.agenda, self.weather, seed + 1, port._gone)
+        self.down = Wire(self.agenda, self.weather, seed + 2, port._arrived)
         self.ready: list[bytes] = []
         """Messages of the core that have come through and can be sent."""
         self.losses: list[tuple[int, str]] = []

@@ -101,7 +101,7 @@ class Connection:
             if isinstance(event, Frame):
                 self._take(event, now)
             elif protocol.handshake_exc is None:
-                self.core.open(now)
+                self.core.port.open(now)
         self._check(now)
 
     def look(self, now: float) -> None:
@@ -111,7 +111,7 @@ class Connection:
         """
         self._silent_s += min(max(now - self._looked, 0.0), LOOK_S)
         self._looked = now
-        if self.core.appetite == 0 or not self.opened or self._ending_since is not None:
+        if self.core.port.appetite == 0 or not self.opened or self._ending_since is not None:
             self._silent_s = 0.0
         elif self._silent_s > SILENCE_S:
             self.broke(f"nothing received for {SILENCE_S:g} s", now)
@@ -131,14 +131,14 @@ class Connection:
         """
         self._protocol.receive_eof()
         self.refused = self.refused or (None if self.opened else self._refusal(reason))
-        self.core.lost(code, reason, now)
+        self.core.port.lost(code, reason, now)
         self._check(now)
 
     def data_to_send(self, now: float) -> bytes:
         """Returns the bytes to write to the stream."""
         protocol = self._protocol
         if protocol.state is OPEN:
-            for message in self.core.outgoing():
+            for message in self.core.port.outgoing():
                 protocol.send_binary(message)
             if self.core.close_request is not None:
                 code, reason = self.core.close_request
@@ -150,16 +150,16 @@ class Connection:
     def _take(self, frame: Frame, now: float) -> None:
         opcode = frame.opcode
         if opcode is Opcode.BINARY and frame.fin:
-            self.core.receive(bytes(frame.data), now)
+            self.core.port.receive(bytes(frame.data), now)
         elif opcode is Opcode.BINARY or (opcode is Opcode.CONT and self._fragments):
             self._fragments += frame.data
             if frame.fin:
                 message = bytes(self._fragments)
                 self._fragments.clear()
-                self.core.receive(message, now)
+                self.core.port.receive(message, now)
         elif opcode is Opcode.TEXT or opcode is Opcode.CONT:
             self._protocol.fail(TEXT, "text message: binary ones only")
-            self.core.lost(TEXT, f"{self.url} is not a Sovereign Netcode server: it sends text", now)
+            self.core.port.lost(TEXT, f"{self.url} is not a Sovereign Netcode server: it sends text", now)
 
     def _refusal(self, reason: str = "") -> ConnectError | None:
         """Returns the error for a handshake without an HTTP answer; None if there was such an answer."""
@@ -176,15 +176,15 @@ class Connection:
             return
         self._ending_since = now
         if self.refused is not None:
-            self.core.lost(CloseCode.ABNORMAL_CLOSURE, str(self.refused), now)
+            self.core.port.lost(CloseCode.ABNORMAL_CLOSURE, str(self.refused), now)
         elif protocol.close_rcvd is not None:
             close = protocol.close_rcvd
-            self.core.lost(close.code, close.reason or "the server closed the connection", now)
+            self.core.port.lost(close.code, close.reason or "the server closed the connection", now)
         elif protocol.close_sent is not None:
             close = protocol.close_sent
-            self.core.lost(close.code, f"the server broke the WebSocket protocol: {close.reason}", now)
+            self.core.port.lost(close.code, f"the server broke the WebSocket protocol: {close.reason}", now)
         else:
-            self.core.lost(CloseCode.ABNORMAL_CLOSURE, "the connection broke off", now)
+            self.core.port.lost(CloseCode.ABNORMAL_CLOSURE, "the connection broke off", now)
 
 
 def stalled(connection: Connection, now: float) -> None:

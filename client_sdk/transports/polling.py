@@ -156,7 +156,7 @@ class PollingTransport:
     def _read(self, sock: socket.socket, now: float) -> None:
         buffer, receive, core = self._buffer, self._connection.receive, self._connection.core
         for _ in range(READS_MAX):
-            room = core.appetite
+            room = core.port.appetite
             if room < READ_BYTES:
                 sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, room)  # the rest waits at the server
                 if not room:

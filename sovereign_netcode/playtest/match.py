@@ -59,7 +59,7 @@ class Player:
     def connect(self) -> None:
         """Opens the connection."""
         self.session = self.match.game.open(self, self.match.now)
-        self.core.open(self.local)
+        self.core.port.open(self.local)
         self._update()
 
     def disconnect(self) -> None:
@@ -71,7 +71,7 @@ class Player:
         self.up.cut()
         self.down.cut()
         self._connect_wires()
-        self.core.lost(1006, "gone", self.local)
+        self.core.port.lost(1006, "gone", self.local)
         self._update()
 
     def suspend(self, seconds: float) -> None:
@@ -113,7 +113,7 @@ class Player:
     def _read(self) -> None:
         core, now = self.core, self.local
         for message in self._inbox:
-            core.receive(message, now)
+            core.port.receive(message, now)
         self._inbox.clear()
         self._flush()
 
@@ -127,7 +127,7 @@ class Player:
             self._acted = prediction.predicted.tick
             core.set_input(self.policy(core, self.rng))
         now = self.local
-        core.update(now)
+        core.port.update(now)
         if self.session is None and core.state == "away" and now >= core.comeback.retry_at:
             core.comeback.trying()
             self.connect()
@@ -136,14 +136,14 @@ class Player:
         if self.frame_s:
             self.match.at(self.match.now + self.frame_s, self._update, key=self)
         elif core.state != "closed":
-            due = core.next_update(now)
+            due = core.port.next_update(now)
             if due < math.inf:
                 when = self.match.now + max(due - now, 1e-4) / (1 + self.drift)
                 self.match.at(when, self._update, key=self)
 
     def _flush(self) -> None:
         core = self.core
-        for message in core.outgoing():
+        for message in core.port.outgoing():
             self.up.send(message)
         self.events += core.events()
         if core.close_request and self.closed is None:

@@ -8,8 +8,8 @@ from collections.abc import Callable, Iterator
 import pytest
 
 from client_sdk.client import Client
+from client_sdk.core import Core
 from client_sdk.events import Answered, Event, Joined, Left
-from client_sdk.netsim.linked import LinkedCore
 from client_sdk.transports import connection
 from client_sdk.transports.connection import UNSENT_MAX, ConnectError, Connection
 from client_sdk.transports.polling import PollingTransport
@@ -121,7 +121,7 @@ def test_a_server_that_stops_reading_is_left() -> None:
         accept(sock)
         over.wait(20)
 
-    core = LinkedCore()
+    core = Core()
     with scripted_server(script) as url:
         client = Client(core, PollingTransport(Connection(url, core), 5.0))
         raw_socket(client).setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 4096)
@@ -151,7 +151,7 @@ def test_what_does_not_fit_goes_out_later_in_order() -> None:
         go.wait(10)
         heard.extend(bytes(frame.data) for frame in until_closed(sock, peer))
 
-    core = LinkedCore()
+    core = Core()
     with scripted_server(script) as url:
         client = Client(core, PollingTransport(Connection(url, core), 5.0))
         raw_socket(client).setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 4096)

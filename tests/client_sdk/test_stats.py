@@ -2,9 +2,10 @@
 
 import pytest
 
+from client_sdk.base import set_link
+from client_sdk.core import Core
 from client_sdk.events import Corrected
 from client_sdk.loopback import Loopback
-from client_sdk.netsim.linked import LinkedCore
 from client_sdk.netsim.links import Path
 from client_sdk.stats import Stats
 from server.game import Game
@@ -100,12 +101,12 @@ def test_one_late_pong_is_not_the_round_trip() -> None:
 def test_the_round_trip_is_that_of_the_last_seconds(before_s: float, after_s: float) -> None:
     """17 ms, and 17 ms for 15 s after the latency was set to 610: that was the least of the last 15 s."""
     match = Match(load_scene("flat"), 1)
-    core = LinkedCore()
-    core.link = Path(before_s)
+    core = Core()
+    set_link(core, Path(before_s))
     match.join(wander, Path(0.0085), core).frame_s = 0.004
     match.run(20)
     assert core.stats.rtt_s == pytest.approx(0.017 + 2 * before_s, abs=0.005)
-    core.link = Path(after_s)
+    set_link(core, Path(after_s))
     match.run(3.5 + 2 * after_s)
     assert core.stats.rtt_s == pytest.approx(0.017 + 2 * after_s, abs=0.005)
     assert dict(core.stats.figures())["round trip"] == f"{core.stats.rtt_s * 1000:.0f} ms"
@@ -113,11 +114,11 @@ def test_the_round_trip_is_that_of_the_last_seconds(before_s: float, after_s: fl
 
 def test_what_a_player_sees_of_a_bad_moment_is_over_soon_after_it() -> None:
     match = Match(load_scene("flat"), 1)
-    core = LinkedCore()
+    core = Core()
     match.join(wander, Path(0.02), core)
     match.run(20)
     assert dict(core.stats.figures())["late inputs"] == "0.00 %"
-    core.link = Path(0.2)  # the inputs on the way come 200 ms later
+    set_link(core, Path(0.2))  # the inputs on the way come 200 ms later
     match.run(1)
     assert float(dict(core.stats.figures())["late inputs"].removesuffix(" %")) > 0
     match.run(15)
@@ -127,7 +128,7 @@ def test_what_a_player_sees_of_a_bad_moment_is_over_soon_after_it() -> None:
 
 def test_figures_are_those_of_the_path() -> None:
     match = Match(load_scene("flat"), 1)
-    core = LinkedCore()
+    core = Core()
     match.join(wander, Path(0.05), core)
     match.run(10)
     stats, before = core.stats, core.stats.bytes_up

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from client_sdk.client import Client
-from client_sdk.netsim.linked import LinkedCore
+from client_sdk.core import Core
 from server.rules import Rules
 from shared import kernels
 from shared.blocks import Blocks
@@ -122,7 +122,7 @@ class Session:
 
     def __init__(self, latency_s: float = 0.01, scene: str = "meadow", rules: Rules | None = None) -> None:
         self.match = Match(load_scene(scene), 5, rules=rules or Tag())
-        self.core = LinkedCore("Ann")
+        self.core = Core("Ann")
         self.player: Player = self.match.join(self._wish, Line(latency_s), self.core)
         self.window = Window(Client(self.core, Idle()), keyboard, "Tag")
         self.run(2)
@@ -161,10 +161,10 @@ def test_everybody_is_in_the_picture_and_the_keys_do_what_they_say() -> None:
     session.press(pygame.K_3)
     assert window.kind == 9
     session.press(pygame.K_LEFTBRACKET)
-    assert core.link is None
+    assert window.client.link is None
     session.press(pygame.K_RIGHTBRACKET)
     session.press(pygame.K_RIGHTBRACKET)
-    assert core.link == Line(0.05)
+    assert window.client.link == Line(0.05)
     session.run(3)
     assert core.stats.divergences == 0
     assert "closed" not in window.over
@@ -208,12 +208,12 @@ def test_a_slider_sets_the_latency(monkeypatch: pytest.MonkeyPatch) -> None:
         pygame.event.post(pygame.event.Event(each, button=1))
     session.run(0.1)
     assert session.window.lag_s == 0.0
-    assert session.core.link is None
+    assert session.window.client.link is None
 
 
 def test_the_latency_of_the_keys_is_as_much_as_they_say() -> None:
     match = Match(load_scene("flat"), 5)
-    core = LinkedCore("Ann")
+    core = Core("Ann")
     Window(Client(core, Idle()), keyboard, "").lag(0.2)
     match.join(lambda core, rng: NEUTRAL, Line(0.01), core).frame_s = 0.001
     match.run(5)

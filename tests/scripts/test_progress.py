@@ -6,7 +6,6 @@ from random import Random
 import pytest
 
 from client_sdk.core import Core
-from client_sdk.netsim.linked import LinkedCore
 from scripts._progress import Progress
 from scripts._walkers import LOOK_S, Walker, walk
 from shared.inputs import Input
@@ -73,7 +72,7 @@ def watched(match: Match, core: Core, seconds: float) -> Walker:
     return walker
 
 
-class Deaf(LinkedCore):
+class Deaf(Core):
     """A client whose inputs get lost from a time on."""
 
     sends = True
