@@ -61,16 +61,17 @@ def ensure(requirements: str) -> Path:
     return PYTHON
 
 
-def enter(*, pinned: bool = False) -> None:
+def enter(requirements: str = DEV, *, pinned: bool = False) -> None:
     """Continues a command in an interpreter that can import the packages of this checkout.
 
-    Returns if this interpreter can, or else starts the command again in `.venv`, with everything for development.
+    Returns if this interpreter can, or else starts the command again in `.venv`.
 
     Args:
+        requirements: file of the pins that `.venv` needs at least.
         pinned: whether only `.venv` will do, because the command depends on the exact versions.
     """
     if pinned or not _can_import():
-        python = ensure(DEV)
+        python = ensure(requirements)
         if Path(sys.executable) != python:
             become(python, *sys.argv)
 

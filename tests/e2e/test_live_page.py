@@ -11,7 +11,7 @@ import pytest
 
 from client_sdk.async_client import AsyncClient
 from client_sdk.bots import Bot, RunAndJump
-from tests.chromium import chromium, installed
+from scripts.live_page.chromium import chromium, installed
 from tests.client_sdk.servers import ROOT, real_server
 
 BROWSER = installed()

@@ -25,23 +25,23 @@ ANSWER_S = 30.0
 
 
 def installed() -> str | None:
-    """The path of a Chromium or Chrome, if there is one."""
+    """Returns the path of a Chromium or Chrome; None if there is none."""
     return next(filter(None, map(shutil.which, NAMES)), None)
 
 
 class Tab:
-    """One page."""
+    """A page of the browser."""
 
     def __init__(self, link: ClientConnection) -> None:
         self._link = link
         self._numbers = count(1)
         self.said: list[str] = []
-        """What has gone wrong in the page so far: exceptions, and whatever the console and the log say."""
+        """Exceptions of the page, and lines of its console and log, so far."""
         for domain in ("Page", "Runtime", "Log", "Network"):
             self.call(f"{domain}.enable")
 
     def call(self, method: str, **parameters: Any) -> dict[str, Any]:
-        """The answer to a call of the protocol."""
+        """Returns the answer to a call of the protocol."""
         number = next(self._numbers)
         self._link.send(json.dumps({"id": number, "method": method, "params": parameters}))
         while True:
@@ -53,7 +53,7 @@ class Tab:
                 self.said.append(json.dumps(told["params"])[:2000])
 
     def open(self, url: str, width: int, height: int, *, scale: float = 1.0, dark: bool = False) -> None:
-        """Goes to a page, in a window of that size."""
+        """Goes to a page, in a window of `width` x `height` pixels."""
         self.call(
             "Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=scale, mobile=False
         )
@@ -62,13 +62,13 @@ class Tab:
         self.call("Page.navigate", url=url)
 
     def run(self, script: str) -> Any:
-        """The value of an expression in the page; of a promise, what it comes to."""
+        """Returns the value of an expression in the page. A promise is awaited."""
         done = self.call("Runtime.evaluate", expression=script, awaitPromise=True, returnByValue=True)
         assert "exceptionDetails" not in done, done
         return done["result"].get("value")
 
     def until(self, script: str, seconds: float = ANSWER_S) -> Any:
-        """Waits until an expression is true, which it does not while it raises; its value."""
+        """Waits until an expression is true and raises nothing. Returns its value."""
         deadline = time.monotonic() + seconds
         while True:
             done = self.call("Runtime.evaluate", expression=script, awaitPromise=True, returnByValue=True)
@@ -79,13 +79,13 @@ class Tab:
             time.sleep(0.05)
 
     def picture(self) -> bytes:
-        """What is to be seen, as PNG."""
+        """Returns a picture of the page as PNG."""
         return base64.b64decode(self.call("Page.captureScreenshot", format="png")["data"])
 
 
 @contextmanager
 def chromium(path: str) -> Iterator[Tab]:
-    """A browser with one empty page and nothing remembered."""
+    """Runs a browser with an empty profile. Yields its only page, which is empty."""
     root = ("--no-sandbox",) if hasattr(os, "geteuid") and os.geteuid() == 0 else ()
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as profile:
         browser = subprocess.Popen(
@@ -106,7 +106,7 @@ def chromium(path: str) -> Iterator[Tab]:
 
 
 def _address(browser: subprocess.Popen[str]) -> str:
-    """Host and port where it wants to be driven: it prints them."""
+    """Returns host and port of the DevTools protocol, which the browser prints."""
     assert browser.stderr is not None
     line = ""
     for line in browser.stderr:
@@ -117,7 +117,7 @@ def _address(browser: subprocess.Popen[str]) -> str:
 
 
 def _page(address: str) -> str:
-    """The WebSocket address of its page."""
+    """Returns the WebSocket address of the browser's page."""
     import urllib.request
 
     deadline = time.monotonic() + START_S

@@ -1,0 +1,1 @@
+"""The picture of the live page, taken with a headless Chromium."""
