@@ -1,4 +1,4 @@
-"""The game as an environment for learning agents: PettingZoo's parallel API, in one process, as fast as it computes.
+"""A game as an environment for learning agents: PettingZoo's parallel API, in one process, without waiting for a clock.
 
     env = Arena("meadow", agents=4, rules=Tag, reward="score", seconds=60)
     observations, infos = env.reset(seed=1)
@@ -6,8 +6,9 @@
         actions = {agent: env.action_space(agent).sample() for agent in env.agents}
         observations, rewards, terminations, truncations, infos = env.step(actions)
 
-It is the server's own `Game`, tick by tick, with nobody connected: what an agent learns here holds on a server. Bots'
-policies play in it as they are: `policy(env.world, env.entity(agent))` is an action. One seed reproduces an episode.
+It runs the server's own `Game` tick by tick without connections, so what an agent learns here holds on a server.
+Policies of bots work in it unchanged: `policy(env.world, env.entity(agent))` is an action. The same seed gives the same
+episode.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -39,16 +40,17 @@ except ImportError as missing:
     raise ImportError(f"agents need PettingZoo, which is not installed here: {install('agents')}") from missing
 
 MANY = 1 << 20
+"""Maximum number of agents, and of ticks per action."""
 OTHERS = 8
-"""So many of the nearest entities an agent sees,"""
+"""Number of other entities, the nearest ones, in an observation."""
 OTHER_COLUMNS = 8
-"""each as its position and velocity relative to the own, its template, and 1 (0 in rows that stand for nobody)."""
+"""Numbers per other entity: position and velocity relative to the own, template, and 1 (0 in unused rows)."""
 OWN_COLUMNS = 8
-"""The own position and velocity, template, and whether it falls."""
+"""Numbers of the own entity: position, velocity, template, and whether it falls."""
 AROUND = (-3, 4), (-3, 4), (-1, 4)
-"""The blocks that an agent sees, from the one with its feet in it: along x, y, z, the end excluded."""
+"""Ranges of the blocks in an observation along x, y, z, relative to the block with the feet; the ends are excluded."""
 NO_BLOCK = 255
-"""Stands for what is not loaded: it stops everybody."""
+"""Kind in an observation for places that are not loaded. Such places stop every entity."""
 
 Array = npt.NDArray[Any]
 Observation = dict[str, Array]
@@ -56,21 +58,21 @@ Reward = Callable[[Stage, int], float]
 
 
 class Arena(ParallelEnv):  # type: ignore[misc]  # it says nothing of its types
-    """A game with so many agents, which join at the start and play until the time is over.
+    """A game whose agents join at the start of an episode and play until its time is over.
 
     Observations are a `Dict` of "own" [8] and "others" [8, 8] (float32; blocks and blocks/s), and "blocks" [5, 7, 7]
     (uint8; kinds by z, y, x around the feet). An action is three whole numbers: move_x (east) and move_y (north) in
     -127..127, and 1 to jump; any `Input` is one.
 
     Args:
-        scene: the name or path of a scene, or one; None: the rules' own, else "flat".
-        agents: how many.
-        rules: makes the rules of the game, anew for each episode.
-        reward: the name of an attribute whose change is the reward, or a function of the game and the entity.
-        over: the name of an attribute which, once it is true of an agent's entity, ends the agent's part: it leaves.
+        scene: the name or path of a scene, or a scene; None: the rules' own, otherwise "flat".
+        agents: number of agents.
+        rules: makes the rules of the game, once per episode.
+        reward: the name of an attribute whose change is the reward, or a function of the game API and the entity.
+        over: the name of an attribute. When it is true for an agent's entity, the agent leaves the episode.
         seconds: the length of an episode.
-        repeat: so many ticks go by with one action.
-        compiled: as for `World`.
+        repeat: number of ticks per action.
+        compiled: whether the kernel is compiled, as for `World`.
 
     Raises:
         SceneError: the scene cannot be used.
@@ -117,38 +119,49 @@ class Arena(ParallelEnv):  # type: ignore[misc]  # it says nothing of its types
         self._table, self._corner, self._loaded = np.zeros((1, 1, 1), np.int64), np.zeros(3, np.int64), -1
 
     def observation_space(self, agent: str) -> spaces.Dict:
-        """See the class."""
+        """Returns the space of an agent's observations, the same for all agents."""
         return self._spaces
 
     def action_space(self, agent: str) -> spaces.Box:
-        """See the class."""
+        """Returns the space of an agent's actions."""
         return self._actions[agent]
 
     @property
     def world(self) -> World:
-        """The world as it is: for policies. Not to be changed."""
+        """The present world, for policies. Do not change it."""
         return self._game.world
 
     @property
     def stage(self) -> Stage:
-        """The running game, as its rules see it."""
+        """The game API of the running game."""
         return self._game.stage
 
     def entity(self, agent: str) -> int:
-        """An agent's entity."""
+        """Returns the number of an agent's entity."""
         return self._seats[agent].entity
 
     def reset(
         self, seed: int | None = None, options: Mapping[str, Any] | None = None
     ) -> tuple[dict[str, Observation], dict[str, dict[str, Any]]]:
-        """A new game; without a seed that of the episode before, plus one. `options` are ignored."""
+        """Starts a new episode with a new game.
+
+        Args:
+            seed: seed of the game; None: that of the last episode plus one.
+            options: ignored.
+
+        Returns:
+            The observations and infos of all agents.
+
+        Raises:
+            ValueError: there is no room to spawn all agents.
+        """
         self._seed = self._seed + 1 if seed is None else seed
         world = RecordedWorld(self.scene, compiled=self._blank.compiled)
         world.restore(self._blank)
         rules = self._rules()
         prepared(rules, self._bare)
         game = self._game = Game(self.scene, limits=Limits(resume_s=0.0), world=world, rules=rules, seed=self._seed)
-        game.tick(0.0, 0.0)  # the rules set their scene before anybody comes
+        game.tick(0.0, 0.0)  # lets the rules prepare the world before agents join
         self.agents = list(self.possible_agents)
         self._seats = {agent: Session(_Nobody(), 0.0) for agent in self.agents}
         self._wheels: dict[str, InputQueue] = {}
@@ -164,13 +177,18 @@ class Arena(ParallelEnv):  # type: ignore[misc]  # it says nothing of its types
         return self._look(), {agent: {"verdicts": []} for agent in self.agents}
 
     def command(self, agent: str, name: str, data: Any = None) -> int:
-        """Asks for something with the next step, as `Client.command` does; "edit" is one, of [x, y, z, kind].
+        """Sends a command of an agent with the next step, as `Client.command` does.
+
+        Args:
+            agent: the agent.
+            name: name of the command; "edit" places or removes a block.
+            data: data of the command, any MessagePack value; for "edit": [x, y, z, kind].
 
         Returns:
-            Its number. The verdict is in the next step's `infos[agent]["verdicts"]`, as (number, verdict).
+            The number of the command. The next step's `infos[agent]["verdicts"]` has its result, as (number, verdict).
 
         Raises:
-            ValueError: the name or the data are too long (32 characters, 1,024 bytes), or no MessagePack.
+            ValueError: the name or the data are too long (32 characters, 1,024 bytes), or no MessagePack value.
         """
         text(name, "name", NAME_MAX)
         payload = pack_value(data)
@@ -190,7 +208,11 @@ class Arena(ParallelEnv):  # type: ignore[misc]  # it says nothing of its types
         dict[str, bool],
         dict[str, dict[str, Any]],
     ]:
-        """Everybody acts, `repeat` ticks go by; who gives no action stands still."""
+        """Runs `repeat` ticks with the given actions. An agent without an action stands still.
+
+        Returns:
+            Observations, rewards, terminations, truncations and infos, each by agent.
+        """
         for agent in self.agents:
             given = actions.get(agent)
             self._wheels[agent].wheel = NEUTRAL if given is None else clamp(Input(*map(int, given)))
@@ -217,7 +239,7 @@ class Arena(ParallelEnv):  # type: ignore[misc]  # it says nothing of its types
     # -- inside --------------------------------------------------------------------------------------------
 
     def _look(self) -> dict[str, Observation]:
-        """What everybody sees, for all at once."""
+        """Returns the observations of all agents."""
         states = self.world.states()
         own = np.searchsorted(states[:, ID], [self.entity(agent) for agent in self.agents])
         seen = _in_blocks(states)
@@ -228,7 +250,7 @@ class Arena(ParallelEnv):  # type: ignore[misc]  # it says nothing of its types
         }
 
     def _around(self, places: Int64s) -> npt.NDArray[np.uint8]:
-        """The kinds of the blocks around positions [n, 3] in grid steps: [n, z, y, x]."""
+        """Returns the kinds of the blocks around positions ([n, 3], in grid steps), [n, z, y, x]."""
         blocks = self.world.blocks
         if self._loaded != len(blocks.rows):
             self._loaded = len(blocks.rows)
@@ -257,13 +279,13 @@ class _Nobody:
     """The link of a player without a client."""
 
     def send(self, message: bytes) -> None:
-        """Nobody reads it."""
+        """Discards the message."""
 
     def outstanding(self) -> int:
         return 0
 
     def close(self, code: int, reason: str) -> None:
-        """There is nothing to close."""
+        """Does nothing."""
 
 
 def _attribute(name: str) -> Reward:
@@ -290,7 +312,7 @@ def _observations(templates: int) -> spaces.Dict:
 
 
 def _in_blocks(states: Int64s) -> npt.NDArray[np.float64]:
-    """States [n, 12] as positions, velocities, template and whether it falls, [n, 8]."""
+    """Converts states [n, 12] to positions, velocities, template and whether the entity falls, [n, 8]."""
     seen = np.empty((len(states), OWN_COLUMNS))
     seen[:, :3] = states[:, X : X + 3] / BLOCK
     seen[:, 3:6] = states[:, VX : VX + 3] / SPEED
@@ -300,7 +322,12 @@ def _in_blocks(states: Int64s) -> npt.NDArray[np.float64]:
 
 
 def _nearest(seen: npt.NDArray[np.float64], own: Int64s) -> npt.NDArray[np.float32]:
-    """For each row in `own` the nearest others, nearest first, [n, 8, 8]."""
+    """Returns the nearest other entities of each own entity, nearest first, [n, 8, 8].
+
+    Args:
+        seen: all entities, as `_in_blocks` returns them.
+        own: rows of the agents' entities.
+    """
     away = seen[own, None, :3] - seen[None, :, :3]
     way = np.einsum("ijk,ijk->ij", away, away)
     way[np.arange(len(own)), own] = np.inf

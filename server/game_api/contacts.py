@@ -1,7 +1,8 @@
-"""Which entities touch: told once, when it begins.
+"""Contacts: which entities touch, reported once, when it begins.
 
-Boxes that share a face, an edge or a corner touch: whoever is stopped by another stands flush against it. Only what
-has changed is looked at, against all: sorted along x, so that the cost is what is near in x, computed in whole columns.
+Boxes touch if they share at least a point: an entity that is stopped by another shares a face with it. Only entities
+that have changed are compared with all others. All are sorted along x, so the cost depends on the number of entities at
+a similar x. The comparison is done with NumPy for all pairs at once.
 """
 
 import numpy as np
@@ -13,10 +14,11 @@ Pair = tuple[int, int]
 
 
 class Contacts:
-    """The pairs of a world that touch.
+    """The pairs of entities of a world that touch.
 
     Args:
-        goes_on: who touches already has been told so, before a restart.
+        world: the world.
+        goes_on: whether the game is restored, so that the present contacts were reported before the restart.
     """
 
     def __init__(self, world: World, *, goes_on: bool = False) -> None:
@@ -29,11 +31,14 @@ class Contacts:
         self._stepped = np.zeros(0, np.int64)
 
     def stepped(self) -> None:
-        """A step is over: whom it has changed, the world forgets as soon as anything is written."""
+        """Takes note of the entities that a step has changed. The world forgets them at its next change."""
         self._stepped = self._world.changed[:, ID]
 
     def begun(self) -> list[Pair]:
-        """The pairs (a < b, ascending) that touch since the latest step, or have been put so, and did not before it."""
+        """Returns the pairs (a < b, ascending) that touch now and did not at the last call.
+
+        Both the latest step and changes by the rules after it count.
+        """
         changed = np.union1d(self._stepped, self._world.changed[:, ID])
         if not len(changed):
             return []
@@ -46,7 +51,7 @@ class Contacts:
         return sorted(new)
 
     def of(self, entity: int) -> list[int]:
-        """Who touches an entity at this moment, ascending."""
+        """Returns the entities that touch an entity now, in ascending order."""
         pairs = self._touched(self._world.states(), np.array([entity], np.int64))
         return sorted(b if a == entity else a for a, b in pairs)
 

@@ -1,4 +1,4 @@
-"""A guard for a game's state: it changes within a tick, in the thread that ticks, and nowhere else."""
+"""A guard of a game's state, which may change only within a tick, in the thread that ticks."""
 
 import asyncio
 import threading
@@ -6,14 +6,14 @@ from types import TracebackType
 
 
 class OutOfTurnError(RuntimeError):
-    """The state of a game was to be changed from another thread, or from a callback of an event loop between ticks."""
+    """An attempt to change a game from another thread, or from a callback of an event loop between ticks."""
 
 
 class Turn:
-    """The right to change a game. It is held within `with turn:`, which is what a tick does.
+    """The right to change a game. A tick holds it, by `with turn:`.
 
-    Between ticks the thread that ticks has it, too, where no event loop runs: a test or a program that calls `tick`
-    itself knows where it stands. Before the first tick that is the thread in which the game was made.
+    Between ticks the thread that ticks has the right, too, if it runs no event loop: a test or a program that calls
+    `tick` itself cannot interfere with a tick. Before the first tick, that is the thread in which the game was made.
     """
 
     def __init__(self) -> None:
@@ -30,13 +30,13 @@ class Turn:
         self._depth -= 1
 
     def check(self, what: str) -> None:
-        """Refuses to go on where the right is not held.
+        """Checks that the caller has the right.
 
         Args:
-            what: the method that was called, for the error.
+            what: name of the method that was called, for the error.
 
         Raises:
-            OutOfTurnError: it is not held here.
+            OutOfTurnError: the caller does not have the right.
         """
         if threading.get_ident() != self._thread:
             where = f"from thread {threading.current_thread().name!r}, which is not the one that ticks"
@@ -44,4 +44,4 @@ class Turn:
             where = "from a callback of the event loop, between two ticks"
         else:
             return
-        raise OutOfTurnError(f"{what}: called {where}; hand it to the next tick by game.soon(game.{what}, ...)")
+        raise OutOfTurnError(f"{what}: called {where}; pass it to the next tick by game.soon(game.{what}, ...)")

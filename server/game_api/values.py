@@ -1,4 +1,4 @@
-"""Values that rules give to clients (attributes, shared values, events): what they may be, and tables of them."""
+"""Checks of the values that rules send to clients (attributes, shared values, events), and of tables of them."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -9,16 +9,16 @@ from shared.checks import SceneError, text
 from shared.messages import NAME_MAX, pack_value, unpack_value
 
 ATTRIBUTES_MAX = 32
-"""The most attributes of an entity, and the most shared values of a game."""
+"""Maximum number of attributes of an entity, and of shared values of a game."""
 VALUE_BYTES_MAX = 256
-"""The longest value, in bytes as MessagePack."""
+"""Maximum size of a value in MessagePack, in bytes."""
 
 
 def checked(name: str, value: Any) -> bytes:
     """Packs a value after checking it and its name.
 
     Raises:
-        SceneError: the name is no text of 1 to 32 characters, or the value is too long, or no MessagePack.
+        SceneError: the name is not a text of 1 to 32 characters, or the value is too long or no MessagePack value.
     """
     text(name, "name", NAME_MAX)
     try:
@@ -36,21 +36,21 @@ def packed(value: Any) -> bytes:
 
 
 def copied(value: Any) -> Any:
-    """Returns a copy of a list or a table, so that a caller cannot change ours."""
+    """Returns a copy of a list or a table, so that a caller cannot change the original. Returns other values as is."""
     return unpack_value(packed(value)) if isinstance(value, list | dict) else value
 
 
 def with_value(values: Mapping[str, Any], name: str, payload: bytes, owner: str) -> dict[str, Any]:
-    """Returns a new table in which a name has another value, or, for None, is gone.
+    """Returns a copy of a table in which a name has a new value. The value None removes the name.
 
     Args:
-        values: the table before.
+        values: the table.
         name: the name.
-        payload: its value, packed.
-        owner: whose values they are, for the error.
+        payload: the new value, packed.
+        owner: the entity, template or game that has the values, for the error.
 
     Raises:
-        SceneError: there are too many then.
+        SceneError: the new table would have more than `ATTRIBUTES_MAX` values.
     """
     value = unpack_value(payload)
     after = {**values, name: value}

@@ -1,7 +1,7 @@
-"""The hash of a world in recordings and saved worlds of formats 1 and 2: for reading them, and for nothing else.
+"""The former hash of a world, which is needed to read recordings and saved worlds of formats 1 and 2.
 
-It goes by an exclusive-or over the blocks of a segment, which some 40 chosen edits leave unchanged. So nothing new is
-written with it. It has 16 bytes, and its successor has 20: the length tells which one a file holds.
+It uses an exclusive-or over the blocks of a segment. About 40 chosen edits can leave that unchanged, so nothing new is
+written with this hash. It has 16 bytes and its successor 20; the length tells which one a file has.
 """
 
 import hashlib
@@ -14,10 +14,11 @@ from shared.layout import Int64s
 from shared.world import World
 
 HASH_BYTES = 16
+"""Length of the former hash in bytes."""
 
 
 def digest_of(kinds: Kinds) -> int:
-    """The former digest of one segment ([32768] kinds)."""
+    """Returns the former digest of one segment ([32768] kinds)."""
     at = np.flatnonzero(kinds).astype(np.uint64)
     value = (at + np.uint64(1)) << np.uint64(8) | kinds[at].astype(np.uint64)
     value = (value ^ (value >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
@@ -26,7 +27,14 @@ def digest_of(kinds: Kinds) -> int:
 
 
 def hash_of(tick: int, segments: Int64s, kinds: list[Kinds], states: Int64s) -> bytes:
-    """The former hash of a world from its parts: segments [n, 3] and their blocks in any order, states [m, 12]."""
+    """Returns the former hash of a world from its parts.
+
+    Args:
+        tick: the tick of the world.
+        segments: indices of the segments in any order, [n, 3].
+        kinds: blocks of the segments, in the same order.
+        states: states of all entities, [m, 12].
+    """
     order = np.lexsort((segments[:, 2], segments[:, 1], segments[:, 0]))
     blocks = np.empty((len(order), 4), "<i8")
     blocks[:, :3] = segments[order]
@@ -38,6 +46,6 @@ def hash_of(tick: int, segments: Int64s, kinds: list[Kinds], states: Int64s) -> 
 
 
 def state_hash(world: World) -> bytes:
-    """The former hash of a world."""
+    """Returns the former hash of a world."""
     rows = list(world.blocks.rows.values())
     return hash_of(world.tick, world.blocks.segments[rows], [world.blocks.kinds[row] for row in rows], world.states())

@@ -1,4 +1,4 @@
-"""A world that tells what happens to it: to recordings (`server.journal` draws their format) and to a store."""
+"""A world with observers: it reports every change to recordings (format: `server.journal.records`) and to a store."""
 
 import math
 import struct
@@ -40,41 +40,43 @@ FRESHENED_PER_TICK = 1
 
 
 class Sink(Protocol):
-    """Where a recording goes: a binary file."""
+    """The target of a recording: a binary file."""
 
     def write(self, data: bytes, /) -> object:
-        """Takes all of `data`."""
+        """Writes all of `data`."""
 
     def flush(self) -> object:
-        """Hands what was written to the system."""
+        """Hands everything that was written to the system."""
 
 
 class Saves(Protocol):
-    """What a game needs to know of where its world is saved (`server.persistence.store`)."""
+    """The store of a world as the game uses it (`server.persistence.store`)."""
 
     kept: Any
-    """What the game's `keep()` returned for the checkpoint that was loaded; None for a new world."""
+    """Result of the game's `keep()` for the loaded checkpoint; None for a new world."""
     trouble: str
-    """Why nothing can be saved just now; empty if all is well. Commands are refused while it lasts."""
+    """Reason why nothing can be saved at the moment; empty: saving works. Commands are refused while there is one."""
 
     @property
     def notes(self) -> Sequence[tuple[int, Any]]:
-        """What was noted since then, in order, each with the tick that came next."""
+        """Notes since the loaded checkpoint in order, each with the tick that followed it."""
         ...
 
     @property
     def durable_tick(self) -> int:
-        """Verdicts on what was done in this tick and before may be told."""
+        """Newest tick that a crash cannot undo. Verdicts of commands up to this tick may be sent."""
         ...
 
 
 class Pen:
-    """Takes down what happens to a world: the calls since the last tick, and the inputs that differ from those held.
+    """An observer of a world. It collects the calls since the last tick and the inputs that differ from the last ones.
 
     Args:
-        first: what was written ahead of the first tick may be among its changes without a call, so it has no mark.
-        hashed_max: no hash of a world with more entities (it takes the step 2 ms with 10,000); every tick has its mark.
-        stale_max: nor of one in which more segments wait for their digests (40 us each).
+        first: whether the first tick gets no mark, because states written before it may be among its changes without a
+            call.
+        hashed_max: number of entities up to which a tick gets a hash of the world (with 10,000 entities it takes 2 ms).
+            Every tick gets a mark.
+        stale_max: number of segments without a present digest up to which a tick gets a hash (40 us each).
     """
 
     def __init__(self, *, first: bool = True, hashed_max: float = math.inf, stale_max: float = math.inf) -> None:
@@ -84,19 +86,19 @@ class Pen:
         self._hashed_max, self._stale_max = hashed_max, stale_max
 
     def forget(self, entities: list[int]) -> None:
-        """The inputs of these entities are not known any more."""
+        """Forgets the latest inputs of entities, so that the next ones are recorded again."""
         for entity in entities:
             self._held.pop(entity, None)
 
     def touch(self, segment: Cell) -> None:
-        """The blocks of a segment may be about to change."""
+        """Is called before the blocks of a segment may change."""
 
     def tick(self, world: World, inputs: Mapping[int, Input]) -> None:
-        """The world has been stepped with `inputs`."""
+        """Is called after each step of the world with the inputs of the step."""
         raise NotImplementedError
 
     def taken(self, world: World, inputs: Mapping[int, Input]) -> list[Any]:
-        """The record of a tick: `[inputs, calls, mark]`, and the hash where one is due."""
+        """Makes the record of a tick: `[inputs, calls, mark]`, and the hash if one is due. Clears the calls."""
         calls, self.calls = self.calls, []
         held = self._held
         news: list[int] = []
@@ -113,28 +115,29 @@ class Pen:
 
 
 class RecordedWorld(World):
-    """A world with pens on it. While there are none, a call costs one comparison more."""
+    """A world with pens (observers). Without any, a change costs one more comparison than in a `World`."""
 
     _pens: tuple[Pen, ...] = ()
     _inside = 0
 
     def attach(self, pen: Pen) -> None:
-        """Has a pen take down everything from now on."""
+        """Adds a pen. It is notified of every change from now on."""
         self._pens = (*self._pens, pen)
 
     def detach(self, pen: Pen) -> None:
-        """Does nothing if the pen is not on it."""
+        """Removes a pen. Does nothing if it is not attached."""
         self._pens = tuple(each for each in self._pens if each is not pen)
 
     def record(self, file: Sink, failed: Callable[[OSError], None] | None = None) -> None:
-        """Records from now on, into a file opened for writing bytes.
+        """Starts a recording. Writes the present state at once, and one record per tick from now on.
 
         Args:
-            file: gets the start state at once, and one record per tick.
-            failed: called with the error when the file can take no more; recording ends, the world goes on.
+            file: a file opened for writing bytes.
+            failed: called with the error if the file cannot be written; the recording ends, and the world goes on.
+                None: the error is raised instead.
 
         Raises:
-            JournalError: it is being recorded already.
+            JournalError: the world is being recorded already.
         """
         if any(isinstance(pen, _FilePen) for pen in self._pens):
             raise JournalError("this world is being recorded already")
@@ -143,20 +146,20 @@ class RecordedWorld(World):
         pen.begin()
 
     def end_recording(self) -> None:
-        """Writes the last hash; the file can be closed. Does nothing if there is no recording."""
+        """Ends the recording with a hash. Then the file can be closed. Does nothing if there is no recording."""
         for pen in self._pens:
             if isinstance(pen, _FilePen):
                 pen.end()
                 self.detach(pen)
 
     def note(self, value: Any) -> None:
-        """Takes down something that is not in the world, in order among the calls ahead of the coming tick.
+        """Records a value of the game that is not in the world, in order with the calls before the coming tick.
 
         Args:
-            value: whatever MessagePack can hold; it is packed at once.
+            value: any MessagePack value; it is packed at once.
 
         Raises:
-            TypeError, ValueError, OverflowError: it cannot hold that.
+            TypeError, ValueError, OverflowError: MessagePack cannot encode the value.
         """
         if self._pens:
             self._call([NOTE, msgpack.packb(value)])
@@ -172,7 +175,7 @@ class RecordedWorld(World):
         super()._put(states)
 
     def spawn_many(self, template: str, positions: npt.ArrayLike) -> range:
-        self._inside += 1  # if it fails, it removes what it has put, and nothing has happened
+        self._inside += 1  # a failed call removes what it has put, which changes nothing
         try:
             ids = super().spawn_many(template, positions)
         finally:
@@ -196,7 +199,7 @@ class RecordedWorld(World):
         for segment in ((x, y, z) for z in range(z0, z1 + 1) for y in range(y0, y1 + 1) for x in range(x0, x1 + 1)):
             self._touch(segment)
         call = [FILL, *low, *high, kind, push]
-        self._inside += 1  # what it pushes is not a call of its own
+        self._inside += 1  # pushed entities are part of this call
         try:
             changed = super()._fill(low, high, kind, push)
         except OverlapError:
@@ -232,7 +235,7 @@ class RecordedWorld(World):
 
     def restore(self, other: World) -> None:
         if self._pens:
-            raise JournalError("a world that is being recorded cannot become another: end the recording first")
+            raise JournalError("a world that is being recorded cannot be replaced by another; end the recording first")
         super().restore(other)
 
     def step(self, inputs: Mapping[int, Input] | None = None) -> None:
@@ -257,7 +260,7 @@ class RecordedWorld(World):
 
 
 class _FilePen(Pen):
-    """Writes a recording."""
+    """A pen that writes a recording."""
 
     def __init__(self, file: Sink, world: RecordedWorld, failed: Callable[[OSError], None]) -> None:
         super().__init__()
@@ -265,7 +268,7 @@ class _FilePen(Pen):
         self._chain = 0
 
     def begin(self) -> None:
-        """Writes the world as it is now."""
+        """Writes the present state of the world."""
         world = self._world
         segments = [[*index, packed(world, index)] for index in sorted(world.blocks)]
         states = world.states().astype("<i8").tobytes()
@@ -277,7 +280,7 @@ class _FilePen(Pen):
         self._record(self.taken(world, inputs))
 
     def end(self) -> None:
-        """Writes the end."""
+        """Writes the last record, with a hash."""
         self._record([None, self.calls, None, self._world.state_hash()])
 
     def _record(self, parts: list[Any], head: bytes = b"") -> None:
@@ -294,7 +297,7 @@ class _FilePen(Pen):
 
 
 def packed(world: World, index: Cell) -> bytes | None:
-    """A loaded segment for the file; None if it is as the generator left it."""
+    """Returns the packed blocks of a loaded segment; None if they are as generated."""
     kinds = world.blocks.segment(index)
     with suppress(SceneError):
         if np.array_equal(terrain.generate(world.scene.terrain, index), kinds.reshape(-1)):

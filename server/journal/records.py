@@ -1,26 +1,28 @@
-"""A recording: the world at its start and every call that changed it since; a replay ends in the same hashes.
+"""Recordings: the format of their files, reading, and replay.
+
+A recording has a world's start and all inputs and calls that changed it since. A replay ends in the same hashes.
 
 file      8 bytes "\\x89SNJ\\r\\n\\x1a\\n"   u16 format version   records
 record    u32 length   u32 check of the length   u32 check of the payload   payload (MessagePack)
           each check is the CRC-32 of its bytes, begun with the payload check of the record before
-          (the first one: with the CRC-32 of the 10 bytes ahead of it; in formats 1 and 2 with 0)
+          (the first one: with the CRC-32 of the 10 bytes before it; in formats 1 and 2 with 0)
 start     [scene, tick, next_id, states, segments]         the first record
-          scene: its table   states: n * 12 int64   segments: [x, y, z, packed kinds or nil for as generated]
+          scene: its table   states: n * 12 int64   segments: [x, y, z, packed kinds or nil if as generated]
 tick      [inputs, calls, mark] or, every 32 ticks, [inputs, calls, mark, hash]
-          calls, in order, ahead of the step   inputs: [id, move_x, move_y, buttons, id, ...] that differ from the
-          ones before   mark: CRC-32 of the states that the tick changed (nil in the first tick, which has a hash)
+          calls: in order, before the step   inputs: [id, move_x, move_y, buttons, id, ...] that differ from the
+          previous ones   mark: CRC-32 of the states that the tick changed (nil in the first tick, which has a hash)
           hash: 20 bytes, the world's after the step (16 in formats 1 and 2: `server.journal.former`)
 end       [nil, calls, nil, hash]                           the last record, if the recording was ended
 
 call      [PUT, 12 numbers per state ...]   [REMOVE, id]   [FILL, x0, y0, z0, x1, y1, z1, kind, push]
-          [LOAD, x, y, z, packed kinds or nil for as generated]   [UNLOAD, x, y, z]
+          [LOAD, x, y, z, packed kinds or nil if as generated]   [UNLOAD, x, y, z]
           [WRITE, x, y, z, blocks, kinds]   [REBASE, tick]   [NOTE, packed value] (since format 2)
 
-All numbers are little-endian. Each tick's record is handed to the system at once: a process that is killed loses
-nothing, and what a crash of the machine leaves of the last record is ignored. Spawns, teleports and throws are
-recorded as what they come to: whole states. A call that fails half-way and takes itself back is recorded too,
-since it may have woken someone. A note is what the game wants told again: it changes nothing in the world. The
-writing side is `server.journal.recorded_world`.
+All numbers are little-endian. Each tick's record is handed to the system at once, so a process that is killed loses
+nothing. An incomplete last record, as a crash of the machine leaves it, is ignored. Spawns, teleports and throws are
+recorded by their results: whole states. A call that fails half-way and undoes itself is recorded, too, since it may
+have woken entities. A note is a value of the game, which a replay passes over: it changes nothing in the world.
+`server.journal.recorded_world` writes recordings.
 """
 
 import struct
@@ -44,23 +46,26 @@ from shared.states import STATES
 from shared.world import World
 
 MAGIC = b"\x89SNJ\r\n\x1a\n"
+"""First bytes of a recording."""
 VERSION = 3
+"""Newest version of the format."""
 UNCHECKED_HEAD = 2
-"""Up to this format no check is over the head of the file."""
+"""Newest version of the format in which no check covers the head of the file."""
 HASH_TICKS = 32
-"""A full hash so often, in ticks."""
+"""Ticks between two hashes of the whole world."""
 FRAME = struct.Struct("<III")
+"""Format of the numbers before the payload of a record."""
 
 PUT, REMOVE, FILL, LOAD, UNLOAD, WRITE, REBASE, NOTE = range(8)
 Call = list[Any]
 
 
 class JournalError(ValueError):
-    """A file that is not a recording this program can read; the message says where and why."""
+    """A file that this program cannot read as a recording. The message says where and why."""
 
 
 class DivergedError(JournalError):
-    """A replay is not what was recorded; `tick` is the first that differs."""
+    """A replay that differs from the recording. `tick` is the first tick that differs."""
 
     def __init__(self, tick: int, reason: str) -> None:
         super().__init__(f"tick {tick}: {reason}")
@@ -68,7 +73,10 @@ class DivergedError(JournalError):
 
 
 def mark(world: World) -> int:
-    """A check of the entities that the latest step changed: cheap, and names the very tick that differs."""
+    """Returns a checksum of the entities that the latest step changed.
+
+    It is cheap enough for every tick, so a replay finds the exact tick that differs.
+    """
     rows = world.changed
     states = rows[np.argsort(rows[:, ID]), :STATES]
     states[:, FLAGS] &= FALLING
@@ -76,38 +84,38 @@ def mark(world: World) -> int:
 
 
 class Moment(NamedTuple):
-    """One tick of a replay: the world (the same object throughout), after this tick, and what led to it."""
+    """One tick of a replay: the world after the tick (always the same object), and its inputs and calls."""
 
     world: World
     inputs: dict[int, Input]
-    """Those that differ from the tick before."""
+    """Inputs by entity that differ from the tick before."""
     calls: list[Call]
-    """What was done ahead of the step."""
+    """Calls before the step."""
     hashed: bool
-    """Whether the whole world has been compared, not just what the tick changed."""
+    """Whether the whole world was compared, and not only the entities that the tick changed."""
     ended: bool
-    """Whether this is not a tick, but the end of a recording that was ended on purpose."""
+    """Whether this is not a tick, but the end of a recording that was ended regularly."""
 
 
 class Recording:
     """A recording that is being read.
 
     Args:
-        file: opened for reading bytes.
-        compiled: as for `World`.
+        file: the file, opened for reading bytes.
+        compiled: whether the kernel is compiled, as for `World`.
 
     Raises:
-        JournalError: not a recording, of a newer format, or damaged.
+        JournalError: the file is not a recording, has a newer format, or is damaged.
     """
 
     def __init__(self, file: BinaryIO, *, compiled: bool | None = None) -> None:
         self._file = file
         self._chain = 0
         self.torn = 0
-        """Bytes of a last record that was never finished, once they have been reached."""
+        """Bytes of an incomplete last record, once the replay has reached it."""
         head = file.read(len(MAGIC) + 2)
         if head[: len(MAGIC)] != MAGIC[: len(head)] or not head:
-            raise JournalError("not a recording: it does not begin like one")
+            raise JournalError("not a recording: the first bytes are not those of one")
         if len(head) < len(MAGIC) + 2:
             raise JournalError("a recording that broke off before its start was written")
         (version,) = struct.unpack("<H", head[len(MAGIC) :])
@@ -123,13 +131,13 @@ class Recording:
         except (LookupError, TypeError, ValueError, OverflowError) as error:
             raise JournalError(f"its start state cannot be used ({error})") from error
         self.scene = self.world.scene
-        """The rules under which it was recorded."""
+        """Scene of the recorded world."""
 
     def __iter__(self) -> Iterator[Moment]:
-        """Goes through the ticks, comparing every one with what was recorded.
+        """Replays the ticks and compares each with the recording.
 
         Raises:
-            DivergedError: a tick came out otherwise.
+            DivergedError: a tick differs from the recording.
             JournalError: the file is damaged.
         """
         while (record := self._read()) is not None:
@@ -156,7 +164,7 @@ class Recording:
         return world
 
     def _read(self) -> list[Any] | None:
-        """The next record; None at the end, and where the rest is less than a record."""
+        """Returns the next record; None at the end, or if the last record is incomplete."""
         frame = self._file.read(FRAME.size)
         if len(frame) < FRAME.size:
             self.torn = len(frame)
@@ -180,23 +188,27 @@ class Recording:
 
 
 def replay(path: str | Path, *, compiled: bool | None = None) -> Iterator[Moment]:
-    """Replays a file tick by tick, comparing every one with what was recorded.
+    """Replays a recording tick by tick and compares each tick with it.
+
+    Args:
+        path: the file.
+        compiled: whether the kernel is compiled, as for `World`.
 
     Raises:
-        DivergedError: a tick came out otherwise.
-        JournalError: not a recording, of a newer format, or damaged.
-        OSError: it cannot be read.
+        DivergedError: a tick differs from the recording.
+        JournalError: the file is not a recording, has a newer format, or is damaged.
+        OSError: the file cannot be read.
     """
     with Path(path).open("rb") as file:
         yield from Recording(file, compiled=compiled)
 
 
 def redo(world: World, record: list[Any]) -> Moment:
-    """Does to a world what a record says, and compares.
+    """Repeats one recorded tick in a world and compares the result.
 
     Raises:
-        DivergedError: the tick came out otherwise.
-        LookupError, TypeError, ValueError, OverflowError: this is not what a record says.
+        DivergedError: the tick differs from the recording.
+        LookupError, TypeError, ValueError, OverflowError: the record is invalid.
     """
     inputs, calls, marked, *hashes = record
     for call in calls:
@@ -213,15 +225,15 @@ def redo(world: World, record: list[Any]) -> Moment:
 
 
 def has_hash(world: World, recorded: bytes) -> bool:
-    """Whether a world has a recorded hash, of today's kind or of the former one."""
+    """Returns whether a world has a recorded hash, of the present or the former kind."""
     return (former.state_hash(world) if len(recorded) == former.HASH_BYTES else world.state_hash()) == recorded
 
 
 def checked_states(scene: Scene, numbers: Int64s) -> Int64s:
-    """States from a file, [n, 12]: the kernel trusts its rows, and a file may be anybody's.
+    """Checks states from a file and returns them, [n, 12]. The kernel does not check its rows, and files may be forged.
 
     Raises:
-        ValueError: they are no states, or there is none like that in such a scene.
+        ValueError: the numbers are not states, or are not possible in the scene.
     """
     try:
         return states.checked_states(numbers.reshape(-1, STATES), len(scene.templates))
@@ -230,14 +242,18 @@ def checked_states(scene: Scene, numbers: Int64s) -> Int64s:
 
 
 def apply(world: World, call: Call) -> None:
-    """Does what a call did."""
+    """Repeats a recorded call in a world.
+
+    Raises:
+        ValueError: there is no such call.
+    """
     match call:
         case [int(op), *numbers] if op == PUT:
             world.write(checked_states(world.scene, np.array(numbers, np.int64)))
         case [int(op), entity] if op == REMOVE:
             world.remove(entity)
         case [int(op), x0, y0, z0, x1, y1, z1, kind, push] if op == FILL:
-            with suppress(SceneError):  # as it went then
+            with suppress(SceneError):  # it failed when it was recorded, too
                 world.fill((x0, y0, z0), (x1, y1, z1), kind, push=push)
         case [int(op), x, y, z, packed] if op == LOAD:
             cell = (x, y, z)

@@ -1,4 +1,4 @@
-"""A world as it was at the end of a tick, taken while it goes on, and a world from what was taken."""
+"""Checkpoints: copies a world at the end of a tick while the world goes on, and restores a world from such a copy."""
 
 import threading
 from collections.abc import Iterable, Iterator, Mapping
@@ -19,48 +19,48 @@ from shared.states import STATES
 from shared.world import World, hash_of
 
 Segment = tuple[int, int, int, bytes | None]
-"""Index of a loaded segment, and its packed blocks (None: as the generator makes them)."""
+"""Index of a loaded segment, and its packed blocks (None: as generated)."""
 
 
 class Known(NamedTuple):
-    """A segment as a checkpoint holds it: the version of its blocks in this process, and their digest."""
+    """The state of a segment in a checkpoint: the version of its blocks in this process, and their digest."""
 
     version: int
     digest: bytes
 
 
 Saved = Mapping[Cell, Known | None]
-"""The segments of the checkpoint before; None: it is not known what it holds of that one."""
+"""Segments of the last checkpoint; None: its content of the segment is not known."""
 
 
 class Checkpoint(NamedTuple):
-    """All of a world at the end of a tick, ready for the disk."""
+    """A whole world at the end of a tick, ready to be written."""
 
     tick: int
     next_id: int
     states: bytes
-    """n * 12 int64, little-endian, ascending by id."""
+    """States of all entities, n * 12 int64, little-endian, ascending by the entity's number."""
     hash: bytes
-    """`World.state_hash` at that tick."""
+    """State hash of the world at that tick (`World.state_hash`)."""
     kept: bytes
-    """What the game wanted kept, in MessagePack."""
+    """State of the game beside its world, in MessagePack."""
     segments: list[Segment]
-    """Those that are not as they were in the checkpoint before,"""
+    """Segments that differ from the last checkpoint."""
     gone: list[Cell]
-    """and those that were loaded then and are not any more."""
+    """Segments that were loaded in the last checkpoint and no longer are."""
 
 
 class Copy:
-    """Takes a world at this instant; the blocks follow piece by piece.
+    """A copy of a world at one moment, whose blocks are copied piece by piece later.
 
-    What the kernel writes to is copied at once: a row of 128 bytes per entity. Of the segments only the versions are
-    copied at once; `pieces` copies and packs those that were touched since the checkpoint before, one after the other,
-    in another thread. The world may go on meanwhile if it calls `touch` ahead of every change: then that segment is
-    copied just before.
+    The data that the kernel changes are copied at once: a row of 128 bytes per entity. Of the segments only the
+    versions are copied at once. `pieces` copies and packs the segments that were touched since the last checkpoint, one
+    by one, in another thread. The world may go on meanwhile if it calls `touch` before every change of a segment, which
+    copies that segment first.
 
     Args:
-        world: between two ticks.
-        kept: goes into the checkpoint as it is.
+        world: the world, between two ticks.
+        kept: state of the game beside its world, in MessagePack; it goes into the checkpoint unchanged.
     """
 
     def __init__(self, world: World, kept: bytes) -> None:
@@ -70,22 +70,22 @@ class Copy:
         self._rows = dict(blocks.rows)
         self._versions = blocks.versions[: blocks.count].copy()
         self.saved: dict[Cell, Known | None] = {}
-        """All segments as the checkpoint holds them, once `pieces` is done."""
+        """State of all segments in the checkpoint, complete when `pieces` is done."""
         self._blocks = blocks
-        self._lock = threading.Lock()  # held for the copying of one segment at most, some 5 us
-        self._taken: dict[Cell, Kinds | None] = {}  # None: it has been fetched, nobody needs it any more
+        self._lock = threading.Lock()  # held while one segment is copied, about 5 us
+        self._taken: dict[Cell, Kinds | None] = {}  # copied segments; None: already packed
 
     def touch(self, segment: Cell) -> None:
-        """The blocks of this segment are about to change."""
+        """Copies a segment whose blocks are about to change, if that is needed."""
         with self._lock:
             if segment in self._rows and segment not in self._taken:
                 self._taken[segment] = self._blocks.segment(segment).copy()
 
     def pieces(self, saved: Saved) -> Iterator[Checkpoint | None]:
-        """Does the work in pieces of a millisecond or so; yields None after each, and the checkpoint in the end.
+        """Makes the checkpoint in pieces of about a millisecond. Yields None after each, and the checkpoint at last.
 
         Args:
-            saved: the segments of the checkpoint before.
+            saved: the segments of the last checkpoint.
         """
         states = self._entities[:, :STATES]
         states = states[states[:, ID] != 0]
@@ -117,7 +117,7 @@ class Copy:
 
 
 def generated(scene: Scene, *, compiled: bool | None = None) -> tuple[RecordedWorld, Checkpoint]:
-    """A new world of a scene with all its terrain, and its checkpoint."""
+    """Returns a new world of a scene with all its terrain, and its checkpoint."""
     world = RecordedWorld(scene, compiled=compiled)
     world.load_terrain()
     segments: list[Segment] = [(*cell, None) for cell in world.blocks]
@@ -125,17 +125,17 @@ def generated(scene: Scene, *, compiled: bool | None = None) -> tuple[RecordedWo
 
 
 def restored(scene: Scene, checkpoint: Checkpoint, *, compiled: bool | None = None) -> RecordedWorld:
-    """The world of a checkpoint that holds all segments.
+    """Restores the world of a checkpoint that has all segments.
 
     Raises:
-        ValueError: what comes out is not what was saved.
+        ValueError: the hash of the result differs from the saved one.
     """
     loaded = {
         (x, y, z): terrain.generate(scene.terrain, (x, y, z)) if packed is None else unpack(packed)
         for x, y, z, packed in checkpoint.segments
     }
     states = checked_states(scene, np.frombuffer(checkpoint.states, "<i8").astype(np.int64))
-    if _hash(checkpoint, loaded, states) != checkpoint.hash:  # ahead of the kernel: it trusts its rows
+    if _hash(checkpoint, loaded, states) != checkpoint.hash:  # before the kernel gets them: it does not check its rows
         raise ValueError(f"the world of tick {checkpoint.tick} is not the one that was saved")
     world = RecordedWorld(scene, compiled=compiled)
     for cell, kinds in loaded.items():
@@ -147,13 +147,13 @@ def restored(scene: Scene, checkpoint: Checkpoint, *, compiled: bool | None = No
 
 
 def saved_of(world: World) -> dict[Cell, Known | None]:
-    """The segments of a world that is as its checkpoint, for the next one."""
+    """Returns the segments of a world that equals its checkpoint, as input for the next checkpoint."""
     blocks = world.blocks
     return {cell: Known(blocks.version(cell), blocks.digest(cell)) for cell in blocks}
 
 
 def _hash(checkpoint: Checkpoint, loaded: Mapping[Cell, Kinds], states: Int64s) -> bytes:
-    """The hash of what a checkpoint holds, of the kind that it has."""
+    """Returns the hash of the content of a checkpoint, of the same kind (present or former) as its own hash."""
     cells = np.array(list(loaded), np.int64).reshape(-1, 3)
     if len(checkpoint.hash) == former.HASH_BYTES:
         return former.hash_of(checkpoint.tick, cells, list(loaded.values()), states)
@@ -161,7 +161,7 @@ def _hash(checkpoint: Checkpoint, loaded: Mapping[Cell, Kinds], states: Int64s) 
 
 
 def _parts(saved: Saved) -> tuple[Int64s, npt.NDArray[np.uint8]]:
-    """Indices and digests of segments, as `hash_of` wants them."""
+    """Returns indices and digests of segments in the form that `hash_of` needs."""
     cells = np.array(list(saved), np.int64).reshape(-1, 3)
     return cells, _digests(known.digest for known in saved.values() if known is not None)
 
@@ -171,4 +171,4 @@ def _digests(digests: Iterable[bytes]) -> npt.NDArray[np.uint8]:
 
 
 NOTHING = b"\xc0"
-"""MessagePack's nil."""
+"""Encoding of nil in MessagePack."""

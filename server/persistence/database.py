@@ -1,14 +1,14 @@
-"""The file of a saved world, in SQLite: its schema, how one schema becomes the next, and what is refused.
+"""The database of a saved world, in SQLite: its schema, migrations, and checks.
 
-    world      one row: the newest checkpoint, without its blocks, and which game it is of (NULL: not known)
-    segment    every loaded segment as of that checkpoint; kinds is NULL where they are as the generator makes them
-    log        what each tick since then was told: the record that a recording has for it (`server.journal`)
+    world      one row: the newest checkpoint without its blocks, and the name of its game (NULL: unknown)
+    segment    every loaded segment at that checkpoint; kinds is NULL if the blocks are as generated
+    log        the record of each tick since then, as in a recording (`server.journal`)
 
-`chain` is the CRC-32 of a record, begun with the one before (the first one: with the checkpoint's), so no record can be
-lost, doubled or changed in between. That nothing is lost at the end is what `server.persistence.mark` and
-`server.persistence.wal` are for. `seal` is a BLAKE2b of the checkpoint's columns but for the states: those and the
-segments are what `hash`, the world's own, is about; and but for the game, which may get another name. While a server
-runs, anyone may read the file with SQLite.
+`chain` is the CRC-32 of a record, begun with the chain of the record before (the first one: with the checkpoint's). So
+no record can be lost, doubled or changed unnoticed, except at the end. `server.persistence.mark` and
+`server.persistence.wal` detect a loss at the end. `seal` is a BLAKE2b hash of the checkpoint's columns except for two:
+the states, because the world's own `hash` is over them and the segments; and the game, whose name may change. While a
+server runs, other programs may read the file with SQLite.
 """
 
 import contextlib
@@ -29,7 +29,7 @@ from shared.checks import Cell
 logger = logging.getLogger(__name__)
 
 APPLICATION_ID = 0x534E5731
-"""The bytes "SNW1" in the header of the file."""
+"""Identifier of the application in the header of the file: the bytes "SNW1"."""
 
 MIGRATIONS: list[tuple[str, ...]] = [
     (
@@ -44,7 +44,7 @@ MIGRATIONS: list[tuple[str, ...]] = [
         f"PRAGMA application_id = {APPLICATION_ID}",
     ),
     ("ALTER TABLE world ADD COLUMN game TEXT",),
-    (  # without the column `digest`; and `hash` is of another kind from here on, which its length tells
+    (  # drops the column `digest`; from here on `hash` is of another kind, which its length tells
         """CREATE TABLE segments (
             x INTEGER NOT NULL, y INTEGER NOT NULL, z INTEGER NOT NULL, kinds BLOB, PRIMARY KEY (x, y, z))""",
         "INSERT INTO segments SELECT x, y, z, kinds FROM segment",
@@ -52,15 +52,15 @@ MIGRATIONS: list[tuple[str, ...]] = [
         "ALTER TABLE segments RENAME TO segment",
     ),
 ]
-"""Entry n takes schema version n to n + 1; version 0 is an empty file."""
+"""Statements that migrate schema version n to n + 1, as entry n. Version 0 is an empty file."""
 
 
 class StoreError(ValueError):
-    """Saved data that cannot be used; the message names the file and says what to do. The file is as it was."""
+    """Saved data that cannot be used. The message names the file and the remedy. The file has not been changed."""
 
 
 class Record(NamedTuple):
-    """What a tick was told, as it lies in the log."""
+    """One row of the log: a tick, its packed record, and the chain after it."""
 
     tick: int
     record: bytes
@@ -68,12 +68,17 @@ class Record(NamedTuple):
 
 
 def chained(record: bytes, chain: int) -> int:
-    """The chain after a record."""
+    """Returns the chain after a record.
+
+    Args:
+        record: the record.
+        chain: the chain before it.
+    """
     return zlib.crc32(record, chain)
 
 
 def damaged(path: Path, reason: object) -> StoreError:
-    """The error of a file that is not as it was written."""
+    """Returns the error for a file whose content is not as it was written."""
     return StoreError(
         f"{path}: damaged ({reason}). It has been left as it is: put a backup of its directory in its place, or move "
         "it away to begin a new world"
@@ -81,7 +86,7 @@ def damaged(path: Path, reason: object) -> StoreError:
 
 
 class Saved(NamedTuple):
-    """What a file holds."""
+    """The content of a file."""
 
     checkpoint: Checkpoint
     scene: bytes
@@ -91,15 +96,15 @@ class Saved(NamedTuple):
 
 
 def mark_of(path: Path) -> Path:
-    """The file with the mark of a world's file."""
+    """Returns the path of the mark that belongs to a database."""
     return path.with_suffix(".mark")
 
 
 def version_of(path: Path) -> int:
-    """The schema version of a file; 0 if there is nothing in it.
+    """Returns the schema version of a file after a check for damage; 0 if it does not exist or is empty.
 
     Raises:
-        StoreError: it is not a saved world, of a newer version, or damaged.
+        StoreError: the file is not a saved world, has a newer version, or is damaged.
     """
     for beside in (path.with_name(path.name + "-wal"), mark_of(path)):
         if beside.exists() and not (path.exists() and path.stat().st_size):
@@ -117,8 +122,8 @@ def version_of(path: Path) -> int:
             raise StoreError(f"{path}: not a saved world, but another SQLite file. It has been left as it is")
         if not 1 <= version <= len(MIGRATIONS):
             raise StoreError(
-                f"{path}: in schema version {version}, and this program knows those up to {len(MIGRATIONS)}. It has "
-                "been left as it is: use the program that wrote it, or a newer one"
+                f"{path}: has schema version {version}, but this program supports versions up to {len(MIGRATIONS)}. It "
+                "has been left as it is: use the program that wrote it, or a newer one"
             )
         (found,) = connection.execute("PRAGMA quick_check(1)").fetchone()
         if found != "ok":
@@ -130,10 +135,10 @@ def version_of(path: Path) -> int:
 
 
 def read(path: Path) -> Saved | None:
-    """All that a file of the newest version holds; None if there is no world in it yet. Nothing is written.
+    """Reads a file of the newest schema version. Returns None if it has no world yet. Writes nothing.
 
     Raises:
-        StoreError: it is damaged.
+        StoreError: the file is damaged.
     """
     with _reading(path) as connection:
         columns = "tick, next_id, states, hash, kept, chain, scene, seal, game"
@@ -159,13 +164,14 @@ def read(path: Path) -> Saved | None:
 
 
 class Database:
-    """A file that is open for writing; it is made if it is not there, and brought to the newest version if it is older.
+    """A database that is open for writing. It is created if it does not exist, and migrated if it is older.
 
     Args:
-        power: what has been written survives a power cut, too (one fsync per transaction), not just the process's end.
+        path: the file.
+        power: whether transactions survive a power cut (by one fsync each), or only the end of the process.
 
     Raises:
-        sqlite3.Error: it cannot be written. So do all methods; then it has to be opened anew.
+        sqlite3.Error: the file cannot be written. All methods raise it, too; after that, open the file again.
     """
 
     def __init__(self, path: Path, *, power: bool = True) -> None:
@@ -183,22 +189,29 @@ class Database:
             raise
 
     def seal(self) -> bytes:
-        """The seal of the checkpoint; empty if there is none."""
+        """Returns the seal of the checkpoint; empty if there is none."""
         row = self._connection.execute("SELECT seal FROM world").fetchone()
         return b"" if row is None else bytes(row[0])
 
     def segments(self) -> list[Cell]:
-        """The index of every segment that is saved."""
+        """Returns the indices of all saved segments."""
         return self._connection.execute("SELECT x, y, z FROM segment").fetchall()
 
     def append(self, records: Sequence[Record]) -> None:
-        """Adds to the log, all or nothing."""
+        """Adds records to the log in one transaction."""
         with self._transaction():
             self._connection.executemany("INSERT INTO log VALUES (?, ?, ?)", records)
         self._mark.write(records[-1].tick, records[-1].chain)
 
     def save(self, checkpoint: Checkpoint, scene: bytes, chain: int, game: str) -> None:
-        """Replaces the checkpoint, and drops the log up to it, all or nothing."""
+        """Replaces the checkpoint and drops the log up to its tick, in one transaction.
+
+        Args:
+            checkpoint: the checkpoint.
+            scene: the packed table of the scene.
+            chain: the chain at the checkpoint's tick.
+            game: the name of the game.
+        """
         seal = seal_of(checkpoint, scene, chain)
         with self._transaction():
             self._connection.execute(
@@ -210,11 +223,11 @@ class Database:
             self._connection.execute("DELETE FROM log WHERE tick <= ?", (checkpoint.tick,))
             newest = self._connection.execute("SELECT tick, chain FROM log ORDER BY tick DESC LIMIT 1").fetchone()
         self._mark.write(*(newest or (checkpoint.tick, chain)))
-        # The -wal file is emptied: it does not grow on, and the other file is whole without it. A reader puts that off.
+        # Empties the -wal file: it does not grow, and the database is complete without it. A reader delays this.
         self._connection.execute("PRAGMA wal_checkpoint(TRUNCATE)").fetchone()
 
     def close(self) -> None:
-        """Closes it; what has been written, is."""
+        """Closes the file. All finished transactions stay."""
         self._mark.close()
         with contextlib.suppress(sqlite3.Error):
             self._connection.close()
@@ -230,17 +243,17 @@ class Database:
             yield
             self._connection.execute("COMMIT")
         except BaseException:
-            if self._connection.in_transaction:  # SQLite ends some by itself
+            if self._connection.in_transaction:  # SQLite itself ends the transaction after some errors
                 with contextlib.suppress(sqlite3.Error):
                     self._connection.execute("ROLLBACK")
             raise
 
 
 def _promised(path: Path) -> Mark | None:
-    """The mark beside a file; None if there is none.
+    """Returns the mark beside a database; None if there is none.
 
     Raises:
-        StoreError: it cannot be read, or holds nothing.
+        StoreError: the mark cannot be read, or is damaged.
     """
     beside = mark_of(path)
     try:
@@ -252,23 +265,27 @@ def _promised(path: Path) -> Mark | None:
 
 
 def _check_end(path: Path, saved: Saved) -> None:
-    """Raises `StoreError` if a file does not hold what its mark has promised."""
+    """Checks that the log of a file reaches as far as its mark.
+
+    Raises:
+        StoreError: the log has lost its end, although the mark rules out a power cut as the cause.
+    """
     promised = _promised(path)
     if promised is None:
-        logger.warning("%s: has no %s, so nobody can tell whether its end is missing", path, mark_of(path).name)
+        logger.warning("%s: has no %s, so a missing end of it cannot be detected", path, mark_of(path).name)
         return
     chains = {record.tick: record.chain for record in saved.log} | {saved.checkpoint.tick: saved.chain}
     reason = promised.against(max(chains), chains)
     if reason and promised.binding:
         raise damaged(path, f"{reason} by {mark_of(path).name}")
     if reason:
-        logger.warning("%s: %s; the machine was started anew since, and durability was 'process'", path, reason)
+        logger.warning("%s: %s; the machine was restarted since, and durability was 'process'", path, reason)
 
 
 @contextlib.contextmanager
 def _reading(path: Path) -> Iterator[sqlite3.Connection]:
-    """A connection that changes neither the file nor what is in its -wal, and sees one state of it throughout."""
-    # Without a -wal the file is all there is; not told so, SQLite would make one.
+    """Opens a connection that changes neither the file nor its -wal, and sees the same state throughout."""
+    # Without a -wal the file is complete; without `immutable` SQLite would create a -wal.
     beside = path.with_name(path.name + "-wal")
     how = "mode=ro" if beside.exists() and beside.stat().st_size else "mode=ro&immutable=1"
     try:
@@ -279,15 +296,15 @@ def _reading(path: Path) -> Iterator[sqlite3.Connection]:
     except StoreError:
         raise
     except sqlite3.OperationalError as error:
-        if error.sqlite_errorcode == sqlite3.SQLITE_ERROR:  # no such table, or column
+        if error.sqlite_errorcode == sqlite3.SQLITE_ERROR:  # there is no such table or column
             raise damaged(path, error) from error
-        raise StoreError(f"{path}: cannot be read ({error}). Look to the disk, and to who may read the file") from error
-    except (sqlite3.Error, TypeError, ValueError, struct.error) as error:  # a column of another type, or no UTF-8
+        raise StoreError(f"{path}: cannot be read ({error}). Check the disk and the file's permissions") from error
+    except (sqlite3.Error, TypeError, ValueError, struct.error) as error:  # a column of another type, or not UTF-8
         raise damaged(path, error) from error
 
 
 def seal_of(checkpoint: Checkpoint, scene: bytes, chain: int) -> bytes:
-    """The seal of a checkpoint, of the rules it was made under and of the chain at its tick."""
+    """Returns the seal: a hash of a checkpoint, of the packed scene and of the chain at the checkpoint's tick."""
     digest = hashlib.blake2b(struct.pack("<qqQ", checkpoint.tick, checkpoint.next_id, chain), digest_size=16)
     for part in (checkpoint.hash, checkpoint.kept, scene):
         digest.update(struct.pack("<Q", len(part)))

@@ -1,14 +1,15 @@
-"""A note of how much of a saved world has been acknowledged: `world.mark`, a small file beside the database.
+"""The mark: a small file beside the database, `world.mark`, with the tick up to which a world has been saved.
 
-SQLite opens a file whose -wal is damaged without a word: it takes what comes before the damage for all there is. That
-is right after a crash, which leaves a transaction half written. It is wrong when a byte of a finished one has changed,
-or the end of the file is gone. Only a note that was made after the transaction was on disk can tell the two apart.
+SQLite opens a database whose -wal file is damaged without an error and ignores everything from the damage on. That is
+right after a crash, which leaves an incomplete transaction. It is wrong if a byte of a complete transaction has
+changed, or if the end of the file is missing. Only a note that was written after the transaction can tell these cases
+apart.
 
-The note names the newest tick of the log and the chain there (`server.persistence.database`). It is written after each
-transaction and before anything in it is acknowledged, without an fsync of its own: after the end of the process it is
-complete, and after a power cut it may be older, never newer, than what SQLite had synchronised. A log that ends before
+The mark has the newest tick of the log and the chain there (`server.persistence.database`). It is written after each
+transaction and before anything in it is acknowledged, without an fsync of its own. After the end of the process it is
+complete. After a power cut it may be older than what SQLite had synchronised, but not newer. So a log that ends before
 the mark has lost something that was promised. One exception: with `--durability process` SQLite does not synchronise,
-so after a power cut the mark may well be newer than the log. `boot` tells that the machine was started anew since.
+so after a power cut the mark may be newer than the log. `boot` tells whether the machine was restarted since.
 
 file   2 slots, 512 bytes apart, written in turn: a torn write spoils one of them
 slot   8 bytes "SNWMARK1"   u64 number (the higher one is newer)   i64 tick   u32 chain   u8 power
@@ -24,16 +25,19 @@ from pathlib import Path
 from typing import NamedTuple
 
 MAGIC = b"SNWMARK1"
+"""First bytes of a slot."""
 SLOT = struct.Struct("<8sQqIB16s")
+"""Format of a slot without its check."""
 CHECK = struct.Struct("<I")
+"""Format of the check of a slot."""
 APART = 512
-"""Bytes from one slot to the next: the size of a sector, which a disk writes whole."""
+"""Bytes from one slot to the next: the size of a sector, which a disk writes as a whole."""
 UNKNOWN = bytes(16)
-"""Stands for the boot where the system does not tell."""
+"""Identifier of the boot if the system has none."""
 
 
 class Mark(NamedTuple):
-    """One note: in the log, `tick` has this chain."""
+    """A mark: the log had reached `tick`, with this chain."""
 
     number: int
     tick: int
@@ -43,15 +47,15 @@ class Mark(NamedTuple):
 
     @property
     def binding(self) -> bool:
-        """Whether a log that ends before the mark is damaged; else a power cut may have cost its end."""
+        """Whether a log that ends before the mark is damaged. Otherwise a power cut may have removed its end."""
         return self.power or self.boot == boot() != UNKNOWN
 
     def against(self, end: int, chains: Mapping[int, int]) -> str:
-        """Says what is wrong with a log; empty if nothing is.
+        """Returns what is wrong with a log; empty if it agrees with the mark.
 
         Args:
-            end: its newest tick.
-            chains: the chain of each of its ticks.
+            end: the newest tick of the log.
+            chains: the chain of each tick of the log.
         """
         if self.tick > end:
             return f"it ends with tick {end}, and was promised to hold tick {self.tick}"
@@ -61,14 +65,14 @@ class Mark(NamedTuple):
 
 
 class MarkFile:
-    """A mark that is open for writing; the file is made with the first note.
+    """A mark that is open for writing. The first `write` creates the file.
 
     Args:
-        path: of the file.
-        power: whether transactions are synchronised before their note is made.
+        path: the file.
+        power: whether transactions are synchronised before the mark is written.
 
     Raises:
-        OSError: it cannot be written. So does `write`.
+        OSError: the file cannot be written (also raised by `write`).
     """
 
     def __init__(self, path: Path, *, power: bool) -> None:
@@ -77,7 +81,7 @@ class MarkFile:
         self._number = 0
 
     def write(self, tick: int, chain: int) -> None:
-        """Notes that all up to the end of `tick` is on disk."""
+        """Writes that everything up to the end of `tick` is on disk."""
         if self._file is None:
             self._open(tick, chain)
             return
@@ -90,7 +94,7 @@ class MarkFile:
             os.write(self._file, data)
 
     def close(self) -> None:
-        """Lets go of the file."""
+        """Closes the file."""
         if self._file is not None:
             os.close(self._file)
             self._file = None
@@ -100,7 +104,7 @@ class MarkFile:
         return note + CHECK.pack(zlib.crc32(note))
 
     def _open(self, tick: int, chain: int) -> None:
-        """Opens the file with its first note in it. It is made under another name, so that it is never empty."""
+        """Creates the file with its first slot, under another name first, so that it is never empty."""
         before = None
         with contextlib.suppress(ValueError):
             before = read(self._path)
@@ -115,11 +119,11 @@ class MarkFile:
 
 
 def read(path: Path) -> Mark | None:
-    """The newest note in a file; None if there is no file.
+    """Returns the newest mark in a file; None if there is no file.
 
     Raises:
-        ValueError: the file holds none.
-        OSError: it cannot be read.
+        ValueError: the file has no valid mark.
+        OSError: the file cannot be read.
     """
     try:
         data = path.read_bytes()

@@ -1,4 +1,4 @@
-"""The way back: from a directory to the world that was saved in it."""
+"""Restoring: loads the world that was saved in a directory, or makes a new one."""
 
 import logging
 import sys
@@ -19,61 +19,69 @@ logger = logging.getLogger(__name__)
 
 
 class Note(NamedTuple):
-    """What `RecordedWorld.note` was told ahead of tick `tick`."""
+    """A value that was passed to `RecordedWorld.note` before the step of tick `tick`."""
 
     tick: int
     value: Any
 
 
 class Loaded(NamedTuple):
-    """What was found, or made."""
+    """A restored or new world."""
 
     world: RecordedWorld
     kept: Any
-    """What belongs to the checkpoint and is not in the world; None for a new one."""
+    """State beside the world that the checkpoint has; None for a new world."""
     notes: list[Note]
-    """Those since the checkpoint, in order."""
+    """Notes since the checkpoint, in order."""
     checkpoint_tick: int
     chain: int
+    """Chain after the last record of the log."""
     log_bytes: int
+    """Size of the log in bytes."""
     saved: dict[Cell, Known | None]
-    """The segments of the checkpoint."""
+    """Segments of the checkpoint."""
 
 
 def load(path: Path, scene: Scene, game: str = "", *, compiled: bool | None = None) -> Loaded:
-    """The world that was saved, checkpoint and log, each tick compared; or a new one, which is saved at once.
+    """Restores a world from its checkpoint and its log, comparing each tick, or makes and saves a new one.
+
+    Args:
+        path: the database.
+        scene: the scene; it must be the one with which the world was saved.
+        game: the name of the game, which must be the same, too; empty: none.
+        compiled: whether the kernel is compiled, as for `World`.
 
     Raises:
-        StoreError: what is there cannot be used; it has been left as it is.
-        sqlite3.Error: it cannot be written.
+        StoreError: the saved world cannot be used. It has not been changed.
+        sqlite3.Error: the file cannot be written.
     """
     version = database.version_of(path)
     if 0 < version < len(database.MIGRATIONS):
         Database(path).close()
-        logger.info("%s: brought from schema version %d to %d", path, version, len(database.MIGRATIONS))
+        logger.info("%s: migrated from schema version %d to %d", path, version, len(database.MIGRATIONS))
     saved = database.read(path) if version else None
     if saved is None:
         return _new(path, scene, game, compiled)
     if saved.game is not None and saved.game != game:
         raise StoreError(
-            f"{path}: was saved by {_served(saved.game)}, and this is {_served(game)}. Serve the same, or give another "
-            "directory"
+            f"{path}: was saved by {_served(saved.game)}, and this is {_served(game)}. Start the same game, or use "
+            "another directory"
         )
     try:
         theirs = Scene.from_table(msgpack.unpackb(saved.scene, strict_map_key=False)).digests
         differ = sorted(name for name in theirs | scene.digests if theirs.get(name) != scene.digests.get(name))
         if differ:
             raise StoreError(
-                f"{path}: was saved under other rules (another {', '.join(differ)}). Start with the scene that it was "
-                "saved with, or give another directory"
+                f"{path}: was saved with another scene (different: {', '.join(differ)}). Start with the scene that it "
+                "was saved with, or use another directory"
             )
         return _replayed(scene, saved, compiled)
     except StoreError:
         raise
     except DivergedError as error:
         raise StoreError(
-            f"{path}: replayed otherwise than it was played ({error}). Start it with the version of this program that "
-            "wrote it and stop it once: then there is nothing to replay"
+            f"{path}: the replay of its log gives another world than was saved ({error}). Start it once with the "
+            "version of this program that wrote it, and stop that: then there is nothing to replay"
         ) from error
     except (LookupError, TypeError, ValueError, OverflowError) as error:
         raise database.damaged(path, error) from error
@@ -95,10 +103,10 @@ def _new(path: Path, scene: Scene, game: str, compiled: bool | None) -> Loaded:
 
 def _replayed(scene: Scene, saved: Saved, compiled: bool | None) -> Loaded:
     world = checkpoint.restored(scene, saved.checkpoint, compiled=compiled)
-    known = checkpoint.saved_of(world)  # ahead of the log: what it touches belongs into the next checkpoint
+    known = checkpoint.saved_of(world)  # before the log, because segments that it touches go into the next checkpoint
     notes: list[Note] = []
     chain = saved.chain
-    for tick, record, chain in saved.log:  # noqa: B007 - the last one is what goes on
+    for tick, record, chain in saved.log:  # noqa: B007 - the last chain is used below
         moment = redo(world, msgpack.unpackb(record))
         if world.tick != tick:
             raise ValueError(f"tick {world.tick} is in the log as tick {tick}")
@@ -110,10 +118,10 @@ def _replayed(scene: Scene, saved: Saved, compiled: bool | None) -> Loaded:
 
 
 def claimed(directory: Path) -> BinaryIO:
-    """A directory for this process alone, until the file that is returned is closed or the process ends, however.
+    """Reserves a directory for this process. Returns a lock file; closing it, or the end of the process, releases it.
 
     Raises:
-        StoreError: another process has it, or it cannot be used.
+        StoreError: another process has the directory, or it cannot be used.
     """
     try:
         directory.mkdir(parents=True, exist_ok=True)

@@ -1,35 +1,38 @@
-"""A world that outlives its process: `--data DIR`.
+"""The store: saves a world in a directory, so that it outlives the process (`--data DIR`).
 
-Theory of operation. The physics is deterministic, so a world is its last checkpoint and what it has been told since. A
-store is a pen on the world (`server.journal.recorded_world`): after every step it has the record of that tick, the same
-bytes that a recording would hold, and hands it to a thread of its own. That thread puts what has come since its last
-transaction into the next one (group commit), so there is never more than one fsync under way, and a slow disk makes the
-groups larger, not the ticks longer. `durable_tick` is the newest tick that is on disk. The game holds back until then
-what it promises: the verdict on a command, and the welcome with the token to come back with. A client that was told
-"done" finds it done after any crash. What others see of it in their snapshots meanwhile is news, not a promise.
-`server.persistence.restore` puts the world together again: checkpoint, then every record, each compared with the marks
-and hashes in it; it is the same world at the same tick, or an error. `server.persistence.mark` knows how far the log
-must reach. What belongs to the game and is not in the world goes the same way: `keep` for the checkpoint,
+Theory of operation. The physics is deterministic, so a world is its last checkpoint plus the inputs and calls since. A
+store observes the world as a pen (`server.journal.recorded_world`). After every step it gets the record of that tick,
+with the same bytes as in a recording, and passes it to a thread of its own. The thread writes all records that came
+since its last transaction in one transaction (group commit). So there is never more than one fsync under way, and a
+slow disk makes the groups larger, but not the ticks longer.
+
+`durable_tick` is the newest tick that is on disk. Until then the game holds back its promises: the verdict of a
+command, and the welcome with the resume token. If a client received "done", the command is done after any crash.
+Snapshots are not held back, so other clients may see a change before it is durable.
+
+`server.persistence.restore` restores a world from the checkpoint and every record after it, and compares the marks and
+hashes in them. The result is the same world at the same tick, or an error. `server.persistence.mark` knows how far the
+log must reach. The state of the game beside its world is saved in the same way: by `keep` for the checkpoint, and by
 `RecordedWorld.note` for the log.
 
-A tick in which nothing was told, nothing moved and nothing changed is quiet. Quiet ticks are written once a second; the
-loss of some is the loss of nothing, so they count as durable as soon as everything before them is.
+A tick without inputs, calls and changes is quiet. Quiet ticks are written once per second. Losing them loses nothing,
+so they count as durable as soon as everything before them is.
 
-Every `checkpoint_s` seconds the world is copied (`server.persistence.checkpoint`: entities at once, the segments
-touched since the checkpoint before piece by piece and in the thread), packed between the transactions of the log, and
-saved in one transaction, which also drops the log up to there. Until it is complete the old checkpoint and its log are.
-The ticks wait for none of it.
+Every `checkpoint_s` seconds the world is copied (`server.persistence.checkpoint`): entities at once, segments that were
+touched since the last checkpoint one by one in the thread. The copy is packed between the transactions of the log and
+saved in one transaction, which also drops the log up to its tick. Until that is complete, the old checkpoint and its
+log stay valid. The ticks wait for none of this.
 
-A checkpoint that fails by a fault of our own is reported, counted and tried again; the log goes on meanwhile. When the
-disk takes no more, or does not keep up by more than `BEHIND_S`, there is a gap: `trouble` says why, records are
-dropped, and the game refuses commands (`messages.UNSAVED`) while players move on. What was told "done" before is on
-disk; what was carried out and not yet answered stays unanswered. Then the file is opened anew and a fresh checkpoint
-tried, again and again. With it everything is saved, the unanswered too, and the gap is closed.
+If a checkpoint fails by a fault of our own, that is logged, counted and tried again, and the log goes on. If the disk
+accepts nothing, or is more than `BEHIND_S` behind, a gap begins: `trouble` has the reason, records are dropped, and the
+game refuses commands (`messages.UNSAVED`) while players can still move. Commands that were answered with "done" before
+are on disk; commands that were carried out and not answered stay unanswered. Then the thread reopens the file and saves
+a new checkpoint, and repeats this until it works. That saves everything, the unanswered commands too, and ends the gap.
 
-Rejected: a transaction in the tick (a disk's hiccup would be everybody's); a log of states instead of inputs (a hundred
-times the bytes); a file per segment (no transaction spans them); a copy of the world by fork (threads, and Windows);
-one replica that replays the log in the thread (twice the CPU, all the time). Not promised: that ticks which clients
-have seen in snapshots, and got no verdict for, survive; those that the next transaction would have held are lost.
+Rejected: a transaction in the tick (a slow disk would delay every client); a log of states instead of inputs (100 times
+the bytes); a file per segment (no transaction spans several files); a copy of the world by fork (not with threads, not
+on Windows); a replica that replays the log in the thread (twice the CPU time, always). Not promised: ticks that clients
+saw in snapshots without a verdict. A crash loses those that the next transaction would have saved.
 """
 
 import logging
@@ -54,46 +57,46 @@ from shared.scene import Scene
 from shared.world import World
 
 LOG_BYTES_MAX = 32 << 20
-"""A log that has grown to this is cut by a checkpoint ahead of time."""
+"""Size of the log in bytes that triggers a checkpoint ahead of time."""
 HASHED_MAX = 1000
-"""In larger worlds, whole hashes are left to the checkpoints: no tick should pay for one."""
+"""Number of entities up to which ticks have hashes of the whole world. In larger worlds only checkpoints have them."""
 STALE_MAX = 16
-"""So are those of worlds in which more segments wait for their digests, 40 us each."""
+"""Number of segments without a present digest up to which a tick gets a hash; each would take 40 us."""
 QUIET_S = 1.0
-"""Ticks in which nothing happened wait so long for company."""
+"""Seconds that quiet ticks may wait to be written."""
 BEHIND_S = 10.0
-"""The disk may be so far behind the world before its records are dropped."""
+"""Seconds that the disk may be behind the world before records are dropped."""
 RETRY_S = 2.0
-"""After a failure the next attempt waits so long, twice as long after each further one,"""
+"""Seconds until the next attempt after a failure. The time doubles with each further failure."""
 RETRY_MAX_S = 30.0
-"""but no longer than this: a disk that stays full should not fill with lines of the log, either."""
+"""Maximum time between two attempts, in seconds; long, so that a disk that stays full gets few log lines."""
 GAME_MAX = 1024
-"""The longest name of a game, in characters."""
+"""Maximum length of the name of a game, in characters."""
 CLOSE_S = 2.5
-"""The end waits so long for the disk."""
+"""Seconds that the shutdown waits for the disk."""
 
 logger = logging.getLogger(__name__)
 
 
 class Store(Pen):
-    """A directory with a world in it.
+    """A directory with a saved world.
 
     Args:
-        directory: made if it is not there.
-        scene: the rules; they must be those that the world was saved with.
-        game: so must the game be, MODULE:CLASS; empty: none.
-        power: whether a verdict waits until it survives a power cut (an fsync), or just the end of the process.
-        checkpoint_s: a checkpoint so often, in seconds of the world's time.
-        compiled: as for `World`.
+        directory: the directory; it is created if it does not exist.
+        scene: the scene; it must be the one with which the world was saved.
+        game: the name of the game, MODULE:CLASS, or empty; it must be the one with which the world was saved.
+        power: whether a durable tick survives a power cut (by an fsync), or only the end of the process.
+        checkpoint_s: seconds of the world's time between two checkpoints.
+        compiled: whether the kernel is compiled, as for `World`.
 
     Attributes:
-        world: the one that was saved, or a new one.
-        kept: what `keep` returned for its checkpoint; None for a new world.
-        notes: what has been noted since then, in order.
+        world: the saved world, or a new one.
+        kept: the result of `keep` for the checkpoint; None for a new world.
+        notes: notes since the checkpoint, in order.
 
     Raises:
-        SceneError: the game's name is no text that UTF-8 can hold.
-        StoreError: what is there cannot be used, by this program or now; nothing has been changed.
+        SceneError: the name of the game is too long, or UTF-8 cannot encode it.
+        StoreError: the directory or the world in it cannot be used. Nothing has been changed.
     """
 
     def __init__(
@@ -111,21 +114,21 @@ class Store(Pen):
         self._path = Path(directory) / "world.db"
         self._rules, self._game = msgpack.packb(scene.to_table()), game
         self.faults = Faults("the store has failed")
-        """Exceptions of our own, by what has been given up because of them."""
+        """Exceptions in our own code."""
         self.checkpoints_failed = 0
         self._power = power
         self._checkpoint_ticks = max(1, round(checkpoint_s * scene.tick_rate))
         self.trouble = ""
-        """Why nothing can be saved just now, in one line; empty if all is well."""
+        """Reason why nothing can be saved at the moment, in one line; empty: saving works."""
         self.commit_s, self.checkpoint_s = Histogram(), Histogram()
-        """How long it took from the end of a step until its record was on disk, and a checkpoint."""
-        # The thread's own:
+        """Durations from the end of a step until its record was on disk, and durations of checkpoints."""
+        # Used by the thread only:
         self._chain_there = 0
         self._retry_s = RETRY_S
         self._copying: Copy | None = None
         self._pieces: Iterator[Checkpoint | None] = iter(())
         self._began = 0.0
-        # Between the loop and the thread, under its lock:
+        # Shared by the event loop and the thread, guarded by the lock of `_wake`:
         self._wake = threading.Condition()
         self._records: list[tuple[int, bytes, float]] = []
         self._copy: Copy | None = None
@@ -146,7 +149,7 @@ class Store(Pen):
         self.notes: Sequence[tuple[int, Any]] = loaded.notes
         self._chain, self._log_bytes, self._copied = loaded.chain, loaded.log_bytes, loaded.checkpoint_tick
         self.restored = (self.world.tick, self.world.state_hash().hex())
-        """The tick and the state hash of the world that was found, or of the new one."""
+        """Tick and state hash of the restored or new world."""
         self._tick = self._loud = self._written = self._not_before = self.world.tick
         self._keep: Callable[[], Any] = lambda: None
         self._thread = threading.Thread(target=self._run, name="store", daemon=True)
@@ -155,18 +158,18 @@ class Store(Pen):
     # -- the loop's side -------------------------------------------------------------------------------------
 
     def start(self, keep: Callable[[], Any]) -> None:
-        """Begins to write. What has happened to the world since it was loaded belongs to the first tick.
+        """Starts to write. Changes of the world since it was loaded belong to the first tick.
 
         Args:
-            keep: what belongs to the world and is not in it, for a checkpoint: anything that MessagePack can hold. It
-                is called at the end of a step, when all that was noted so far belongs to that tick.
+            keep: returns the state beside the world for a checkpoint, as a MessagePack value. It is called at the end
+                of a step, when all notes so far belong to that tick.
         """
         self._keep = keep
         self._thread.start()
 
     @property
     def durable_tick(self) -> int:
-        """The newest tick with nothing before it that a crash could undo."""
+        """Newest tick that a crash cannot undo."""
         return self._tick if self._written >= self._loud else self._written
 
     @property
@@ -184,14 +187,14 @@ class Store(Pen):
         try:
             parts = self.taken(world, inputs)
             record, loud = msgpack.packb(parts), any(parts[:3])
-        except Exception:  # the tick goes on: what it was told is as good as on a disk that takes nothing
+        except Exception:  # the tick goes on, as with a disk that accepts nothing
             self.faults.report("the record of a tick")
             with self._wake:
                 self._tick = self._loud = tick
                 self._drop("internal error")
             return
         due = self._copy_due or tick - self._copied >= self._checkpoint_ticks
-        if self._gap:  # not before the file is opened anew: the log must not go on behind a gap
+        if self._gap:  # not before the file is reopened, because the log must not go on behind a gap
             due = self._reopening
         copy = self._copied_world() if self._copy is None and due and tick >= self._not_before else None
         with self._wake:
@@ -209,29 +212,29 @@ class Store(Pen):
                 self._wake.notify()
 
     def close(self) -> bool:
-        """Saves all that there is, and lets go of the directory; whether that worked."""
+        """Saves everything and releases the directory. Returns whether everything was saved."""
         self.world.detach(self)
         if self._thread.is_alive():
-            copy = self._copied_world()  # if that fails, the log has all that there is
+            copy = self._copied_world()  # if that fails, the log has everything
             with self._wake:
                 self._copy = copy
                 self._closing = self._urgent = True
                 self._wake.notify()
             self._thread.join(CLOSE_S)
             if self._thread.is_alive():
-                logger.error("the disk does not answer: what happened since tick %d may be lost", self._written)
+                logger.error("the disk does not respond: changes since tick %d may be lost", self._written)
                 return False
         elif self._file is not None:
             self._file.close()
         self._claim.close()
         if self.trouble:
             logger.error(
-                "the end could not be saved: %s; what happened since tick %d is lost", self.trouble, self._written
+                "the last changes could not be saved: %s; changes since tick %d are lost", self.trouble, self._written
             )
         return not self.trouble
 
     def stats(self) -> dict[str, Any]:
-        """What `/stats` shows."""
+        """Returns the figures of the store for `/stats`."""
         return {
             "save_trouble": self.trouble,
             "restored_tick": self.restored[0],
@@ -246,7 +249,7 @@ class Store(Pen):
         }
 
     def _copied_world(self) -> Copy | None:
-        """A copy of the world for a checkpoint; None if that failed, which is counted, and tried again later."""
+        """Returns a copy of the world for a checkpoint; None if that failed, which is counted and tried again."""
         try:
             return Copy(self.world, msgpack.packb(self._keep()))
         except Exception:
@@ -254,7 +257,7 @@ class Store(Pen):
             return None
 
     def _checkpoint_failed(self) -> None:
-        """An exception of ours has hit a checkpoint: the log goes on, and another attempt follows."""
+        """Counts a checkpoint that failed by an exception of ours, and schedules another attempt."""
         self.faults.report("a checkpoint")
         self.checkpoints_failed += 1
         self._copy_due = True
@@ -281,7 +284,7 @@ class Store(Pen):
             self._file.close()
 
     def _write_on(self, file: Database) -> None:
-        """Writes what has come, and packs a piece of the checkpoint that is being made."""
+        """Writes the records that have come, and packs one piece of the checkpoint that is being made."""
         with self._wake:
             if self._copy is None:
                 self._wake.wait_for(lambda: self._urgent, QUIET_S)
@@ -304,14 +307,20 @@ class Store(Pen):
             except (sqlite3.Error, OSError):
                 raise
             except Exception:
-                if self.trouble:  # it was to close a gap, behind which the log must not go on
+                if self.trouble:  # the checkpoint was to end a gap; without it the log must not go on
                     raise
                 with self._wake:
                     self._checkpoint_failed()
                     self._copy = None if self._copy is copy else self._copy
 
     def _append(self, file: Database, records: list[tuple[int, bytes, float]], tick: int) -> int:
-        """Puts records on disk, in one transaction; what the chain is after a tick."""
+        """Writes records to disk in one transaction. Returns the chain after the record of a tick.
+
+        Args:
+            file: the database.
+            records: tick, record, and the time in seconds at which its step ended (0: quiet).
+            tick: the tick whose chain is wanted; -1: none.
+        """
         chain = there = self._chain
         rows = []
         for at, record, _ in records:
@@ -331,7 +340,7 @@ class Store(Pen):
         return there
 
     def _save(self, file: Database, copy: Copy, checkpoint: Checkpoint, chain: int) -> None:
-        """Puts a checkpoint on disk; the gap before it, if there was one, is closed."""
+        """Writes a checkpoint to disk. That ends a gap before it."""
         seal = seal_of(checkpoint, self._rules, chain)
         self._seals[seal] = copy.saved
         file.save(checkpoint, self._rules, chain, self._game)
@@ -343,11 +352,11 @@ class Store(Pen):
             if self._copy is copy:
                 self._copy = None
             if self.trouble and not self._gap:
-                logger.warning("saving again, as of tick %d", copy.tick)
+                logger.warning("saving again, from tick %d on", copy.tick)
                 self.trouble = ""
 
     def _reopen(self) -> None:
-        """After a gap: waits a while, and saves everything anew. What has come since then follows in `_write_on`."""
+        """Reopens the file after a gap and saves a new checkpoint. `_write_on` then writes the records after it."""
         with self._wake:
             self._wake.wait_for(lambda: self._closing, self._retry_s)
             self._reopening = True
@@ -361,7 +370,7 @@ class Store(Pen):
         self._began = time.monotonic()
         file = Database(self._path, power=self._power)
         try:
-            seal = file.seal()  # an attempt that failed may have been carried out all the same
+            seal = file.seal()  # a transaction that raised may have been committed nevertheless
             self._saved = self._seals.get(seal) or dict.fromkeys(file.segments())
             self._seals = {seal: self._saved}
             for checkpoint in copy.pieces(self._saved):
@@ -373,7 +382,7 @@ class Store(Pen):
                 file.close()
 
     def _fail(self, reason: str) -> None:
-        """The file takes nothing, for this reason."""
+        """Handles a failure of the file: closes it, begins a gap, and doubles the time until the next attempt."""
         self._retry_s = min(2 * self._retry_s, RETRY_MAX_S)
         if self._file is not None:
             self._file.close()
@@ -382,10 +391,10 @@ class Store(Pen):
             self._drop(reason)
 
     def _drop(self, reason: str) -> None:
-        """Begins a gap; the lock is held."""
+        """Begins a gap, or goes on with it. The caller holds the lock."""
         if not self.trouble:
             logger.error("cannot save: %s; commands are refused until it works again", reason)
         self.trouble, self._gap = reason, True
-        if not self._closing or self._copy is self._copying:  # else it is the last one, which has not been tried yet
+        if not self._closing or self._copy is self._copying:  # otherwise it is the last copy, which has not been tried
             self._copy = None
         self._records.clear()

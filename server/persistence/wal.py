@@ -1,8 +1,8 @@
-"""A look at SQLite's -wal file (sqlite.org/walformat.html), for what SQLite itself does not tell.
+"""A check of SQLite's -wal file (sqlite.org/walformat.html) for damage that SQLite itself does not report.
 
-SQLite reads the frames of the file up to the first that does not check, and forgets the rest. It synchronises a
-transaction before it begins the next one. So after a crash what does not check is at most one transaction. If another
-one comes behind it, a byte has changed that was on disk.
+SQLite reads the frames of the file up to the first whose checksum is wrong, and ignores the rest. It synchronises a
+transaction before it begins the next one. So a crash leaves at most one transaction with wrong checksums, at the end.
+If another transaction follows it, a byte that was on disk has changed.
 """
 
 import struct
@@ -11,21 +11,22 @@ from pathlib import Path
 import numpy as np
 
 HEAD_BYTES, FRAME_HEAD_BYTES = 32, 24
+"""Sizes of the header of the file and of the header of a frame, in bytes."""
 MAGICS = (0x377F0682, 0x377F0683)
-"""The first number of a file whose checks are over little-endian, or big-endian, words."""
+"""First numbers of a file: its checksums are over little-endian words, or over big-endian words."""
 
 
 def damage(database: Path) -> str:
-    """Says what is wrong behind the frames that SQLite uses; empty if a crash may have left it so.
+    """Returns what is wrong behind the frames that SQLite uses; empty if a crash may have left the file like this.
 
     Args:
-        database: of which it is the -wal; a connection has to be reading it.
+        database: the database to which the -wal file belongs. A connection must be reading it.
     """
     path, index = (database.with_name(database.name + end) for end in ("-wal", "-shm"))
     data = path.read_bytes() if path.exists() else b""
     if len(data) < HEAD_BYTES or not index.exists():
         return ""
-    if not _head_checks(data[:HEAD_BYTES]):  # it is synchronised ahead of the first frame
+    if not _head_checks(data[:HEAD_BYTES]):  # the header is synchronised before the first frame
         return f"the head of {path.name} does not match its check" if len(data) > HEAD_BYTES else ""
     size, used = FRAME_HEAD_BYTES + int.from_bytes(data[8:12]), _frames_used(index)
     frames = np.frombuffer(data, np.uint8)[HEAD_BYTES:]
@@ -38,7 +39,7 @@ def damage(database: Path) -> str:
 
 
 def _frames_used(index: Path) -> int:
-    """The number of frames that SQLite uses, from its own index of them."""
+    """Returns the number of frames that SQLite uses, from its index file."""
     with index.open("rb") as file:
         return int(struct.unpack("=I", file.read(20)[16:])[0])
 

@@ -1,11 +1,11 @@
-"""The game events for one player: sent in order, behind the snapshot that has what they speak of, or counted.
+"""The outbox: the game events that wait to be sent to one player, in order.
 
-Theory of operation. An event is queued in the tick in which the rules send it. It goes once the player's client has
-been sent all that was in its sight at the end of that tick, so an entity that the event names is known by then. The
-queue belongs to the player and outlasts a connection: events of the time without a connection go after the return. It
-is bounded; beyond that the oldest events are dropped. Both sides count the events from the player's first on, and
-`NextHappened` has the number of the next one. It is sent wherever the client may expect another number: after a drop,
-and after a lost connection, with which events on their way may be lost. The client computes from it how many it missed.
+Theory of operation. An event is queued in the tick in which the rules send it. It is sent once the client has been sent
+everything that was in its view at the end of that tick. So the client knows an entity that the event names. The queue
+belongs to the player and outlasts a connection: events from the time without a connection are sent after the reconnect.
+It is bounded; if it is full, the oldest events are dropped. Both sides count the events from the player's first on, and
+`NextHappened` has the number of the next event. It is sent whenever the client may expect another number: after a drop,
+and after a lost connection, which may lose events on their way. From it the client computes how many events it missed.
 """
 
 from collections import deque
@@ -19,7 +19,7 @@ class Outbox:
     def __init__(self) -> None:
         self._waiting: deque[tuple[int, bytes]] = deque()
         self._next = 0
-        """The number of the first event that waits."""
+        """Number of the first event that waits."""
         self._unsure = False
         """Whether the client may expect another number than the next one."""
 
@@ -35,12 +35,12 @@ class Outbox:
         """Queues an event.
 
         Args:
-            tick: in which the rules sent it.
-            message: encoded already.
-            most: events that may wait; of more, the oldest one is dropped.
+            tick: the tick in which the rules sent it.
+            message: the encoded event.
+            most: number of events that may wait; if there are more, the oldest is dropped.
 
         Returns:
-            Whether one was dropped.
+            Whether an event was dropped.
         """
         self._waiting.append((tick, message))
         full = len(self._waiting) > most
@@ -51,15 +51,15 @@ class Outbox:
         return full
 
     def reconnect(self) -> None:
-        """Notes that the player goes on over another connection: what was on its way may be lost."""
+        """Notes that the player has reconnected, so events on their way may be lost."""
         self._unsure = True
 
     def take(self, known: int, room: int) -> list[bytes]:
-        """Takes the messages that are to be sent now.
+        """Takes the messages to send now, and returns them.
 
         Args:
-            known: the client has been sent all that was in its sight up to this tick.
-            room: bytes of events to send, about; one event always goes.
+            known: tick up to which the client has been sent everything in its view.
+            room: bytes of events to send, about; at least one event is taken.
         """
         messages = []
         if self._unsure:

@@ -1,15 +1,16 @@
-"""What a game keeps beside its world, so that it goes on after a restart: who plays, and what the rules have said.
+"""The persisted state: what belongs to a game beside its world and survives a restart.
 
-It is noted as it happens (`RecordedWorld.note`), and whole with every checkpoint:
+It consists of players, attributes and shared values. Each change is noted (`RecordedWorld.note`), and every checkpoint
+has the whole state, as the notes that lead to it:
 
-    ["player", entity, name, subject, tokens]    has joined or come back; of tokens, the digests
-    ["answered", entity, number, verdict]        a command of that player
-    ["settled", entity, verdicts]                the latest of them by number: with a checkpoint
-    ["left", entity]
-    ["said", entity, attributes]                 all of them
-    ["shared", values]                           all of them
+    ["player", entity, name, subject, tokens]    a player has joined or reconnected; digests of the resume tokens
+    ["answered", entity, number, verdict]        a command of a player was carried out
+    ["settled", entity, verdicts]                the latest verdicts by number; in checkpoints only
+    ["left", entity]                             an entity was removed, or its player has left
+    ["said", entity, attributes]                 all attributes of an entity
+    ["shared", values]                           all shared values
 
-What rules remember in their own variables is not kept: what must survive belongs into attributes and shared values.
+Variables of the rules' class are not persisted. State that must survive belongs in attributes or shared values.
 """
 
 from collections.abc import Iterable, Mapping
@@ -21,7 +22,7 @@ PLAYER, ANSWERED, SETTLED, LEFT, SAID, SHARED = "player", "answered", "settled",
 
 
 class Kept(NamedTuple):
-    """What is kept, by entity where it is about one."""
+    """The persisted state: players and attributes by entity, and shared values by name."""
 
     players: dict[int, Player]
     attributes: dict[int, dict[str, Any]]
@@ -29,12 +30,12 @@ class Kept(NamedTuple):
 
 
 def note_of(player: Player) -> list[Any]:
-    """The note of a player who has joined or come back."""
+    """Returns the note of a player who has joined or reconnected."""
     return [PLAYER, player.entity, player.name, player.subject, player.tokens]
 
 
 def whole(kept: Kept) -> list[list[Any]]:
-    """All of it, as the notes that would lead to it."""
+    """Returns the whole state as the notes that lead to it."""
     notes = [note_of(player) for player in kept.players.values()]
     notes += [[SETTLED, entity, player.settled] for entity, player in kept.players.items() if player.settled]
     notes += [[SAID, entity, attributes] for entity, attributes in kept.attributes.items()]
@@ -42,7 +43,11 @@ def whole(kept: Kept) -> list[list[Any]]:
 
 
 def restored(notes: Iterable[list[Any]]) -> Kept:
-    """What these notes, in order, come to."""
+    """Returns the state that notes, in order, lead to.
+
+    Raises:
+        ValueError: there is no such kind of note.
+    """
     kept = Kept({}, {}, {})
     shared: Mapping[str, Any] = {}
     for kind, *parts in notes:
@@ -64,7 +69,7 @@ def restored(notes: Iterable[list[Any]]) -> Kept:
             case _:
                 raise ValueError(f"{kind!r}: no such note")
     for player in kept.players.values():
-        player.verdicts.clear()  # who asks is told, from `settled`
+        player.verdicts.clear()  # a client that asks again gets them from `settled`
         player.command = max(player.settled, default=-1)
     kept.shared.update(shared)
     return kept

@@ -231,7 +231,7 @@ def test_what_cannot_be_used_is_refused_and_left_as_it_is(opened: Callable[..., 
 
     newest = len(database.MIGRATIONS)
     said = refused(bad("newer", f"PRAGMA user_version = {newest + 1}"))
-    assert f"world.db: in schema version {newest + 1}, and this program knows those up to {newest}" in said
+    assert f"world.db: has schema version {newest + 1}, but this program supports versions up to {newest}" in said
     assert "newer one" in said
     assert "not a saved world" in refused(bad("foreign", "PRAGMA application_id = 1"))
     for name, statement in {
@@ -263,7 +263,7 @@ def test_what_cannot_be_used_is_refused_and_left_as_it_is(opened: Callable[..., 
     with pytest.raises(StoreError, match="cannot be used"):
         Store(tmp_path / "file", SCENE, compiled=False)
     said = refused(good, worlds.scene([worlds.floor(0)], gravity=9.0, tick_rate=32))
-    assert "saved under other rules (another gravity, tick_rate)" in said
+    assert "saved with another scene (different: gravity, tick_rate)" in said
     assert path in said
     assert opened(good).world.tick == 60
 
@@ -276,7 +276,7 @@ def test_a_replay_that_comes_out_otherwise_says_what_to_do(
     copy = crashed(store, tmp_path)
     step = World.step
     monkeypatch.setattr(World, "step", lambda world, inputs: step(world, {} if world.tick == 30 else inputs))
-    assert "replayed otherwise than it was played (tick 31: the entities" in refused(copy)
+    assert "the replay of its log gives another world than was saved (tick 31: the entities" in refused(copy)
 
 
 def test_a_world_belongs_to_its_game(tmp_path: Path) -> None:

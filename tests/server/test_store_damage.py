@@ -174,7 +174,7 @@ def test_only_a_power_cut_without_fsync_may_cost_the_end(
         assert isinstance(found, str)
     else:
         assert found == (tick, torn.hashes[tick])
-        assert "the machine was started anew since" in caplog.text
+        assert "the machine was restarted since" in caplog.text
 
 
 def test_a_system_that_does_not_tell_of_its_start_is_trusted_less(monkeypatch: pytest.MonkeyPatch) -> None:
