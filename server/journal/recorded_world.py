@@ -235,7 +235,7 @@ class RecordedWorld(World):
 
     def restore(self, other: World) -> None:
         if self._pens:
-            raise JournalError("a world that is being recorded cannot be replaced by another; end the recording first")
+            raise JournalError("a world that is being recorded cannot become another; end the recording first")
         super().restore(other)
 
     def step(self, inputs: Mapping[int, Input] | None = None) -> None:
