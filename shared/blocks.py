@@ -1,14 +1,15 @@
-"""World segments: cubes of 32^3 blocks, dense, in one array that the kernel reads.
+"""The blocks of a world, as segments: cubes of 32^3 blocks, dense, in one array that the kernel reads.
 
-Two numbers answer whether a segment is the same as another one:
+Two values show whether two segments are equal:
 
-`version` answers within this process. Every change takes the next number of one count, and a copy takes the number of
+`version` compares within one process. Every change takes the next number of one counter, and a copy takes the number of
 its original, so equal versions mean equal blocks. It costs an edit nothing.
 
-`digest` answers between processes and machines: SHA-256 over the segment's bytes, so nobody can choose edits that leave
-it as it was. An edit only marks it as stale; it is computed (25 to 40 us) when it is asked for, or by `freshen`.
+`digest` compares between processes and machines. It is a SHA-256 over the segment's bytes, so no client can choose
+edits that leave it unchanged. An edit only marks it as stale; it is computed (25 to 40 us) when it is read, or by
+`freshen`.
 
-Rejected: a sum or an exclusive-or over the blocks, which an edit can update. Some 40 chosen edits leave such a digest
+Rejected: a sum or an exclusive-or over the blocks, which an edit can update. About 40 chosen edits leave such a digest
 unchanged, and a key does not help, because every client would have to know it.
 """
 
@@ -26,31 +27,35 @@ from shared.layout import CELLS
 from shared.units import SEGMENT, SEGMENT_SHIFT
 
 BLOCKS = SEGMENT**3
+"""Number of blocks in a segment."""
 AIR = 0
+"""Kind of a block that is not solid; all other kinds are."""
 KIND_MAX = 255
+"""Greatest kind of a block."""
 PACKED_MAX = 48 * 1024
-"""No packed segment is longer, in bytes (noise of 256 kinds packs to 33 KB)."""
+"""Longest packed segment, in bytes (random blocks of 256 kinds pack to 33 KB)."""
 
 DIGEST_BYTES = 16
-"""Bytes of a segment's digest."""
+"""Length of a segment's digest, in bytes."""
 
 Kinds = npt.NDArray[np.uint8]
+"""Kinds of blocks; for a whole segment [32768], by index z << 10 | y << 5 | x."""
 
 _versions = itertools.count(1)
 
 
 def digest_of(kinds: Kinds) -> bytes:
-    """The digest of one segment ([32768] kinds, contiguous): the first 16 bytes of their SHA-256."""
+    """Returns the digest of a segment ([32768] kinds, contiguous): the first 16 bytes of their SHA-256."""
     return hashlib.sha256(kinds.data).digest()[:DIGEST_BYTES]
 
 
 def pack(kinds: Kinds) -> bytes:
-    """One segment for the wire or the disk."""
+    """Returns the blocks of a segment packed for a message or a file (zlib)."""
     return zlib.compress(kinds.tobytes(), 6)
 
 
 def unpack(data: bytes) -> Kinds:
-    """The reverse of `pack`: [32768] kinds.
+    """Returns the [32768] kinds that `pack` packed.
 
     Raises:
         ValueError: `data` is not one packed segment.
@@ -68,10 +73,10 @@ def unpack(data: bytes) -> Kinds:
 
 
 def checked_kinds(kinds: npt.ArrayLike) -> Kinds:
-    """The blocks of one segment as [32768] kinds.
+    """Returns the blocks of a segment as [32768] kinds.
 
     Raises:
-        SceneError: they are not 32768 whole numbers from 0 to 255.
+        SceneError: `kinds` are not 32768 whole numbers from 0 to 255.
     """
     found = np.asarray(kinds)
     good = found.dtype.kind in "iu" and found.size == BLOCKS
@@ -81,12 +86,12 @@ def checked_kinds(kinds: npt.ArrayLike) -> Kinds:
 
 
 def segment_of(x: int, y: int, z: int) -> Cell:
-    """The index of the segment that a block lies in."""
+    """Returns the index of the segment that has a block."""
     return x >> SEGMENT_SHIFT, y >> SEGMENT_SHIFT, z >> SEGMENT_SHIFT
 
 
 def offset_of(x: int, y: int, z: int) -> int:
-    """The index of a block within its segment."""
+    """Returns the index of a block within its segment: z << 10 | y << 5 | x."""
     inside = SEGMENT - 1
     return (z & inside) << 10 | (y & inside) << 5 | (x & inside)
 
@@ -95,7 +100,7 @@ T = TypeVar("T", bound=np.generic)
 
 
 def grown(array: npt.NDArray[T], fill: int, length: int) -> npt.NDArray[T]:
-    """A copy with another length; what is new holds `fill`."""
+    """Returns a copy of an array with another length; new items are `fill`."""
     new = np.full((length, *array.shape[1:]), fill, array.dtype)
     kept = min(len(array), length)
     new[:kept] = array[:kept]
@@ -103,13 +108,13 @@ def grown(array: npt.NDArray[T], fill: int, length: int) -> npt.NDArray[T]:
 
 
 class Blocks:
-    """The loaded segments. Rows are never reused while the world lives, except by `restore`."""
+    """The loaded segments of a world, each in a row of the arrays."""
 
     def __init__(self) -> None:
         self.count = 1  # row 0 is layout.NOWHERE
         self.rows: dict[Cell, int] = {}
         self.kinds: Kinds = np.zeros((1, BLOCKS), np.uint8)
-        self.solid = np.zeros((1, SEGMENT * SEGMENT), np.uint32)  # what the kernel reads: an eighth of the memory
+        self.solid = np.zeros((1, SEGMENT * SEGMENT), np.uint32)  # one bit per block for the kernel
         self.segments = np.zeros((1, 3), np.int64)
         self.versions = np.zeros(1, np.int64)
         self.digests = np.zeros((1, DIGEST_BYTES), np.uint8)
@@ -118,7 +123,7 @@ class Blocks:
         self.near = np.full(4, 1 << 40, np.int64)
         self._free: list[int] = []
         self._stale: set[int] = set()
-        """The rows whose digests are not those of their blocks."""
+        """Rows whose digests are not up to date."""
 
     def __contains__(self, index: Cell) -> bool:
         return index in self.rows
@@ -127,7 +132,7 @@ class Blocks:
         return iter(self.rows)
 
     def load(self, index: Cell, kinds: Kinds) -> bool:
-        """Adds or replaces a segment; whether the arrays had to move."""
+        """Adds or replaces a segment. Returns whether the arrays have moved in memory."""
         moved = False
         row = self.rows.get(index)
         if row is None:
@@ -146,9 +151,10 @@ class Blocks:
         return moved
 
     def unload(self, index: Cell) -> None:
-        """Forgets a segment, which is solid from then on; its entities must have left or been removed.
+        """Removes a segment, which counts as solid from then on. No entity may be in it.
 
-        Raises as `row` does.
+        Raises:
+            MissingError: the segment is not loaded.
         """
         row = self.row(index)
         del self.rows[index]
@@ -157,10 +163,10 @@ class Blocks:
         self._rebuild(len(self.table))
 
     def row(self, index: Cell) -> int:
-        """The row of a loaded segment.
+        """Returns the row of a loaded segment.
 
         Raises:
-            MissingError: it is not loaded.
+            MissingError: the segment is not loaded.
         """
         row = self.rows.get(index)
         if row is None:
@@ -168,18 +174,18 @@ class Blocks:
         return row
 
     def get(self, x: int, y: int, z: int) -> int | None:
-        """The kind of a block; None where no segment is loaded."""
+        """Returns the kind of a block; None if its segment is not loaded."""
         row = self.rows.get(segment_of(x, y, z))
         return None if row is None else int(self.kinds[row, offset_of(x, y, z)])
 
     def different(self, low: Cell, high: Cell, kind: int) -> list[tuple[Cell, int]]:
-        """The blocks of a box (`high` excluded) that are not of a kind, and the kinds they have, by z, y, x.
+        """Returns the blocks of a box (`high` excluded) that are not of a kind, with their kinds, ordered by z, y, x.
 
         Raises:
-            SceneError: a segment in it is not loaded.
+            SceneError: a segment of the box is not loaded.
         """
         (x0, y0, z0), (x1, y1, z1) = low, high
-        if (x1 - x0, y1 - y0, z1 - z0) == (1, 1, 1):  # 1 us, not 60
+        if (x1 - x0, y1 - y0, z1 - z0) == (1, 1, 1):  # a short cut for one block: 1 us instead of 60
             before = self.get(x0, y0, z0)
             if before is not None:
                 return [(low, before)] if before != kind else []
@@ -200,7 +206,11 @@ class Blocks:
         return [((x0 + x, y0 + y, z0 + z), was) for (z, y, x), was in zip(at.tolist(), kinds, strict=True)]
 
     def set(self, x: int, y: int, z: int, kind: int) -> None:
-        """Changes one block of a loaded segment. Raises as `row` does."""
+        """Changes one block of a loaded segment.
+
+        Raises:
+            MissingError: the segment is not loaded.
+        """
         row, at = self.row(segment_of(x, y, z)), offset_of(x, y, z)
         self.kinds[row, at] = kind
         word, bit = at >> SEGMENT_SHIFT, 1 << (at & (SEGMENT - 1))
@@ -208,17 +218,29 @@ class Blocks:
         self._touch(row)
 
     def segment(self, index: Cell) -> Kinds:
-        """The blocks of a loaded segment, [z, y, x], read-only. Raises as `row` does."""
+        """Returns a read-only view of the blocks of a loaded segment, [z, y, x].
+
+        Raises:
+            MissingError: the segment is not loaded.
+        """
         view: Kinds = self.kinds[self.row(index)].reshape(SEGMENT, SEGMENT, SEGMENT)
         view.flags.writeable = False
         return view
 
     def version(self, index: Cell) -> int:
-        """The number of a loaded segment's latest change; see the module. Raises as `row` does."""
+        """Returns the version of a loaded segment: in one process, equal versions mean equal blocks.
+
+        Raises:
+            MissingError: the segment is not loaded.
+        """
         return int(self.versions[self.row(index)])
 
     def digest(self, index: Cell) -> bytes:
-        """The digest of a loaded segment. Raises as `row` does."""
+        """Returns the digest of a loaded segment, 16 bytes, and computes it if it is stale.
+
+        Raises:
+            MissingError: the segment is not loaded.
+        """
         row = self.row(index)
         if row in self._stale:
             self._freshen(row)
@@ -230,12 +252,15 @@ class Blocks:
         return len(self._stale)
 
     def freshen(self, most: int | None = None) -> None:
-        """Computes the digests that are stale; `most` of them at most."""
+        """Computes stale digests, at most `most` of them (None: all)."""
         for row in list(itertools.islice(self._stale, most)) if self._stale else ():
             self._freshen(row)
 
     def restore(self, other: "Blocks") -> bool:
-        """Becomes equal to `other`, copying only segments that differ; returns whether the arrays had to move."""
+        """Makes this equal to `other`. Returns whether the arrays have moved in memory.
+
+        Only segments that differ are copied, if both have the same segments in the same rows.
+        """
         self._stale = set(other._stale)
         if self.rows == other.rows and len(self.kinds) == len(other.kinds):
             for row in np.flatnonzero(self.versions[: self.count] != other.versions[: self.count]):
@@ -250,7 +275,7 @@ class Blocks:
         return True
 
     def _touch(self, row: int) -> None:
-        """Notes that the blocks of a row have changed."""
+        """Notes that the blocks of a row have changed: takes a new version, and marks the digest as stale."""
         self.versions[row] = next(_versions)
         self._stale.add(row)
 

@@ -1,4 +1,4 @@
-"""Placing and removing blocks as a player: one rule for both sides, so that an edit can be predicted."""
+"""Edits: blocks that players place and remove, by one rule on both sides, so that a client can predict them."""
 
 from typing import NamedTuple
 
@@ -12,11 +12,11 @@ from shared.units import BLOCK
 from shared.world import OverlapError, World
 
 NAME = "edit"
-"""The name of the command."""
+"""Name of the command that carries an edit."""
 
 
 class Edit(NamedTuple):
-    """Block (x, y, z) becomes `kind`; 0 removes it."""
+    """A change of one block: (x, y, z) becomes `kind`; 0 removes it."""
 
     x: int
     y: int
@@ -25,19 +25,19 @@ class Edit(NamedTuple):
 
 
 class EditError(SceneError, OverflowError):
-    """An edit of a block beyond all worlds, or to a kind that there is not."""
+    """An edit whose place or kind is out of range."""
 
 
 FAR = (1 << 28) - 1
-"""No block is further from 0 along an axis."""
+"""Greatest distance of a block from 0 along each axis, in blocks."""
 
 
 def checked(x: object, y: object, z: object, kind: object) -> Edit:
-    """An edit of whole numbers.
+    """Returns an edit of checked numbers.
 
     Raises:
-        EditError: one of them is out of range.
-        TypeError: one of them is none.
+        EditError: a value is out of range.
+        TypeError: a value is not a whole number.
     """
     for value, at in ((x, "x"), (y, "y"), (z, "z"), (kind, "kind")):
         if isinstance(value, bool) or not isinstance(value, WHOLE):
@@ -50,12 +50,12 @@ def checked(x: object, y: object, z: object, kind: object) -> Edit:
 
 
 def pack(edit: Edit) -> bytes:
-    """The payload of the command."""
+    """Returns the payload of the command that carries an edit."""
     return msgpack.packb(tuple(edit))  # type: ignore[no-any-return]
 
 
 def unpack(payload: bytes) -> Edit | None:
-    """The reverse of `pack`; None for any other bytes."""
+    """Returns the edit in a payload that `pack` made; None for any other bytes."""
     try:
         parts = msgpack.unpackb(payload, max_array_len=4)
     except Exception:  # msgpack raises some ten kinds for bytes that are not MessagePack
@@ -67,7 +67,12 @@ def unpack(payload: bytes) -> Edit | None:
 
 
 def apply(world: World, entity: int, edit: Edit) -> int:
-    """Carries out an edit of `entity` if the rules allow it; the verdict (`DONE`, ...)."""
+    """Carries out an edit by the player with the entity `entity`, if the rules allow it.
+
+    Returns:
+        The verdict, as in `shared.messages`: DONE, OUT_OF_REACH (beyond `Scene.reach`), OVERLAPS (an entity is in the
+        way) or INVALID (there is no such entity, or the segment is not loaded).
+    """
     if entity not in world:
         return INVALID
     centre = [part * BLOCK + BLOCK // 2 for part in edit[:3]]

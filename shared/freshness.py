@@ -1,6 +1,6 @@
-"""Checksums of the kernel sources, by which a prebuilt kernel is known to be made from them.
+"""Checksums of the kernel sources, which show whether a prebuilt kernel was made from them.
 
-Standard library only: the build of the wheel uses it, too.
+It uses the standard library only, because the build of the wheel uses it, too.
 """
 
 import io
@@ -11,14 +11,15 @@ from pathlib import Path
 from types import ModuleType
 
 CRC_MASK = (1 << 31) - 1
-"""A library gives its checksum as a signed 32-bit number that is not negative."""
+"""Mask of a checksum: a library returns it as a signed 32-bit number, which must not be negative."""
 SILENT = (tokenize.COMMENT, tokenize.NL, tokenize.ENCODING, tokenize.ENDMARKER)
-"""Kinds of tokens that do nothing."""
+"""Kinds of tokens that have no effect on the code."""
 BEFORE_A_STATEMENT = (tokenize.NEWLINE, tokenize.INDENT, tokenize.DEDENT)
+"""Kinds of tokens after which a statement begins; a string there is a docstring."""
 
 
 def crc(texts: Iterable[str]) -> int:
-    """A checksum of texts, 0 to 2^31 - 1."""
+    """Returns a checksum of texts, 0 to 2^31 - 1."""
     total = 0
     for text in texts:
         total = zlib.crc32(text.encode() + b"\0", total)
@@ -26,10 +27,12 @@ def crc(texts: Iterable[str]) -> int:
 
 
 def sources(paths: Iterable[Path]) -> list[str]:
-    """The texts of source files, as they are in the repository: a wheel has the imports of its package in them.
+    """Returns the texts of source files as they are in the repository.
+
+    In a wheel, their imports name the package; this name is removed.
 
     Raises:
-        OSError: one cannot be read.
+        OSError: a file cannot be read.
     """
     return [path.read_text("utf-8").replace("sovereign_netcode.", "") for path in paths]
 
@@ -40,12 +43,12 @@ def constants(source: ModuleType) -> list[tuple[str, int]]:
 
 
 def text_crc(texts: Iterable[str]) -> int:
-    """A checksum of all of the sources."""
+    """Returns a checksum of the whole sources, with comments and docstrings."""
     return crc(texts)
 
 
 def code_crc(texts: Iterable[str]) -> int:
-    """A checksum of what the sources do: comments, docstrings and blank lines are left out (30 ms)."""
+    """Returns a checksum of the code of the sources, without comments, docstrings and blank lines (takes 30 ms)."""
     return crc(part for text in texts for part in _code(text))
 
 
@@ -56,5 +59,5 @@ def _code(text: str) -> Iterator[str]:
             continue
         after_docstring, docstring = docstring, token.type == tokenize.STRING and before in BEFORE_A_STATEMENT
         before = token.type
-        if not docstring and not after_docstring:  # after it comes the end of its line
+        if not docstring and not after_docstring:  # the token after a docstring is the end of its line
             yield {tokenize.INDENT: "{", tokenize.DEDENT: "}"}.get(token.type, token.string.strip())

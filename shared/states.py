@@ -1,4 +1,4 @@
-"""Checks of whole states of entities: the kernel trusts its rows, and goes anywhere in memory for a wrong one."""
+"""Checks of entities' states. The kernel does not check its rows, and a wrong value would make it read any memory."""
 
 from collections.abc import Iterable
 
@@ -10,25 +10,27 @@ from shared.layout import BUTTONS, CELL, COLUMNS, FLAGS, ID, MOVE_X, TEMPLATE, V
 from shared.units import BLOCK, RANGE_BLOCKS
 
 STATES = CELL
-"""Columns of an entity's state: id, template, flags, x, y, z, vx, vy, vz, move_x, move_y, buttons."""
+"""Number of columns of a state: id, template, flags, x, y, z, vx, vy, vz, move_x, move_y, buttons."""
 ID_MAX = (1 << 31) - 1
+"""Greatest id of an entity."""
 PLACE_MAX, FAST = 2 * RANGE_BLOCKS * BLOCK, 1 << 30
-"""No position is further from 0 along an axis, in grid steps, and no velocity greater: more than any world gets to."""
+"""Greatest distance of a position from 0 along an axis, in grid steps, and greatest velocity along an axis, in velocity
+steps; no world reaches them."""
 
 
 def checked_states(states: Iterable[tuple[int, ...]] | Int64s, templates: int) -> Int64s:
-    """States as an int64 matrix [n, 12].
+    """Returns states as an int64 matrix [n, 12].
 
     Args:
         states: rows of 12 whole numbers (`STATES`).
-        templates: the number of templates of the scene.
+        templates: number of templates of the scene.
 
     Raises:
-        SceneError: they are no such rows, a value is out of range, or two are about the same entity.
+        SceneError: the rows have another shape or type, a value is out of range, or two rows have one id.
     """
     try:
         found = np.asarray(states if isinstance(states, np.ndarray) else list(states))
-    except (TypeError, ValueError, OverflowError) as error:  # ragged, for example, or no list at all
+    except (TypeError, ValueError, OverflowError) as error:  # rows of different lengths, for example, or no list
         raise SceneError(f"states = {shown(states)}: must be rows of {STATES} whole numbers") from error
     if not found.size:
         return np.zeros((0, STATES), np.int64)
@@ -43,7 +45,7 @@ def checked_states(states: Iterable[tuple[int, ...]] | Int64s, templates: int) -
         field, value = f"states[{row}].{COLUMNS[column]}", matrix[row, column]
         raise SceneError(f"{field} = {value}: must be a whole number from {low[column]} to {high[column]}")
     if len(np.unique(matrix[:, ID])) < len(matrix):
-        raise SceneError("states: two are of the same entity")
+        raise SceneError("states: two rows have the same id")
     return matrix
 
 
