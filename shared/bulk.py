@@ -1,7 +1,8 @@
-"""States by the dozen: unpacked from the wire, packed for it, compared and kept. Nothing here moves anything.
+"""The part of the kernel for many states at once: unpacking from a snapshot, comparing, packing, keeping.
 
-Like `shared.kernel`, this source runs compiled by Numba and, unchanged, without it: whole numbers, loops and
-comparisons only. How the bytes lie is told in `shared.snapshot`, how entities do in `shared.layout`.
+Nothing here moves an entity. Like `shared.kernel`, this source runs compiled by Numba and, unchanged, in plain Python,
+so it uses whole numbers, loops and comparisons only. `shared.snapshot` describes the packed bytes, and `shared.layout`
+the rows of entities. `e` is the array of the entities, 16 values per row.
 """
 
 from typing import Any
@@ -36,9 +37,13 @@ from shared.units import IN_SEGMENT, TO_SEGMENT
 jit, inlined = decorators(__name__)
 
 HEAD_BYTES = 5
+"""Length of a packed head, in bytes."""
 ROW_BYTES = 33
+"""Length of a packed state, in bytes."""
 ALL_EVENTS = (1 << EVENT_BITS) - 1
+"""Mask of the events in `changed`."""
 ID_BITS = 32
+"""Number of bits for an id, or for a place in the array of entities, within a key to sort by."""
 
 
 # -- unpacking -----------------------------------------------------------------------------------------------
@@ -46,13 +51,16 @@ ID_BITS = 32
 
 @inlined
 def word(data: Any, at: int) -> int:
-    """The four bytes from `at` on as a whole number from 0 on, the lowest first."""
+    """Returns four bytes from `at` on as an unsigned whole number, little-endian."""
     return data[at] | data[at + 1] << 8 | data[at + 2] << 16 | data[at + 3] << 24
 
 
 @jit
 def read_turns(heads: bytes, tails: bytes, turns: Any) -> bool:
-    """Unpacks turns (see `shared.snapshot`) to `turns` ([n * 8]); whether `tails` has just what they need."""
+    """Unpacks heads and tails (`shared.snapshot`) to `turns` ([n * 8]).
+
+    Returns whether `tails` has exactly the bytes that the heads need.
+    """
     at = 0
     for i in range(len(turns) // TURN):
         to = TURN * i
@@ -79,9 +87,18 @@ def read_turns(heads: bytes, tails: bytes, turns: Any) -> bool:
 
 @jit
 def read_rows(rows: bytes, parts: Any, low: Any, high: Any, templates: int, states: Any) -> bool:
-    """Unpacks whole states (see `shared.snapshot`) to `states` ([n * 12]); whether all values are within bounds.
+    """Unpacks states (`shared.snapshot`).
 
-    Of each part, `parts` has the low corner in grid steps, which its positions are counted from, and how many are its.
+    Args:
+        rows: packed states, [n * 33].
+        parts: for each part of the snapshot: low corner of its segment in grid steps (3), number of its states.
+        low: [12], lowest value of each column.
+        high: [12], greatest value of each column.
+        templates: number of templates of the scene.
+        states: [n * 12], is written to.
+
+    Returns:
+        Whether all values are within their bounds.
     """
     to = at = 0
     for part in range(0, len(parts), 4):
@@ -111,7 +128,7 @@ def read_rows(rows: bytes, parts: Any, low: Any, high: Any, templates: int, stat
 
 @inlined
 def counts(states: Any, at: int, mine: int, reach: int, always: Any) -> bool:
-    """Whether the state at `at` counts for the one at `mine`; -1: for nobody, so it does."""
+    """Returns whether the state at `at` counts in a comparison for the state at `mine`; with -1 every state does."""
     if mine < 0 or always[states[at + TEMPLATE]] != 0:
         return True
     return (
@@ -123,10 +140,15 @@ def counts(states: Any, at: int, mine: int, reach: int, always: Any) -> bool:
 
 @jit
 def alike(a: Any, n: int, b: Any, m: int, entity: int, reach: int, always: Any) -> bool:
-    """Whether two lists of states are the same in all that count for `entity`.
+    """Returns whether two lists of states are equal in all states that count for `entity`.
 
-    Those that do are less than `reach` away from it along each axis, or of a template that `always` counts (not 0);
-    where `entity` is not in a list, all of that list do.
+    A state counts if it is less than `reach` (grid steps) away from `entity` along each axis, or if `always` is not 0
+    for its template. In a list without `entity`, every state counts.
+
+    Args:
+        a: `n` states, ascending by id.
+        b: `m` states, ascending by id.
+        always: [templates].
     """
     mine = -1
     for i in range(n):
@@ -156,7 +178,10 @@ def alike(a: Any, n: int, b: Any, m: int, entity: int, reach: int, always: Any) 
 
 @inlined
 def ahead(e: Any, a: int, b: int) -> int:
-    """How far the segment of the state at `a` is behind that of the one at `b`, in their order; 0: it is the same."""
+    """Compares the segments of the entities at `a` and `b` in the order z, y, x.
+
+    Returns 0 if both are in one segment, a negative number if the segment of `a` comes first, else a positive one.
+    """
     for k in (Z, Y, X):
         by: int = (e[a + k] >> TO_SEGMENT) - (e[b + k] >> TO_SEGMENT)
         if by != 0:
@@ -166,7 +191,7 @@ def ahead(e: Any, a: int, b: int) -> int:
 
 @inlined
 def wire(packed: Any, at: int, value: int, size: int) -> int:
-    """Writes a whole number as `size` bytes, the lowest first; where they end."""
+    """Writes a whole number as `size` bytes, little-endian. Returns the place after them."""
     for k in range(size):
         packed[at + k] = value >> 8 * k & 255
     return at + size
@@ -174,7 +199,7 @@ def wire(packed: Any, at: int, value: int, size: int) -> int:
 
 @inlined
 def wire_state(packed: Any, to: int, e: Any, at: int) -> int:
-    """Writes the whole state at `at`; where it ends."""
+    """Writes the packed state of the entity at `at`. Returns the place after it."""
     to = wire(packed, to, e[at + ID], 4)
     to = wire(packed, to, e[at + TEMPLATE], 1)
     to = wire(packed, to, e[at + FLAGS] & ~AWAKE, 1)
@@ -189,19 +214,24 @@ def wire_state(packed: Any, to: int, e: Any, at: int) -> int:
 
 @jit
 def news(e: Any, changed: Any, lengths: Any, tick: int, every: int, ids: Any, parts: Any, due: Any, packed: Any) -> int:
-    """What has happened to entities, by segment, as it is packed in `shared.snapshot`.
+    """Packs the changes of a tick by segment, as `shared.snapshot` describes them.
 
     Args:
-        tick: for which segments are due: each once in `every` ticks.
-        ids: [n] gets those to which something happened, segment by segment, those that are sent whole last.
-        parts: [n * 8] gets each segment's index, then where in `ids` those sent whole begin, and end; and where in
-            `packed` its heads, tails and rows end.
-        due: [1 + n * 3] gets the count of the numbers that follow; then the index of each segment that is due, once for
-            each entity that has changed there.
+        e: array of the entities.
+        changed: rows of the entities that changed.
+        lengths: lengths of the world's lists (`layout.N_CHANGED` ...).
+        tick: number of the tick; it decides which segments are due for a checksum.
+        every: number of ticks between two checksums of a segment.
+        ids: [n] gets the ids of the entities with events, segment by segment; within a segment, those that are sent
+            whole come last.
+        parts: [n * 8] gets for each segment: its index (3); where in `ids` the entities that are sent whole begin, and
+            where the segment ends; where in `packed` its heads, its tails and its rows end.
+        due: [1 + n * 3] gets the number of the values that follow; then the index (3) of each segment that is due, once
+            for each entity that has changed there.
         packed: [n * 33] gets the bytes.
 
     Returns:
-        The count of the numbers in `parts`.
+        The number of values in `parts`.
     """
     told = n_parts = n_due = 0
     for i in range(lengths[N_CHANGED]):
@@ -224,7 +254,7 @@ def news(e: Any, changed: Any, lengths: Any, tick: int, every: int, ids: Any, pa
     gap = 1
     while gap < told:
         gap = 3 * gap + 1
-    while gap > 1:  # Shell's way of sorting: a thousand in 0.1 ms
+    while gap > 1:  # Shellsort: 0.1 ms for a thousand entities
         gap //= 3
         for i in range(gap, told):
             at = ids[i]
@@ -276,7 +306,7 @@ def news(e: Any, changed: Any, lengths: Any, tick: int, every: int, ids: Any, pa
 
 @jit
 def sort(keys: Any, n: int) -> None:
-    """Sorts the first `n` whole numbers, Shell's way."""
+    """Sorts the first `n` whole numbers by Shellsort."""
     gap = 1
     while gap < n:
         gap = 3 * gap + 1
@@ -293,11 +323,17 @@ def sort(keys: Any, n: int) -> None:
 
 @jit
 def muster(e: Any, heads: Any, keys: Any, packed: Any, segment: int) -> int:
-    """Packs the whole state of all in the segment of a row, ascending by id; how many bytes.
+    """Packs the states of all entities in one segment, ascending by id.
 
     Args:
-        keys: [entities] is written to.
+        e: array of the entities.
+        heads: first entity row of each cell.
+        keys: [entities], is written to.
         packed: [entities * 33] gets the bytes.
+        segment: row of the segment.
+
+    Returns:
+        The number of bytes.
     """
     n = 0
     for cell in range(segment << CELLS_SHIFT, (segment + 1) << CELLS_SHIFT):
@@ -319,11 +355,17 @@ def muster(e: Any, heads: Any, keys: Any, packed: Any, segment: int) -> int:
 
 @jit
 def recall(e: Any, changed: Any, known: Any, before: Any, n: int) -> int:
-    """Brings what is kept of the `n` rows that have changed up to date; by how many more entities are there.
+    """Updates the kept values of the `n` rows that have changed, and returns the old ones in `before`.
 
     Args:
-        known: [rows * 5] of each row id, template, x, y, z.
-        before: [n * 6] gets each row, and what was kept of it.
+        e: array of the entities.
+        changed: the changed rows.
+        known: [rows * 5] kept values of each row: id, template, x, y, z.
+        before: [n * 6] gets each changed row, and the values that were kept of it.
+        n: number of changed rows.
+
+    Returns:
+        By how much the number of entities has grown; negative if it has fallen.
     """
     more = 0
     for i in range(n):

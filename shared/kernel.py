@@ -1,22 +1,24 @@
-"""The only code that moves anything.
+"""The kernel: the step of a world. No other code moves an entity.
 
-Theory of operation. `step` gives every awake entity its turn, in ascending order of id; a turn is
+Theory of operation. `step` gives every awake entity a turn, in ascending order of id. A turn is
 
-    supported?  ->  input  ->  gravity  ->  move z, x, y, each up to the first obstacle  ->  awake still?
+    input  ->  supported?  ->  gravity  ->  move along z, x, y, each up to the first obstacle  ->  stays awake?
 
-Nobody else is looked at: what could start to move is woken by the event that lets it (`wake`), and an entity
-woken by one of a lower id has its turn in the same tick, exactly as if it had been awake all along. So sleep
-is invisible in the results, and a sleeper costs nothing.
+Entities that sleep are not examined. An event that could make a sleeping entity move wakes it (`wake`): a block or an
+entity under it goes away, or it is written. An entity that was woken by one with a lower id has its turn in the same
+tick, exactly as if it had been awake before. So sleep does not change the results, and an entity that sleeps costs no
+time.
 
-A move is swept: along one axis, the leading face passes the layers of cells and the faces of solid entities
-that it newly reaches, and stops *on* the first one. The numbers are whole grid steps, so "on" is equality; a
-box that overlapped nothing overlaps nothing afterwards, at any speed, with no epsilon and no second pass. What
-was overlapped at the start is no obstacle: it can be left. Rejected: the rewind along the whole velocity
-(loses 93 % of the motion along a wall) and merged slabs (4 times slower than the dense look-up, and their
-seams catch a sliding box).
+A move is swept: along one axis, the leading face passes the layers of blocks and the faces of solid entities that it
+newly reaches, and stops *on* the first one. The numbers are whole grid steps, so "on" means equality. A box that
+overlapped nothing overlaps nothing afterwards, at any speed, with no epsilon and no second pass. An obstacle that the
+box already overlaps does not stop it, so the box can get out. Rejected: the rewind along the whole velocity (loses 93 %
+of the motion along a wall), and merged slabs (4 times slower than the dense look-up, and a sliding box catches on their
+seams).
 
-This source runs compiled by Numba and, unchanged, without it (`shared.kernels`): whole numbers, loops and
-comparisons only.
+This source runs compiled by Numba and, unchanged, in plain Python (`shared.kernels`), so it uses whole numbers, loops
+and comparisons only. In all functions, `w` has the arrays of the world (`shared.layout`), `x0, y0, z0` is the low
+corner of a box and `x1, y1, z1` its high one, in grid steps.
 """
 
 from typing import Any
@@ -89,13 +91,21 @@ from shared.units import BLOCK, BLOCK_SHIFT, IN_SEGMENT, SEGMENT_SHIFT, TO_SEGME
 jit, inlined = decorators(__name__)
 
 ROW_BITS = 32
+"""Number of low bits of a key that hold the row; the bits above hold the id."""
 ROW_MASK = (1 << ROW_BITS) - 1
+"""Mask of a key's row."""
 INSIDE = (1 << SEGMENT_SHIFT) - 1
+"""Mask of a block's place within its segment, along one axis."""
 TO_CELL = BLOCK_SHIFT + CELL_SHIFT
+"""Shift from grid steps to cells, along x and y."""
 TO_CELL_Z = BLOCK_SHIFT + CELL_SHIFT_Z
+"""Shift from grid steps to cells, along z."""
 CELL_TO_SEGMENT = SEGMENT_SHIFT - CELL_SHIFT
+"""Shift from cells to segments, along x and y."""
 CELL_TO_SEGMENT_Z = SEGMENT_SHIFT - CELL_SHIFT_Z
+"""Shift from cells to segments, along z."""
 MOVES = 2 * MOVE_MAX + 1
+"""Number of walk velocities per template: one for each part of a direction, -127 to 127."""
 
 
 # -- looking things up ---------------------------------------------------------------------------------------
@@ -103,7 +113,7 @@ MOVES = 2 * MOVE_MAX + 1
 
 @inlined
 def segment_row(w: Arrays, x: int, y: int, z: int) -> int:
-    """The row of a loaded segment, or NOWHERE; the latest answer is kept in `near`."""
+    """Returns the row of a segment, or NOWHERE if it is not loaded. The latest answer is kept in `near`."""
     near = w.near
     if near[0] == x and near[1] == y and near[2] == z:
         return near[3]
@@ -112,7 +122,7 @@ def segment_row(w: Arrays, x: int, y: int, z: int) -> int:
 
 @jit
 def find_segment(table: Any, segments: Any, near: Any, x: int, y: int, z: int) -> int:
-    """The same through the hash table."""
+    """Looks a segment up in the hash table, keeps the answer in `near`, and returns its row or NOWHERE."""
     mask = len(table) - 1
     at = (x * 73856093 ^ y * 19349663 ^ z * 83492791) & mask
     row = NOWHERE
@@ -131,15 +141,15 @@ def find_segment(table: Any, segments: Any, near: Any, x: int, y: int, z: int) -
 
 @inlined
 def solid_in(w: Arrays, x0: int, y0: int, z0: int, x1: int, y1: int, z1: int) -> bool:
-    """Whether any of the blocks from the first corner to the second, which is included, stops things.
+    """Returns whether any of the blocks between two corners, both included, is an obstacle. Corners are in blocks.
 
-    What is not loaded does, the void below the floor does not.
+    A block that is not loaded is an obstacle, except for the void below the scene's floor.
     """
     for z in range(z0, z1 + 1):
         for y in range(y0, y1 + 1):
             x = x0
             while x <= x1:
-                last = min(x1, x | INSIDE)  # all in one segment, and so in one word
+                last = min(x1, x | INSIDE)  # blocks x to last are in one segment, and so in one word
                 row = segment_row(w, x >> SEGMENT_SHIFT, y >> SEGMENT_SHIFT, z >> SEGMENT_SHIFT)
                 if row == NOWHERE:
                     if z >= w.parameters[FLOOR]:
@@ -154,7 +164,7 @@ def solid_in(w: Arrays, x0: int, y0: int, z0: int, x1: int, y1: int, z1: int) ->
 
 @jit
 def blocks_in(w: Arrays, x0: int, y0: int, z0: int, x1: int, y1: int, z1: int) -> bool:
-    """Whether a solid block overlaps the open box between two corners."""
+    """Returns whether a solid block overlaps the open box between two corners, in grid steps."""
     return solid_in(
         w,
         x0 >> BLOCK_SHIFT, y0 >> BLOCK_SHIFT, z0 >> BLOCK_SHIFT,
@@ -164,7 +174,10 @@ def blocks_in(w: Arrays, x0: int, y0: int, z0: int, x1: int, y1: int, z1: int) -
 
 @jit
 def gather(w: Arrays, but: int, solid: bool, x0: int, y0: int, z0: int, x1: int, y1: int, z1: int) -> int:
-    """Fills `candidates` with the (solid) entities that overlap or touch a box, row `but` left out; up to where."""
+    """Writes the entities that overlap or touch a box to `candidates`, without the row `but`.
+
+    With `solid`, only solid entities count. Returns the number of values written, 7 per entity.
+    """
     p, e, t, found = w.parameters, w.entities, w.templates, w.candidates
     n = 0
     for cz in range((z0 - p[REACH_HI + 2]) >> TO_CELL_Z, ((z1 + p[REACH_LO + 2]) >> TO_CELL_Z) + 1):
@@ -203,13 +216,14 @@ def gather(w: Arrays, but: int, solid: bool, x0: int, y0: int, z0: int, x1: int,
 
 @inlined
 def cell_at(w: Arrays, x: int, y: int, z: int) -> int:
-    """The number of a cell from its place among all cells of the world."""
+    """Returns the number of a cell in `heads`, from its place among all cells of the world."""
     segment = segment_row(w, x >> CELL_TO_SEGMENT, y >> CELL_TO_SEGMENT, z >> CELL_TO_SEGMENT_Z)
     return segment << CELLS_SHIFT | (z & 1) << 6 | (y & 7) << 3 | (x & 7)
 
 
 @jit
 def unlink(w: Arrays, row: int) -> None:
+    """Removes an entity from its cell, if it is in one."""
     e = w.entities
     at = row << WIDTH_SHIFT
     cell = e[at + CELL]
@@ -230,7 +244,7 @@ def unlink(w: Arrays, row: int) -> None:
 
 @jit
 def relink(w: Arrays, row: int) -> None:
-    """Puts an entity into the cell of its position, if it is not there."""
+    """Moves an entity to the cell of its position, if it is not in it already."""
     e = w.entities
     at = row << WIDTH_SHIFT
     cell = cell_at(w, e[at + X] >> TO_CELL, e[at + Y] >> TO_CELL, e[at + Z] >> TO_CELL_Z)
@@ -250,6 +264,7 @@ def relink(w: Arrays, row: int) -> None:
 
 @jit
 def relink_range(w: Arrays, start: int, stop: int) -> None:
+    """Moves the entities of the rows from `start` up to `stop` (excluded) to the cells of their positions."""
     for row in range(start, stop):
         if w.entities[(row << WIDTH_SHIFT) + ID] != 0:
             relink(w, row)
@@ -260,7 +275,7 @@ def relink_range(w: Arrays, start: int, stop: int) -> None:
 
 @jit
 def push(heap: Any, n: int, key: int) -> None:
-    """Adds `key` to a heap of `n` keys, the least on top."""
+    """Adds `key` to a heap of `n` keys, with the least on top."""
     while n > 0:
         parent = (n - 1) >> 1
         if heap[parent] <= key:
@@ -272,7 +287,7 @@ def push(heap: Any, n: int, key: int) -> None:
 
 @jit
 def pop(heap: Any, n: int) -> int:
-    """Takes the least of a heap of `n` keys."""
+    """Removes the least key from a heap of `n` keys, and returns it."""
     least = heap[0]
     n -= 1
     key = heap[n]
@@ -293,7 +308,7 @@ def pop(heap: Any, n: int) -> int:
 
 @inlined
 def wake(w: Arrays, row: int, turn: int) -> None:
-    """Gives a sleeper its next turn: in this tick if it comes after key `turn`, else in the next."""
+    """Wakes an entity that sleeps: it has a turn in this tick if its key is above `turn`, else in the next tick."""
     e, n = w.entities, w.lengths
     at = row << WIDTH_SHIFT
     if e[at + FLAGS] & AWAKE:
@@ -310,7 +325,10 @@ def wake(w: Arrays, row: int, turn: int) -> None:
 
 @jit
 def wake_riders(w: Arrays, n: int, x0: int, y0: int, x1: int, y1: int, top: int, turn: int) -> None:
-    """Wakes those candidates up to `n` that stand on the face between (x0, y0) and (x1, y1) at height `top`."""
+    """Wakes the candidates that stand on the face from (x0, y0) to (x1, y1) at the height `top`.
+
+    `n` is the number of values in `candidates`, and `turn` the key of the entity that has its turn (-1: none).
+    """
     c = w.candidates
     for m in range(0, n, CANDIDATE):
         if c[m + 2] == top and c[m] < x1 and c[m + 3] > x0 and c[m + 1] < y1 and c[m + 4] > y0:
@@ -319,13 +337,13 @@ def wake_riders(w: Arrays, n: int, x0: int, y0: int, x1: int, y1: int, top: int,
 
 @jit
 def wake_on(w: Arrays, but: int, x0: int, y0: int, x1: int, y1: int, top: int) -> None:
-    """Wakes whatever stands on a face: it is about to go (`but`: the row of its owner, or -1)."""
+    """Wakes the entities that stand on a face that is about to go; `but` is the row of the face's owner, or -1."""
     wake_riders(w, gather(w, but, False, x0, y0, top, x1, y1, top), x0, y0, x1, y1, top, -1)
 
 
 @jit
 def wake_in(w: Arrays, x0: int, y0: int, z0: int, x1: int, y1: int, z1: int) -> None:
-    """Wakes whatever overlaps or touches a box."""
+    """Wakes the entities that overlap or touch a box."""
     for m in range(0, gather(w, -1, False, x0, y0, z0, x1, y1, z1), CANDIDATE):
         wake(w, w.candidates[m + 6], -1)
 
@@ -335,7 +353,10 @@ def wake_in(w: Arrays, x0: int, y0: int, z0: int, x1: int, y1: int, z1: int) -> 
 
 @inlined
 def displacement(p: Any, velocity_sum: int) -> int:
-    """Grid steps in one tick for the sum of the old and the new velocity, rounded halves away from zero."""
+    """Returns the displacement of one tick in grid steps, from the sum of the old and the new velocity.
+
+    Halves are rounded away from zero.
+    """
     if p[EXACT] != 0:
         return velocity_sum * p[EXACT]
     rate = p[RATE]
@@ -346,7 +367,7 @@ def displacement(p: Any, velocity_sum: int) -> int:
 
 @inlined
 def stands_on_block(w: Arrays, x0: int, y0: int, x1: int, y1: int, z: int) -> bool:
-    """Whether a solid block touches the underside of a box, with an area."""
+    """Returns whether a solid block touches the underside of a box on an area, not only at an edge."""
     if z & (BLOCK - 1) != 0:
         return False
     below = (z >> BLOCK_SHIFT) - 1
@@ -357,7 +378,7 @@ def stands_on_block(w: Arrays, x0: int, y0: int, x1: int, y1: int, z: int) -> bo
 
 @inlined
 def stands_on_entity(w: Arrays, row: int, x0: int, y0: int, x1: int, y1: int, z: int) -> bool:
-    """Whether a solid entity does."""
+    """Returns whether a solid entity touches the underside of a box on an area, not only at an edge."""
     c = w.candidates
     for m in range(0, gather(w, row, True, x0, y0, z, x1, y1, z), CANDIDATE):
         if c[m + 5] == z and c[m] < x1 and c[m + 3] > x0 and c[m + 1] < y1 and c[m + 4] > y0:
@@ -367,7 +388,10 @@ def stands_on_entity(w: Arrays, row: int, x0: int, y0: int, x1: int, y1: int, z:
 
 @inlined
 def layer_solid(w: Arrays, k: int, layer: int, i0: int, i1: int, j0: int, j1: int) -> bool:
-    """Whether a solid block lies in a layer across axis k, from i0 to i1 along axis k+1 and j0 to j1 along k+2."""
+    """Returns whether a layer of blocks across axis k has a solid block, within i0..i1 and j0..j1.
+
+    i0 to i1 is along axis k+1 and j0 to j1 along axis k+2, in grid steps.
+    """
     i0 >>= BLOCK_SHIFT
     i1 = (i1 - 1) >> BLOCK_SHIFT
     j0 >>= BLOCK_SHIFT
@@ -381,9 +405,10 @@ def layer_solid(w: Arrays, k: int, layer: int, i0: int, i1: int, j0: int, j1: in
 
 @inlined
 def sweep(w: Arrays, k: int, d: int, n: int, a0: int, a1: int, i0: int, i1: int, j0: int, j1: int) -> int:
-    """How far a box gets along axis k, wishing for d, with candidates up to `n`.
+    """Returns how far a box can move along axis k, at most d, up to the first obstacle, in grid steps.
 
-    It reaches from a0 to a1 along axis k, from i0 to i1 along axis k+1 and from j0 to j1 along axis k+2.
+    The box reaches from a0 to a1 along axis k, from i0 to i1 along axis k+1 and from j0 to j1 along axis k+2. `n` is
+    the number of values in `candidates`.
     """
     sign = 1 if d > 0 else -1
     lead = a1 - 1 if d > 0 else a0
@@ -409,10 +434,10 @@ def sweep(w: Arrays, k: int, d: int, n: int, a0: int, a1: int, i0: int, i1: int,
 
 @inlined
 def turn(w: Arrays, row: int, key: int, tick: int) -> bool:
-    """The whole turn of one entity; whether it stays awake."""
+    """Makes the whole turn of one entity. Returns whether it stays awake."""
     e, p, t = w.entities, w.parameters, w.templates
     at = row << WIDTH_SHIFT
-    near = w.near  # nearly all look-ups of this turn are about the segment that it is in
+    near = w.near  # nearly all look-ups of this turn concern the segment that the entity is in
     near[0] = e[at + X] >> TO_SEGMENT
     near[1] = e[at + Y] >> TO_SEGMENT
     near[2] = e[at + Z] >> TO_SEGMENT
@@ -532,7 +557,7 @@ def turn(w: Arrays, row: int, key: int, tick: int) -> bool:
 
 @inlined
 def mark(w: Arrays, row: int, tick: int, events: int) -> None:
-    """Notes that the state of an entity changed in this tick, or before its step, and by what."""
+    """Notes that an entity changed in this tick, or before its step, and the events that changed it."""
     if w.lengths[N_STEPPED] != 0:
         w.lengths[N_STEPPED] = 0
         w.lengths[N_CHANGED] = 0
@@ -549,7 +574,14 @@ def mark(w: Arrays, row: int, tick: int, events: int) -> None:
 
 @jit
 def step(w: Arrays, inputs: Any, n_inputs: int, tick: int) -> None:
-    """One tick. `inputs`: [n * 4] row, move_x, move_y, buttons; an entity without one keeps its latest."""
+    """Computes one tick. An entity without an input goes on with its latest one.
+
+    Args:
+        w: arrays of the world.
+        inputs: [n_inputs * 4] row, move_x, move_y, buttons.
+        n_inputs: number of inputs.
+        tick: number of the tick.
+    """
     e, n = w.entities, w.lengths
     if n[N_STEPPED] != 0:
         n[N_CHANGED] = 0
@@ -579,7 +611,7 @@ def step(w: Arrays, inputs: Any, n_inputs: int, tick: int) -> None:
             at += 1
         row = key & ROW_MASK
         if key == last or e[(row << WIDTH_SHIFT) + ID] != key >> ROW_BITS:
-            continue  # gone since it was woken
+            continue  # the key occurs twice, or the entity was removed after it was woken
         last = key
         if turn(w, row, key, tick):
             w.next_awake[kept] = key
@@ -601,7 +633,7 @@ def step(w: Arrays, inputs: Any, n_inputs: int, tick: int) -> None:
 
 @jit
 def leave(w: Arrays, row: int, states: Any, i: int) -> None:
-    """Wakes what stands on an entity that the state at `i` moves or changes."""
+    """Wakes the entities that stand on an entity, if the state at `i` moves it or changes its template."""
     e, t = w.entities, w.templates
     at = row << WIDTH_SHIFT
     same = e[at + TEMPLATE] == states[i + TEMPLATE]
@@ -617,7 +649,7 @@ def leave(w: Arrays, row: int, states: Any, i: int) -> None:
 
 @jit
 def write(w: Arrays, row: int, states: Any, i: int, tick: int) -> None:
-    """Writes the whole state at `i` (the state columns) into a row ahead of `tick`, wakes it and its riders."""
+    """Writes the state at `i` to a row before the step of `tick`. Wakes the entity and those that stand on it."""
     e = w.entities
     at = row << WIDTH_SHIFT
     if e[at + CELL] >= 0:
@@ -633,14 +665,17 @@ def write(w: Arrays, row: int, states: Any, i: int, tick: int) -> None:
 
 @jit
 def store(w: Arrays, rows: Any, states: Any, n: int, tick: int) -> None:
-    """Writes `n` whole states."""
+    """Writes `n` states to their rows before the step of `tick`."""
     for i in range(n):
         write(w, rows[i], states, CELL * i, tick)
 
 
 @jit
 def settle(w: Arrays, rows: Any, states: Any, n: int, tick: int) -> int:
-    """The same for newcomers, up to the first whose place is taken; how many."""
+    """Writes the states of new entities like `store`, up to the first whose place is occupied.
+
+    Returns the number of states written.
+    """
     t, c = w.templates, w.candidates
     for i in range(n):
         kind = states[CELL * i + TEMPLATE] * TEMPLATE_COLUMNS
@@ -665,9 +700,17 @@ def settle(w: Arrays, rows: Any, states: Any, n: int, tick: int) -> int:
 
 @inlined
 def advance(w: Arrays, row: int, events: int, turns: Any, i: int) -> None:
-    """The turn of an entity in a world that is written, not stepped: `turn`, with its decisions told.
+    """Makes the turn of an entity in a world that is written, not stepped: as `turn`, but with given events.
 
-    Without any, it goes on as before. What would leave its segment stays: that is told by the whole state.
+    Without events, the entity moves on as before, with nothing in its way. An entity that would leave its segment stays
+    as it was, because the server then sends its whole state.
+
+    Args:
+        w: arrays of the world.
+        row: row of the entity.
+        events: events of the turn (`layout.STOP_X` ...).
+        turns: explicit turns, [n * 8], with the input and the position of the events.
+        i: place of this turn in `turns`.
     """
     e, p, t = w.entities, w.parameters, w.templates
     at = row << WIDTH_SHIFT
@@ -732,8 +775,22 @@ def advance(w: Arrays, row: int, events: int, turns: Any, i: int) -> None:
 
 @jit
 def follow(w: Arrays, turns: Any, n: int, rows: int, ticks: int, tick: int) -> bool:
-    """Takes the first `rows` rows on by `ticks`; those `n` in `turns`, which are told, by one; whether all of these are
-    there (a row that is not: -1). Nothing counts as changed then. What was written ahead of `tick` is as it says."""
+    """Extrapolates the first `rows` rows by `ticks`, and applies `n` explicit turns for one tick.
+
+    A row with an explicit turn is not extrapolated, nor is one that was written before `tick`. Afterwards no row counts
+    as changed.
+
+    Args:
+        w: arrays of the world.
+        turns: explicit turns, [n * 8]: row (-1: there is no such entity), events, input (3), position (3).
+        n: number of explicit turns.
+        rows: number of rows of the world.
+        ticks: number of ticks.
+        tick: number of the first of these ticks.
+
+    Returns:
+        Whether there is an entity for every explicit turn.
+    """
     e = w.entities
     all_there = True
     for i in range(0, n * TURN, TURN):
@@ -760,7 +817,10 @@ def follow(w: Arrays, turns: Any, n: int, rows: int, ticks: int, tick: int) -> b
 
 @jit
 def collect(e: Any, rows: int, out: Any) -> int:
-    """Copies the states in use to `out` ([rows * 12]), ascending by id, without bookkeeping; how many."""
+    """Copies the states of all entities to `out` ([rows * 12]), ascending by id, without the bookkeeping flag.
+
+    Returns the number of states.
+    """
     n = 0
     for row in range(rows):
         from_ = row << WIDTH_SHIFT

@@ -33,6 +33,7 @@ COMPLIANT = (
     "hatch_build.py",
     "scripts/checks",
     "server",
+    "shared",
     "sovereign_netcode",
     "tests/readme/pages.py",
     "tests/readme/test_links.py",

@@ -87,7 +87,7 @@ def test_a_change_of_what_it_does_makes_it_stale(copy: Path, file: str, old: str
 @here
 def test_comments_do_nothing(copy: Path) -> None:
     edit(copy, "kernel.py", "    least = heap[0]\n", "\n    # The least is on top.\n    least = heap[0]  # always\n")
-    edit(copy, "bulk.py", '"""The four bytes from', '"""Reads the four bytes\n\n    from')
+    edit(copy, "bulk.py", '"""Returns four bytes from', '"""Returns four bytes\n\n    from')
     assert chosen(copy) == [PREBUILT, "", PREBUILT]
     manifest = copy / "shared" / "prebuilt" / kernels.MANIFEST
     manifest.write_text("{", "utf-8")
