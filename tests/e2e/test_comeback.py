@@ -13,7 +13,7 @@ import pytest
 from client_sdk.async_client import AsyncClient
 from client_sdk.client import Client
 from client_sdk.events import Disconnected, Event, Joined, Left, Resumed
-from scripts._walkers import walk
+from scripts.soak_test.walkers import walk
 from tests.client_sdk.servers import ROOT
 from tests.e2e.processes import MOVING_BLOCKS, RECOVERY_S, Strider
 

@@ -8,7 +8,11 @@ from pathlib import Path
 
 import pytest
 
-from scripts import _soakers, _walkers, soak
+from scripts.soak_test import app as soak
+from scripts.soak_test.cells import Cells
+from scripts.soak_test.disturbance import QUIET_SHARE, Course
+from scripts.soak_test.server_process import logged
+from scripts.soak_test.walkers import Walker
 from shared import messages
 from tests.e2e.processes import ROOT
 from tests.worlds import build, floor
@@ -42,7 +46,7 @@ def test_everything_at_once_loses_no_edit_and_leaves_no_error_unexplained(tmp_pa
 
 def test_an_edit_that_was_told_and_is_not_there_is_found() -> None:
     world, untouched = build([floor()]), build([floor()])
-    cells, rng = _soakers.Cells(), random.Random(1)
+    cells, rng = Cells(), random.Random(1)
     done, open_, refused = (0, 0, 1), (1, 0, 1), (2, 0, 1)
     kinds = [cells.ask(7, cell, rng) for cell in (done, open_, refused)]
     assert None not in kinds
@@ -62,13 +66,13 @@ def test_what_a_log_holds_is_explained_or_not(tmp_path: Path) -> None:
     told = [("started", "info"), ("the event loop has stalled", "warning"), ("internal error in serving", "error")]
     lines = [json.dumps({"event": event, "level": level}) for event, level in told]
     (tmp_path / "log 1").write_text("\n".join([*lines, "Traceback (most recent call last):"]) + "\n", "utf-8")
-    bad, explained = soak.logged(tmp_path)
+    bad, explained = logged(tmp_path)
     assert [line.partition(": ")[2] for line in bad] == [lines[2], "Traceback (most recent call last):"]
     assert explained == {"the event loop has stalled": 1}
 
 
 def test_a_player_who_was_stuck_is_an_error() -> None:
-    walker = _walkers.Walker(0, 0)
+    walker = Walker(0, 0)
     assert soak.wrongs(walker) == []
     walker.progress.stuck_s = soak.STUCK_S_MAX + 0.5
     walker.unexplained.append("left")
@@ -77,7 +81,7 @@ def test_a_player_who_was_stuck_is_an_error() -> None:
 
 def test_a_course_has_one_of_each_at_least_and_a_quiet_end() -> None:
     for minutes in (0.25, 1.0, 30.0):
-        plan = soak.Course(60 * minutes, random.Random(2)).plan()
+        plan = Course(60 * minutes, random.Random(2)).plan()
         assert {what for _, what in plan} == {"kill", "stall", "abuse"}
-        assert all(at <= 60 * minutes * (1 - soak.QUIET_SHARE) for at, what in plan if what == "kill")
+        assert all(at <= 60 * minutes * (1 - QUIET_SHARE) for at, what in plan if what == "kill")
         assert plan == sorted(plan)

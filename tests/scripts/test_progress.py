@@ -6,8 +6,8 @@ from random import Random
 import pytest
 
 from client_sdk.core import Core
-from scripts._progress import Progress
-from scripts._walkers import LOOK_S, Walker, walk
+from scripts.soak_test.progress import Progress
+from scripts.soak_test.walkers import LOOK_S, Walker, walk
 from shared.inputs import Input
 from shared.messages import Inputs, decode_from_client
 from shared.scene import load_scene

@@ -1,14 +1,14 @@
-"""Whether a player gets anywhere: inputs that the server used, and blocks walked."""
+"""Detection of players that are stuck although snapshots arrive."""
 
 from collections import deque
 from typing import NamedTuple
 
 WITHIN_S = 2.0
-"""A player is to move again within this time, in seconds, from the first snapshot after a stall on."""
+"""Time, in seconds from the first snapshot after a stall, within which a player must move again."""
 GAP_S = 0.5
-"""The time without a snapshot, in seconds, that counts as a stall."""
+"""Time without a snapshot, in seconds, that counts as a stall."""
 WALKED_MIN = 0.5
-"""The way, in blocks, that a player who walks all the time covers at least in `WITHIN_S`."""
+"""Least distance, in blocks, that a walking player covers in `WITHIN_S`."""
 
 
 class _Look(NamedTuple):
@@ -18,12 +18,12 @@ class _Look(NamedTuple):
 
 
 class Progress:
-    """Counts the seconds in which snapshots came, but nothing that the player wished had happened for `WITHIN_S`.
+    """Counts the seconds in which snapshots came, but had no effect of the player's inputs for `WITHIN_S`.
 
-    Snapshots alone say nothing: a server goes on sending them to a client whose inputs it refuses.
+    Snapshots alone prove nothing, because a server goes on sending them to a client whose inputs it refuses.
 
     Args:
-        walks: the player walks all the time, so that the way counts as well.
+        walks: whether the player walks all the time; if so, it must also cover `WALKED_MIN`.
     """
 
     def __init__(self, *, walks: bool) -> None:
@@ -50,5 +50,5 @@ class Progress:
             self.stuck_s += now - looks[-2].at
 
     def away(self) -> None:
-        """The player has no connection, or another one: the time begins anew."""
+        """Restarts the time, because the player has no connection or a new one."""
         self._looks.clear()

@@ -1,4 +1,4 @@
-"""Players of the SDK for `soak.py`: they walk in circles and jump, all the time, and see whether they get anywhere."""
+"""Players of the SDK that walk in circles and jump all the time, and check that they move."""
 
 import asyncio
 import math
@@ -9,34 +9,34 @@ from client_sdk.async_client import AsyncClient
 from client_sdk.core import Core
 from client_sdk.events import Diverged, Left
 from client_sdk.transports.connection import ConnectError
-from scripts._progress import Progress
+from scripts.soak_test.progress import Progress
 from shared.inputs import make_input
 
 LOOK_S = 0.1
 AGAIN_S = 0.5
 TURN_TICKS = 96
-"""One round of a circle."""
+"""Ticks per round of the circle."""
 JUMP_BLOCKS = 3.0
-"""A longer way between two looks is no walking: the player was put somewhere."""
+"""Longest distance, in blocks, between two looks of a walking player. A player that is farther away was placed."""
 
 
 class Walker:
-    """One player, from its first join until the task is cancelled."""
+    """A player, from its first join until the task is cancelled."""
 
     def __init__(self, number: int, port: int) -> None:
         self.number, self.port = number, port
         self.progress = Progress(walks=True)
         self.walked = 0.0
-        """Blocks, up and down included."""
+        """Distance in blocks, up and down included."""
         self.used = 0
-        """Inputs that the server has used, over all connections."""
+        """Number of inputs that the server has used, over all connections."""
         self.unexplained: list[str] = []
         self.counts: Counter[str] = Counter()
         self._place: tuple[float, float, float] | None = None
         self._tick = -1
 
     async def play(self) -> None:
-        """Connection after connection."""
+        """Plays, and connects again after each connection."""
         url, name = f"ws://127.0.0.1:{self.port}", f"walker {self.number}"
         while True:
             try:
@@ -63,7 +63,7 @@ class Walker:
             self.look(core, time.monotonic())
 
     def look(self, core: Core, now: float) -> None:
-        """Takes what the newest snapshot says, if it is a new one."""
+        """Takes the newest snapshot, unless it was taken before."""
         confirmed = core.prediction.confirmed if core.prediction else None
         if core.state != "playing" or confirmed is None or core.entity not in confirmed:
             self._place = None

@@ -1,6 +1,6 @@
-"""Honest players for `soak.py`: lean, on the wire alone; they walk, build, lose connections, come back, leave and join.
+"""Honest players that use the wire protocol without the SDK: they walk, build, lose connections, return and leave.
 
-Each has blocks of its own that nobody else edits, so that what a block may be follows from what its player was told.
+No other player edits the blocks of a player, so the answers to a player determine what its blocks may be.
 """
 
 import asyncio
@@ -15,61 +15,21 @@ import numpy as np
 
 from client_sdk.prediction.confirmed import Confirmed
 from client_sdk.replica import check_scene
-from scripts._progress import Progress
 from scripts.loadgen.generator import REQUEST, frame
+from scripts.soak_test.cells import Cell, Cells
+from scripts.soak_test.progress import Progress
 from shared import edits, messages
 from shared.messages import Bye, Command, Hello, Inputs, Ping, Snapshot, Welcome, decode_from_server, encode
 from shared.snapshot import VERDICT
-from shared.world import World
 
 LEAD_TICKS = 2
 CONNECT_S = 5.0
 AWAY_S = 13.0
-"""Who was away for longer may find another entity: the server keeps it for 15 s, and notices a loss in its own time."""
-Cell = tuple[int, int, int]
-
-
-class Cells:
-    """What each edited block may be: the kind last told to be done, and those asked for since without an answer."""
-
-    def __init__(self) -> None:
-        self.asked: dict[Cell, list[int | None]] = {}
-        """None: what the terrain has there."""
-        self.owner: dict[Cell, int] = {}
-        self.verdicts: Counter[int] = Counter()
-        self.settled: set[Cell] = set()
-        """Those about which something has been acknowledged."""
-
-    def ask(self, player: int, cell: Cell, rng: random.Random) -> int | None:
-        """A kind to ask for that tells this edit from others that are open; None: the block is another's."""
-        if self.owner.setdefault(cell, player) != player:
-            return None
-        kinds = self.asked.setdefault(cell, [None])
-        kind = rng.choice([kind for kind in range(256) if kind not in kinds])
-        kinds.append(kind)
-        return kind
-
-    def answered(self, cell: Cell, kind: int, verdict: int) -> None:
-        self.verdicts[verdict] += 1
-        kinds = self.asked[cell]
-        if verdict == messages.DONE:
-            self.settled.add(cell)
-            del kinds[: kinds.index(kind)]
-        else:
-            kinds.remove(kind)
-
-    def lost(self, world: World, untouched: World) -> list[str]:
-        """Blocks that are not what they may be."""
-        found = []
-        for cell, kinds in self.asked.items():
-            kind = world.blocks.get(*cell)
-            if kind not in [untouched.blocks.get(*cell) if each is None else each for each in kinds]:
-                found.append(f"block {cell} is {kind}; could be {kinds}")
-        return found
+"""Longest time, in seconds, for which a disconnected player surely keeps its entity. The server keeps it for 15 s."""
 
 
 class Link(asyncio.Protocol):
-    """One connection: whole messages go to the player."""
+    """A connection that passes whole messages to its player."""
 
     def __init__(self, player: "Honest") -> None:
         self.player = player
@@ -119,13 +79,14 @@ class Link(asyncio.Protocol):
 
 
 class Honest:
-    """One player, from its first join until the task is cancelled.
+    """A player, from its first join until the task is cancelled.
 
     Args:
-        number: its own.
-        port: of the server.
-        cells: common to all.
-        lossy: it is cut off every few seconds.
+        number: number of the player, which is part of its name and seed.
+        port: port of the server.
+        seed: seed of the whole soak test.
+        cells: the edited blocks of all players.
+        lossy: whether the connection is cut every few seconds.
     """
 
     def __init__(self, number: int, port: int, seed: int, cells: Cells, *, lossy: bool) -> None:
@@ -135,21 +96,21 @@ class Honest:
         self.unexplained: list[str] = []
         self.counts: Counter[str] = Counter()
         self.got = self.due = 0
-        """Snapshots that came, and that the server made, between the first and the last of each connection."""
+        """Snapshots received, and snapshots made by the server, between the first and last of each connection."""
         self.playing = False
         self.progress = Progress(walks=False)
         self.used = 0
-        """Inputs that the server has used."""
+        """Number of inputs that the server has used."""
         self._waiting: dict[int, tuple[Cell, int, Command]] = {}
         self._copy: Confirmed | None = None
-        """What it knows of the world, but for the terrain."""
+        """Copy of the world, without terrain."""
         self._asked = 0
         self._tick = self._sent = -1
         self._row = bytes(3)
         self._lost_at = -math.inf
 
     async def play(self) -> None:
-        """Connection after connection."""
+        """Plays, and connects again after each connection."""
         loop, failed = asyncio.get_running_loop(), 0
         while True:
             try:
@@ -165,7 +126,7 @@ class Honest:
             await asyncio.sleep(self.rng.uniform(0.1, 2.0))
 
     async def _connected(self, link: Link) -> None:
-        """Until it is over, by the server's doing or one's own."""
+        """Waits until the server ends the connection, or ends it after a random time."""
         stay = self.rng.uniform(4, 15) if self.lossy else self.rng.uniform(20, 90)
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(stay):
@@ -191,11 +152,11 @@ class Honest:
                 link.transport.abort()
 
     def hello(self, link: Link) -> None:
-        """The WebSocket is open."""
+        """Sends the hello once the WebSocket is open."""
         link.send(Hello(messages.VERSION, {}, f"honest {self.number}", resume=self.resume))
 
     def take(self, link: Link, data: bytes) -> None:
-        """One message."""
+        """Takes a message of the server."""
         message = decode_from_server(data)
         if isinstance(message, Snapshot):
             self._snapshot(link, message)
@@ -246,7 +207,7 @@ class Honest:
             self._edit(link, snapshot)
 
     def _edit(self, link: Link, snapshot: Snapshot) -> None:
-        """A block next to where the player is."""
+        """Requests an edit of a block near the player."""
         if self._copy is None or self.entity not in self._copy.world:
             return
         x, y, z = (int(part // 1) + self.rng.randint(-3, 3) for part in self._copy.world.position(self.entity))
