@@ -19,7 +19,7 @@ import sys
 from collections import Counter
 from collections.abc import Awaitable, Callable
 
-from scripts.loadgen.generator import REQUEST, frame
+from scripts.loadgen.player import REQUEST, frame
 from shared import messages
 from shared.messages import CLIENT_MESSAGE_MAX, Command, Hello, Inputs, Ping, encode
 

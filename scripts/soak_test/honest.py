@@ -15,7 +15,7 @@ import numpy as np
 
 from client_sdk.prediction.confirmed import Confirmed
 from client_sdk.replica import check_scene
-from scripts.loadgen.generator import REQUEST, frame
+from scripts.loadgen.player import REQUEST, frame
 from scripts.soak_test.cells import Cell, Cells
 from scripts.soak_test.progress import Progress
 from shared import edits, messages

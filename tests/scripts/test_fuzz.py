@@ -4,7 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from scripts import _targets, fuzz
+from scripts.fuzzing import app as fuzz
+from scripts.fuzzing import targets
 from tests.lengths import long
 
 INPUTS = {"client": 20_000, "server": 10_000, "value": 10_000, "edit": 10_000, "session": 8_000, "settings": 150}
@@ -12,7 +13,7 @@ SEED = 7
 
 
 @pytest.mark.parametrize("share", [0.2, *long(1.0)])
-@pytest.mark.parametrize("name", sorted(_targets.TARGETS))
+@pytest.mark.parametrize("name", sorted(targets.TARGETS))
 def test_a_short_run_from_the_corpus_that_is_kept(name: str, share: float) -> None:
     found = fuzz.fuzz(name, round(share * INPUTS[name]), SEED)
     assert found["failure"] == ""
@@ -32,7 +33,7 @@ def test_what_breaks_a_promise_is_found_and_told_with_its_input(monkeypatch: pyt
         assert b"\xc1" not in data
         return str(len(data) > 10)
 
-    monkeypatch.setitem(_targets.TARGETS, "client", (lambda: fragile, (b"abc",), 1))
+    monkeypatch.setitem(targets.TARGETS, "client", (lambda: fragile, (b"abc",), 1))
     found = fuzz.fuzz("client", 5000, SEED, corpus=Path("nowhere"))
     assert "AssertionError" in found["failure"]
     assert "c1" in found["failure"].partition(": ")[2].partition("\n")[0]

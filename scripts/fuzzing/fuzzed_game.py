@@ -42,25 +42,25 @@ class _Shooting(Rules):
 class _Deaf:
     """A link that is sometimes congested, and that may report the loss of the connection while it is being closed."""
 
-    def __init__(self, house: "House", number: int) -> None:
-        self.house, self.number, self.waiting = house, number, 0
+    def __init__(self, game: "FuzzedGame", number: int) -> None:
+        self.game, self.number, self.waiting = game, number, 0
 
     def send(self, message: bytes) -> None:
         assert len(message) <= messages.MESSAGE_MAX
         if message[1] == WELCOME:
             welcome = decode_from_server(message)
             assert isinstance(welcome, Welcome)
-            self.house.tokens.append(welcome.resume)
+            self.game.tokens.append(welcome.resume)
 
     def outstanding(self) -> int:
         return self.waiting
 
     def close(self, code: int, reason: str) -> None:
         if self.number % 2:
-            self.house.lose(self.number)
+            self.game.lose(self.number)
 
 
-class House:
+class FuzzedGame:
     """A target of the fuzzer: a game with players, each input of which is one client's next message."""
 
     PLAYERS = 6

@@ -12,7 +12,7 @@ import tempfile
 from collections.abc import Callable
 from pathlib import Path
 
-from scripts._house import House
+from scripts.fuzzing.fuzzed_game import FuzzedGame
 from server.config.options import SettingsError
 from server.config.settings import KINDS, Settings, parse
 from shared import edits
@@ -187,7 +187,7 @@ TARGETS: dict[str, tuple[Callable[[], Target], tuple[bytes, ...], int]] = {
     "server": (lambda: server, tuple(map(encode, FROM_SERVER)), 200),
     "value": (lambda: value, VALUES, 200),
     "edit": (lambda: edit, VALUES, 180),
-    "session": (House, tuple(map(encode, FROM_CLIENT)), 38),
+    "session": (FuzzedGame, tuple(map(encode, FROM_CLIENT)), 38),
     "settings": (Desk, SETTINGS, 2),
 }
 """Targets by name: a function that makes the target, its first inputs, and its share of all inputs in thousandths."""

@@ -1,0 +1,1 @@
+"""The fuzzer of the decoders, of a game and of the settings."""
