@@ -57,7 +57,7 @@ Observation = dict[str, Array]
 Reward = Callable[[Stage, int], float]
 
 
-class Arena(ParallelEnv):  # type: ignore[misc]  # it says nothing of its types
+class Arena(ParallelEnv):  # type: ignore[misc]  # it has no type information
     """A game whose agents join at the start of an episode and play until its time is over.
 
     Observations are a `Dict` of "own" [8] and "others" [8, 8] (float32; blocks and blocks/s), and "blocks" [5, 7, 7]

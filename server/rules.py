@@ -45,7 +45,7 @@ class Rules:
     """The scene to play if the operator names none: a name or the path of a file. Empty: the server's default."""
 
     game: "Stage"
-    """The running game. Not available in `__init__` and `prepare`."""
+    """The game API of the running game. Not available in `__init__` and `prepare`."""
 
     if not TYPE_CHECKING:  # with a visible __getattr__ a type checker would accept every misspelt attribute
 

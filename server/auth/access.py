@@ -49,7 +49,7 @@ def tls_context(settings: Settings) -> ssl.SSLContext | None:
     context.minimum_version = ssl.TLSVersion.TLSv1_2
     try:
         context.load_cert_chain(settings.tls_cert, settings.tls_key)
-    except OSError as error:  # an SSLError is one
+    except OSError as error:  # an SSLError is an OSError, too
         files = f"tls_cert = {settings.tls_cert!r}, tls_key = {settings.tls_key!r}"
         raise SettingsError(f"{files}: cannot be used ({error.strerror or error})") from error
     return context

@@ -295,7 +295,7 @@ class Connection(Guest):
             if events:
                 self._answer(cast("HttpRequest", events[0]))
                 break
-            if isinstance(protocol.handshake_exc, InvalidMessage):  # websockets alone would only close
+            if isinstance(protocol.handshake_exc, InvalidMessage):  # websockets itself closes without an answer
                 response = protocol.reject(HTTPStatus.BAD_REQUEST, "this is not an HTTP request\n")
                 protocol.writes.insert(0, response.serialize())
             if protocol.eof_sent:

@@ -26,15 +26,15 @@ assert sys.byteorder == "little", "margins lie in memory as they go over the wir
 
 @lru_cache(4096)
 def _wish(row: bytes) -> Input:
-    """A row as an input that is allowed. Hands hold keys for longer than a tick: most rows have been seen before."""
+    """Decodes and clamps an input. The cache helps because a key is held for many ticks, so most rows repeat."""
     return clamp(Input(*INPUT_ROW.unpack(row)))
 
 
 class InputQueue:
-    """The inputs of one player: exactly one is taken per tick, and each one's fate is kept until it is sent.
+    """The inputs of one player. Exactly one is taken per tick, and its status is kept until it is sent.
 
     Args:
-        bounds: those of the scene's tick rate.
+        bounds: bounds for the scene's tick rate.
     """
 
     def __init__(self, bounds: Bounds = DEFAULT) -> None:

@@ -1,6 +1,6 @@
 """Sending: the newest snapshot to each client whose connection has room, then game events and terrain.
 
-Theory of operation. Once per tick `serve` is called for each session. If more bytes are on the way to the client than
+Theory of operation. Once per tick `serve` is called for each client. If more bytes are on the way to the client than
 flow control allows (`flow_control`), the tick is left out; the next snapshot has the union of the changes. The client
 view (`client_view`) chooses the segments of a snapshot. The change log (`change_log`) encodes the changes of a segment,
 once for all clients. Shared values and game events follow the snapshot; an event is not sent before a snapshot that has
@@ -35,7 +35,7 @@ more."""
 
 
 class Delivery:
-    """The sender of snapshots, game events and terrain to all sessions.
+    """The sender of snapshots, game events and terrain to all clients.
 
     Args:
         world: the world.
@@ -142,7 +142,8 @@ class Delivery:
         could not show the events; they wait until there is room and no terrain is due.
 
         Args:
-            session: the session.
+            stream: the sending state of the client.
+            player: the client's player.
             window: bytes that may be on the way.
         """
         if stream.shared_due:
