@@ -191,6 +191,7 @@ POLICIES: dict[str, Callable[[Random], Policy]] = {
     "follow": Follow,
     "dig-and-place": DigAndPlace,
 }
+"""Policies by name."""
 
 
 def _heading(random: Random, *, jump: bool) -> Input:

@@ -96,3 +96,4 @@ class Compiler:
 
 
 COMPILER = Compiler()
+"""The background compilation that all clients of the program share."""

@@ -358,11 +358,11 @@ class Core:
                 else:
                     self._end(left)
             case _:
-                raise ProtocolError(f"{type(message).__name__} from a server")
+                raise ProtocolError(f"unexpected {type(message).__name__} message from a server")
 
     def _welcome(self, welcome: messages.Welcome, now: float) -> None:
         if self._filled:
-            raise ProtocolError("a second Welcome")
+            raise ProtocolError("unexpected second Welcome message")
         self._plain_for_now = self._compiled is None and not kernels.ready()
         compiled = False if self._plain_for_now else self._compiled
         world = Replica(welcome, self.clock, now, neighbours=self._neighbours, compiled=compiled)
@@ -392,7 +392,7 @@ class Core:
 
     def _welcomed(self, message: messages.Message) -> Replica:
         if self._filled is None:
-            raise ProtocolError(f"{type(message).__name__} before Welcome")
+            raise ProtocolError(f"unexpected {type(message).__name__} message before Welcome")
         return self._filled
 
     def _snapshot(self, snapshot: messages.Snapshot, now: float) -> None:

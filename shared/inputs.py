@@ -29,6 +29,7 @@ class Input(NamedTuple):
 
 
 NEUTRAL = Input()
+"""Input of a player that does nothing."""
 
 
 def make_input(x: float = 0.0, y: float = 0.0, *, jump: object = False, buttons: int = 0) -> Input:
@@ -55,7 +56,7 @@ def _way(part: object, at: str) -> float:
         return part  # type: ignore[return-value]
     number = finite(int(part) if isinstance(part, bool | np.bool_) else part, at)
     if abs(number) > FAR:
-        raise SceneError(f"{at} = {shown(part)}: must be finite, and at most {FAR:g} either way")
+        raise SceneError(f"{at} = {shown(part)}: must be from -{FAR:g} to {FAR:g}")
     return number
 
 

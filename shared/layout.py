@@ -10,7 +10,9 @@ import numpy as np
 import numpy.typing as npt
 
 COLUMNS = "id template flags x y z vx vy vz move_x move_y buttons cell next prev changed".split()
+"""Names of the columns of an entity's row."""
 ID, TEMPLATE, FLAGS, X, Y, Z, VX, VY, VZ, MOVE_X, MOVE_Y, BUTTONS, CELL, NEXT, PREV, CHANGED = range(16)
+"""Columns of an entity's row; the first 12 are its state."""
 ENTITY = np.dtype([(name, np.int64) for name in COLUMNS])
 """Type of an entity's row. `id` is 0 in a free row. Position and velocity are in grid steps. `cell` is the entity's
 cell in the entity index (-1: none), and `next` and `prev` are its neighbour rows in that cell. `changed` is
@@ -34,18 +36,27 @@ came into another segment, so its whole state is needed."""
 TURN = 8
 """Number of columns of an explicit turn: id (for the kernel: row, or -1), events, input (3), position (3)."""
 
-# Columns of a template's row: the box relative to the position, and the abilities.
 LO_X, LO_Y, LO_Z, SIZE_X, SIZE_Y, SIZE_Z, SOLID, WALKS, JUMP_SPEED = range(9)
+"""Columns of a template's row. LO and SIZE: low corner of the box relative to the position, and its sides, in grid
+steps. SOLID, WALKS: 0 or 1. JUMP_SPEED: in velocity steps."""
 TEMPLATE_COLUMNS = 9
+"""Number of columns of a template's row."""
 
-# Places of the scene's numbers in `Arrays.parameters`.
-GRAVITY, TERMINAL, RATE, EXACT, MEAN, PAIRS, FLOOR = range(7)  # FLOOR: the lowest z, in blocks
-REACH_LO, REACH_HI = 7, 10  # how far any box reaches below and above its position, three columns each
+GRAVITY, TERMINAL, RATE, EXACT, MEAN, PAIRS, FLOOR = range(7)
+"""Places of a scene's numbers in `Arrays.parameters`. GRAVITY: velocity steps per tick. TERMINAL: greatest fall speed,
+in velocity steps. RATE: ticks per second. EXACT: 128 / RATE if that is a whole number, else 0. MEAN: 1 for the
+integrator "mean". PAIRS: 1 if solid entities stop each other. FLOOR: lowest z of the scene, in blocks."""
+REACH_LO, REACH_HI = 7, 10
+"""Places in `Arrays.parameters` of how far any template's box reaches below and above its position, three numbers each,
+in grid steps."""
 PARAMETERS = 13
+"""Number of values in `Arrays.parameters`."""
 
-# Places of the lists' lengths in `Arrays.lengths`.
 N_AWAKE, N_WOKEN, N_CHANGED, N_FELL, N_LATER, N_HOMELESS, N_STEPPED = range(7)
+"""Places of the lists' lengths in `Arrays.lengths`. N_HOMELESS: number of entities in no loaded segment. N_STEPPED: 1
+if nothing has changed since the latest step."""
 LENGTHS = 7
+"""Number of values in `Arrays.lengths`."""
 
 CELL_SHIFT = 2
 """Shift from blocks to a cell of the entity index, along x and y."""
@@ -85,5 +96,5 @@ class Arrays(NamedTuple):
     candidates: Any  # [(rows + 1) * 7] box and row of the entities near the one that has its turn
     changed: Any  # [rows + 1] rows whose state the step changed
     fell: Any  # [rows + 1] ids of entities below the scene's floor
-    lengths: Any  # [7]; N_HOMELESS: entities in no loaded segment; N_STEPPED: nothing has changed since a step
+    lengths: Any  # [7] lengths of the lists, and other counts (N_AWAKE ...)
     near: Any  # [4] index and row of the segment that was looked up last

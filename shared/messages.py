@@ -116,9 +116,12 @@ VERDICT_TEXTS = (
 )
 """Texts of the verdicts, by number."""
 
-# Close codes.
 GOING_AWAY, PROTOCOL, TEXT, TOO_BIG, INTERNAL = 1001, 1002, 1003, 1009, 1011
+"""Close codes of WebSocket (RFC 6455) that the server and the client use."""
 WRONG_VERSION, WRONG_SCENE, MALFORMED, FULL, TOO_SLOW, NO_HELLO, TAKEN_OVER, UNAUTHORISED = range(4001, 4009)
+"""Close codes of this protocol. FULL: the server has no room for another player. TOO_SLOW: the connection cannot keep
+up, or nothing was received for too long. NO_HELLO: no `Hello` came in time. TAKEN_OVER: another connection goes on as
+this player."""
 
 
 class ProtocolError(ValueError):
@@ -436,7 +439,7 @@ def decode(data: bytes, kinds: frozenset[int], longest: int, lists: int = LIST_M
     except Exception as error:  # msgpack raises some ten kinds for bytes that are not MessagePack
         raise ProtocolError(f"not MessagePack ({type(error).__name__})") from error
     if type(parts) is not list or not parts or type(parts[0]) is not int or parts[0] not in kinds:
-        raise ProtocolError("not a message of this side")
+        raise ProtocolError("not a list that begins with a kind of message which this side may send")
     kind, checks = KINDS[parts[0]]
     values = parts[1:]
     if kind is Snapshot and len(checks) <= len(values) <= len(checks) + SEGMENTS_MAX:

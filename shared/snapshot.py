@@ -308,7 +308,7 @@ def _decode_rows(rows: bytes, corners: list[int], templates: int, kernel: Kernel
 def _decode_turns(heads: bytes, tails: bytes, kernel: Kernel) -> Int64s:
     turns = np.empty((len(heads) // HEAD.itemsize, TURN), np.int64)
     if not kernel.read_turns(heads, tails, kernel.lent(turns)):
-        raise ProtocolError("segment.tails: too many or too few")
+        raise ProtocolError("segment.tails: too many or too few bytes for the heads")
     return turns
 
 
@@ -318,7 +318,7 @@ def _decode_part(part: Any, corners: list[int], news: tuple[list[bytes], ...]) -
     Appends its low corner (grid steps) and its number of rows to `corners`, and its heads, tails and rows to `news`.
     """
     if type(part) is not list or not 4 <= len(part) <= 11:
-        raise ProtocolError("segment: not four to eleven fields")
+        raise ProtocolError("segment: must be a list of 4 to 11 fields")
     x, y, z, ago, heads, tails, rows, gone, check, edits, attributes = part + NO_FIELDS[len(part) - 4 :]
     if not (type(x) is type(y) is type(z) is int and -FAR <= x < FAR and -FAR <= y < FAR and -FAR <= z < FAR):
         raise ProtocolError(f"segment {shown(x)} {shown(y)} {shown(z)}: not allowed")
@@ -333,7 +333,7 @@ def _decode_part(part: Any, corners: list[int], news: tuple[list[bytes], ...]) -
     ):
         raise ProtocolError("segment: heads, tails, rows, gone or edits are not bytes, too long, or of a wrong length")
     if heads and ago != 1:
-        raise ProtocolError(f"segment.heads of {ago} ticks: not allowed")
+        raise ProtocolError(f"segment.heads: not allowed with ago = {ago}, only with 1")
     all_heads, all_tails, all_rows = news
     all_heads.append(heads)
     all_tails.append(tails)
@@ -350,7 +350,7 @@ def _decode_part(part: Any, corners: list[int], news: tuple[list[bytes], ...]) -
 
 def _decode_attributes(attributes: Any) -> list[tuple[int, dict[str, Any]]]:
     if type(attributes) is not list or len(attributes) % 2:
-        raise ProtocolError("segment.attributes: not allowed")
+        raise ProtocolError("segment.attributes: must be a list of pairs of entity and table")
     said = list(zip(attributes[::2], attributes[1::2], strict=True))
     for entity, values in said:
         if type(entity) is not int or not 0 < entity <= ENTITY_MAX:

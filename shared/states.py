@@ -50,6 +50,7 @@ def checked_states(states: Iterable[tuple[int, ...]] | Int64s, templates: int) -
 
 
 _LOW, _HIGH = np.zeros(STATES, np.int64), np.zeros(STATES, np.int64)
+"""Lowest and greatest values of the columns of a state; the greatest template depends on the scene."""
 for _columns, _low, _high in (
     (ID, 1, ID_MAX), (FLAGS, 0, 255), (slice(X, VX), -PLACE_MAX, PLACE_MAX), (slice(VX, MOVE_X), -FAST, FAST),
     (slice(MOVE_X, BUTTONS), -MOVE_MAX, MOVE_MAX), (BUTTONS, 0, BUTTONS_MAX),

@@ -13,6 +13,7 @@ import numpy.typing as npt
 from shared.checks import SceneError, finite, shown
 
 BLOCK_SHIFT = 24
+"""Shift from a position in grid steps to blocks."""
 BLOCK = 1 << BLOCK_SHIFT
 """Number of grid steps in one block."""
 SPEED = 1 << 16

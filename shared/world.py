@@ -508,7 +508,7 @@ class World:
         """
         where, what = list(offsets), list(kinds)
         if len(where) != len(what):
-            raise SceneError(f"kinds: {len(what)} of them, for {len(where)} offsets")
+            raise SceneError(f"kinds: {len(what)} values for {len(where)} offsets")
         segment = _segment(segment)
         self.blocks.row(segment)
         where = [whole(at, f"offsets[{i}]", 0, blocks.BLOCKS - 1) for i, at in enumerate(where)]
@@ -647,7 +647,7 @@ class World:
         theirs, mine = other.scene, self.scene
         if theirs is not mine and theirs.fingerprint != mine.fingerprint:
             differ = sorted(name for name, digest in mine.digests.items() if theirs.digests[name] != digest)
-            raise SceneError(f"other = a world of {theirs.name!r}: its scene has another {', '.join(differ)}")
+            raise SceneError(f"other = a world of {theirs.name!r}: its scene differs in {', '.join(differ)}")
         cells = self._entities[: self._rows, layout.CELL]
         self.blocks.heads[cells[cells >= 0]] = -1
         moved = len(self._entities) != len(other._entities)

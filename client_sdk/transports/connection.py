@@ -158,7 +158,7 @@ class Connection:
                 self._fragments.clear()
                 self.core.port.receive(message, now)
         elif opcode is Opcode.TEXT or opcode is Opcode.CONT:
-            self._protocol.fail(TEXT, "text message: binary ones only")
+            self._protocol.fail(TEXT, "text message; only binary messages are allowed")
             self.core.port.lost(TEXT, f"{self.url} is not a Sovereign Netcode server: it sends text", now)
 
     def _refusal(self, reason: str = "") -> ConnectError | None:

@@ -191,7 +191,7 @@ def test_what_is_no_number_of_an_entity_is_named(name: str) -> None:
 def test_a_world_of_another_scene_is_not_restored(other: Callable[[], Any]) -> None:
     world = build([floor(0)])
     before = world.state_hash()
-    with pytest.raises(SceneError, match=r"^other = (None|a world of 'test': its scene has another (terrain|gravity))"):
+    with pytest.raises(SceneError, match=r"^other = (None|a world of 'test': its scene differs in (terrain|gravity))"):
         world.restore(other())
     assert world.state_hash() == before
     world.restore(build([floor(0)]))
