@@ -1,1 +1,1 @@
-"""Checks of the sources that no other tool makes."""
+"""The checks and the runs of the tests behind `scripts/test`, and the check of the language of texts."""

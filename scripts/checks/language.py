@@ -31,7 +31,7 @@ COMPLIANT = (
     "docs/protocol.md",
     "docs/server.md",
     "hatch_build.py",
-    "scripts/checks",
+    "scripts",
     "server",
     "shared",
     "sovereign_netcode",
