@@ -146,7 +146,9 @@ class Recording:
             except (LookupError, TypeError, ValueError, OverflowError) as error:
                 if isinstance(error, JournalError):
                     raise
-                raise DivergedError(self.world.tick + 1, f"a recorded input or call cannot be repeated ({error})") from error
+                raise DivergedError(
+                    self.world.tick + 1, f"a recorded input or call cannot be repeated ({error})"
+                ) from error
             yield moment
             if moment.ended:
                 if self._file.read(1):
