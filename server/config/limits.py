@@ -36,18 +36,19 @@ class Limits:
     """
 
     connections_max: int = setting(
-        4096, Kind(int, "connections at once, players or not; beyond it only pages are served", "N", 1, 1_000_000)
+        4096,
+        Kind(int, "maximum connections, with or without a player; beyond it only pages are served", "N", 1, 1_000_000),
     )
     connections_per_address: int = setting(
-        64, Kind(int, "connections at once from one address (IPv6: one /64 network)", "N", 1, 1_000_000)
+        64, Kind(int, "maximum connections from one address (IPv6: from one /64 network)", "N", 1, 1_000_000)
     )
     joins_per_s: float = setting(
-        200.0, Kind(float, "WebSockets opened per second; a burst may be two seconds' worth", "N", 0.1, 100_000)
+        200.0, Kind(float, "maximum WebSockets opened per second; a burst may be those of 2 s", "N", 0.1, 100_000)
     )
     loopback_exempt: bool = setting(
         True, Kind(bool, "do not limit connections from this machine per address and per second")
     )
-    clients_max: int = setting(2000, Kind(int, "players at once", "N", 1, 1_000_000))
+    clients_max: int = setting(2000, Kind(int, "maximum players at once", "N", 1, 1_000_000))
     handshake_s: float = setting(
         5.0, Kind(float, "seconds in which a new connection must send its HTTP request", "S", 0.1, HOUR_S)
     )
@@ -63,19 +64,28 @@ class Limits:
     )
     rewind_s: float = setting(0.5, Kind(float, "seconds that lag compensation can look back", "S", 0.05, 1.0))
     message_bytes_max: int = setting(
-        CLIENT_MESSAGE_MAX, Kind(int, "bytes of a client's message", "BYTES", 512, CLIENT_MESSAGE_MAX)
+        CLIENT_MESSAGE_MAX, Kind(int, "maximum bytes of a client's message", "BYTES", 512, CLIENT_MESSAGE_MAX)
     )
     messages_per_tick: float = setting(
-        8.0, Kind(float, "messages of a client per tick; a burst: what 1 s allows, or 32 ticks if longer", "N", 1, 1000)
+        8.0,
+        Kind(
+            float,
+            "maximum messages of a client per tick; a burst may be those of 1 s (at least 32 ticks)",
+            "N",
+            1,
+            1000,
+        ),
     )
     input_rows_max: int = setting(
-        INPUT_ROWS_MAX, Kind(int, "inputs in one message; this SDK sends up to 16", "N", 16, INPUT_ROWS_MAX)
+        INPUT_ROWS_MAX, Kind(int, "maximum inputs in one message; this SDK sends up to 16", "N", 16, INPUT_ROWS_MAX)
     )
     edits_per_s: float = setting(
-        10.0, Kind(float, "edits of a player per second; a burst may be two seconds' worth", "N", 0.5, 10_000)
+        10.0, Kind(float, "maximum edits of a player per second; a burst may be those of 2 s", "N", 0.5, 10_000)
     )
-    commands_waiting_max: int = setting(64, Kind(int, "commands of a player that wait for their tick", "N", 1, 10_000))
-    name_max: int = setting(NAME_MAX, Kind(int, "characters of a player's name", "N", 1, NAME_MAX))
+    commands_waiting_max: int = setting(
+        64, Kind(int, "maximum commands of a player that wait for their tick", "N", 1, 10_000)
+    )
+    name_max: int = setting(NAME_MAX, Kind(int, "maximum characters of a player's name", "N", 1, NAME_MAX))
     joins_per_tick: int = 8
     """Players that may join in one tick. Others wait for the next tick, because a spawn costs 1 to 2 ms."""
     outbox_max: int = 1024

@@ -144,7 +144,7 @@ GROUPS = {
     "network": ("host", "port", "tls_cert", "tls_key", "allowed_origins", "allowed_hosts"),
     "access": ("auth", "auth_key_file"),
     "saving": ("data", "durability", "checkpoint_s", "record"),
-    "operation": ("log_level", "log_format", "figures", "restart_s"),
+    "operation": ("log_level", "log_format", "figures", "page", "restart_s"),
 }
 """Groups of settings as `--help` shows them, the ones for beginners first. Settings in no group are shown as limits."""
 SECTIONS: dict[str, dict[str, Kind]] = {"": kinds_of(Settings), "limits": kinds_of(Limits)}
@@ -286,7 +286,9 @@ def parse(arguments: Sequence[str], environment: Mapping[str, str] = os.environ)
             )
     parser.add_argument("--config", metavar="FILE", help=f"TOML file with settings (or {CONFIG_VARIABLE})")
     parser.add_argument("--list-scenes", action="store_true", help="print the built-in scenes and exit")
-    parser.add_argument("--print-config", action="store_true", help="print the settings in force and exit")
+    parser.add_argument(
+        "--print-config", action="store_true", help="print all settings as a TOML file, with their origins, and exit"
+    )
     flags = parser.flags(arguments)
     config, listing, printing = (flags.pop(name) for name in ("config", "list_scenes", "print_config"))
     if listing:
