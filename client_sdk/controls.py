@@ -13,6 +13,8 @@ class Controls:
     def __init__(self) -> None:
         self.held = NEUTRAL
         """The input that was set most recently."""
+        self.delay = 0
+        """Input delay in ticks, 0 to 3: inputs are filed this far ahead of the predicted world."""
         self._pressed = 0
         """Bits of the buttons that were pressed since the latest tick."""
 

@@ -130,7 +130,6 @@ class Core:
         self._compiled = compiled
         self._plain_for_now = False
         self._neighbours = neighbours
-        self._delay = 0
         self._open = False
         self._filled: Replica | None = None
         """The replica that receives the server's messages; after a reconnect, `_play` uses the old one until this one
@@ -268,9 +267,7 @@ class Core:
         Raises:
             ValueError: `ticks` is not 0 to 3.
         """
-        ticks = self._delay = whole(ticks, "ticks", 0, INPUT_DELAY_MAX)
-        if self.prediction is not None:
-            self.prediction.ahead = ticks
+        self.controls.delay = whole(ticks, "ticks", 0, INPUT_DELAY_MAX)
 
     # -- time ----------------------------------------------------------------------------------------------
 
@@ -365,7 +362,9 @@ class Core:
             raise ProtocolError("unexpected second Welcome message")
         self._plain_for_now = self._compiled is None and not kernels.ready()
         compiled = False if self._plain_for_now else self._compiled
-        world = Replica(welcome, self.clock, now, neighbours=self._neighbours, compiled=compiled)
+        world = Replica(
+            welcome, self.clock, now, controls=self.controls, neighbours=self._neighbours, compiled=compiled
+        )
         self.stats.kernel = "plain for now" if self._plain_for_now else world.known.world.kernel.form
         if self.scene is not None and world.scene.digests != self.scene.digests:
             raise ProtocolError("Welcome.scene: not the scene that the client requested")
@@ -426,7 +425,6 @@ class Core:
         else:
             play = old
             play.world = world
-        world.prediction.ahead = self._delay
         play.restart(now, RECONNECTED)
         self.state = "playing"
         self.stats.reconnects += old is not None

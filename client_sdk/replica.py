@@ -7,6 +7,7 @@ is complete (`complete`), it takes over the inputs and edits of the first (`take
 welcome agrees with it within `CLOCK_S` seconds: then the client's timeline goes on.
 """
 
+from client_sdk.controls import Controls
 from client_sdk.prediction.confirmed import Confirmed
 from client_sdk.prediction.prediction import Prediction
 from client_sdk.timing.clock import ServerClock
@@ -29,6 +30,7 @@ class Replica:
         welcome: the message that the connection began with.
         clock: the clock of the connection before; it stays in use if the welcome agrees with it.
         now: local time in seconds.
+        controls: where the input delay is set.
         neighbours: whether the predicted world has other entities, so that blocking each other is predicted.
         compiled: True for a compiled kernel, False for the plain one, None for the chosen one.
 
@@ -37,11 +39,18 @@ class Replica:
     """
 
     def __init__(
-        self, welcome: Welcome, clock: ServerClock, now: float, *, neighbours: bool, compiled: bool | None
+        self,
+        welcome: Welcome,
+        clock: ServerClock,
+        now: float,
+        *,
+        controls: Controls,
+        neighbours: bool,
+        compiled: bool | None,
     ) -> None:
         self.scene = check_scene(welcome.scene)
         self.known = Confirmed(self.scene, welcome.entity, compiled=compiled)
-        self.prediction = Prediction(self.known, neighbours=neighbours)
+        self.prediction = Prediction(self.known, controls, neighbours=neighbours)
         self.picture = Picture(self.scene, self.prediction)
         self.clock = clock
         if clock.rate == 0 or abs(clock.tick(now) - welcome.tick) > CLOCK_S * self.scene.tick_rate:

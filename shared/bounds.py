@@ -45,6 +45,16 @@ class Bounds(NamedTuple):
     margin_one: float
     """Value on the wire of a margin of one tick: `MARGINS_PER_S` divided by the tick rate."""
 
+    def stands_in(self, missing: int) -> bool:
+        """Returns whether the latest input stands in for a missing one; if not, `NEUTRAL` does.
+
+        Server and client use the same substitutes, so that a client predicts what the server will use.
+
+        Args:
+            missing: number of ticks without an input since the latest input, including this one.
+        """
+        return missing <= self.repeats
+
 
 def in_ticks(seconds: float, rate: float, least: int) -> int:
     """Returns a time as a whole number of ticks, rounded up, at least `least`."""

@@ -23,6 +23,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from client_sdk.controls import Controls
 from client_sdk.events import Corrected
 from client_sdk.prediction.confirmed import Confirmed
 from shared import edits
@@ -71,23 +72,22 @@ class Prediction:
 
     Args:
         known: the confirmed world, which snapshots write.
+        controls: where the input delay is set.
         neighbours: whether the predicted world has other entities, so that blocking each other is predicted; otherwise
             it has the own entity only.
     """
 
-    def __init__(self, known: Confirmed, *, neighbours: bool = True) -> None:
+    def __init__(self, known: Confirmed, controls: Controls | None = None, *, neighbours: bool = True) -> None:
         self.known = known
         self.entity = known.entity
         self.neighbours = neighbours
-        self.ahead = 0
-        """Input delay in ticks: inputs are filed this far ahead of the predicted world."""
+        self._controls = controls or Controls()
         self.confirmed = known.world
         self.predicted = World(known.world.scene, compiled=known.world.compiled)
         self.attributes = known.attributes
         """Attributes of the entities that the client sees, by entity and name."""
         self.begun = False
-        limits = bounds(known.world.scene.tick_rate)
-        self._repeats = limits.repeats
+        limits = self._bounds = bounds(known.world.scene.tick_rate)
         self._inputs: Ring[Input] = Ring(limits.predicted)
         self._states: Ring[Int64s] = Ring(limits.predicted)
         templates = known.world.scene.templates
@@ -129,11 +129,17 @@ class Prediction:
 
     def _wish(self, tick: int) -> Input:
         """Returns the own input of a tick, or the substitute that the server uses if none was sent."""
-        for before in range(tick, tick - self._repeats - 1, -1):
-            wish = self._inputs.get(before)
-            if wish is not None:
+        missing = 0
+        while self._bounds.stands_in(missing):
+            if (wish := self._inputs.get(tick - missing)) is not None:
                 return wish
+            missing += 1
         return NEUTRAL
+
+    @property
+    def ahead(self) -> int:
+        """Input delay in ticks: inputs are filed this far ahead of the predicted world."""
+        return self._controls.delay
 
     @property
     def next_order(self) -> int:

@@ -22,6 +22,7 @@ from server.journal.recorded_world import RecordedWorld, Saves
 from server.observability.counters import Counters
 from server.observability.errors import Faults
 from server.players import persisted_state
+from server.players.player import Player
 from server.replication.client_stream import Link
 from server.replication.sender import Delivery
 from server.rewind import Rewind
@@ -112,7 +113,6 @@ class Game:
         self.delivery = Delivery(self.world, self.log, self.limits, self.counters)
         self.sessions: list[Session] = []
         self.roster = Roster(self.world, self.stage, self.limits, self.counters)
-        self.players = self.roster.players
         self._authenticate = authenticate
         self.orders = Orders(self.world, self.stage, self.limits, self.faults, saves)
         self._deadline: float | None = None
@@ -120,6 +120,11 @@ class Game:
         self._catch_up = catch_up_ticks(scene.tick_rate)
         self._burst = in_ticks(BURST_S, scene.tick_rate, BURST_TICKS_MIN) * self.limits.messages_per_tick
         self._rules = scene.to_table()
+
+    @property
+    def players(self) -> dict[int, Player]:
+        """Players by entity, in the order in which they joined; do not change the dictionary."""
+        return self.stage.kept.players
 
     # -- external events: queued ---------------------------------------------------------------------------
 

@@ -75,9 +75,6 @@ class Stage:
         self.turn = Turn()
         self._soon: deque[tuple[Callable[..., object], tuple[Any, ...]]] = deque()
         self.kept = kept or Kept({}, {}, {})
-        self.players = self.kept.players
-        """Players by entity, in the order in which they joined. Includes players who have lost their connection and
-        may still reconnect."""
         self.steered: dict[int, Input] = {}
         self._attributes = self.kept.attributes
         self.log = ChangeLog(world, self._attributes)
@@ -93,6 +90,14 @@ class Stage:
         self._started = kept is not None
         self._faults = Faults("the rules have failed")
         rules.game = self
+
+    @property
+    def players(self) -> dict[int, Player]:
+        """Players by entity, in the order in which they joined.
+
+        Players who have lost their connection and may still reconnect are among them. Do not change the dictionary.
+        """
+        return self.kept.players
 
     # -- the world -----------------------------------------------------------------------------------------
 

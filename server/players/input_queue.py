@@ -130,7 +130,7 @@ class InputQueue:
         else:
             self._missing += 1
             self.substituted += 1
-            fate = REPEATED if self._missing <= self._bounds.repeats else NEUTRALISED
+            fate = REPEATED if self._bounds.stands_in(self._missing) else NEUTRALISED
         self.fates.append(fate)
         if len(self.fates) > self._bounds.fates:
             del self.fates[0]

@@ -71,10 +71,22 @@ def test_a_wrong_value_is_named_and_nothing_is_done(playing: Playing, said: str,
     core = client.core
     assert core.prediction is not None
     for bad in wrong:
-        before = (core.wish, core._delay, client.link, core.prediction.predicted.state_hash(), core._orders._number)
+        before = (
+            core.wish,
+            core.controls.delay,
+            client.link,
+            core.prediction.predicted.state_hash(),
+            core._orders._number,
+        )
         with pytest.raises((ValueError, TypeError), match=f"^{said}"):
             act(client, bad)
-        after = (core.wish, core._delay, client.link, core.prediction.predicted.state_hash(), core._orders._number)
+        after = (
+            core.wish,
+            core.controls.delay,
+            client.link,
+            core.prediction.predicted.state_hash(),
+            core._orders._number,
+        )
         assert after == before
     playing.play(10)
     assert client.playing
