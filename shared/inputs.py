@@ -56,7 +56,7 @@ def _way(part: object, at: str) -> float:
         return part  # type: ignore[return-value]
     number = finite(int(part) if isinstance(part, bool | np.bool_) else part, at)
     if abs(number) > FAR:
-        raise SceneError(f"{at} = {shown(part)}: must be from -{FAR:g} to {FAR:g}")
+        raise SceneError(f"{at} = {shown(part)}: must be finite, from -{FAR:g} to {FAR:g}")
     return number
 
 

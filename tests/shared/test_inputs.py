@@ -83,5 +83,5 @@ def test_buttons_are_kept_and_jump_is_one_of_them() -> None:
 @pytest.mark.parametrize("wrong", [math.nan, math.inf, -math.inf, 1e300])
 def test_a_direction_that_is_not_finite_is_refused(wrong: float) -> None:
     for direction in ((wrong, 0.0), (0.0, wrong)):
-        with pytest.raises(ValueError, match=r"must be (finite|from -1e\+09 to 1e\+09)"):
+        with pytest.raises(ValueError, match="must be finite"):
             make_input(*direction)
