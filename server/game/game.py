@@ -211,7 +211,8 @@ class Game:
         """Computes the next tick.
 
         Args:
-            deadline: the time at which this tick was due, in seconds of the same clock as `now`.
+            deadline: the time at which this tick was due, in seconds of the same clock as `now`. At this moment the
+                server time equals the number of the tick.
             now: the current time in seconds.
         """
         self._excuse(now)
