@@ -19,11 +19,12 @@ FATES_S = 8.0
 UNCONFIRMED_S = 4.0
 """A client predicts at most this far beyond the newest snapshot, in seconds."""
 UPDATE_S = 1.5
-"""A client catches up on at most this much time in one update; a program that stood still longer starts anew."""
+"""A client catches up on at most this much time in one update, in seconds; after a longer pause it starts the
+prediction again."""
 PREDICTED_S = 6.0
 """A client keeps its own inputs and predicted states for this long, in seconds."""
 MARGINS_PER_S = 8192
-"""A margin on the wire is a whole number of these parts of a second, so an i16 holds 4 s at every tick rate."""
+"""Unit of a margin on the wire, as parts of a second; so an i16 holds 4 s at every tick rate."""
 TICK_RATE_MAX = 240
 """Highest tick rate of a scene, per second."""
 

@@ -58,7 +58,7 @@ def unpack(payload: bytes) -> Edit | None:
     """Returns the edit in a payload that `pack` made; None for any other bytes."""
     try:
         parts = msgpack.unpackb(payload, max_array_len=4)
-    except Exception:  # msgpack raises some ten kinds for bytes that are not MessagePack
+    except Exception:  # msgpack raises about ten types of exceptions for such bytes
         return None
     if type(parts) is not list or len(parts) != 4 or any(type(part) is not int for part in parts):
         return None

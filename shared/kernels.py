@@ -2,7 +2,7 @@
 
     prebuilt  a library of this package for this platform (`scripts/kernels` makes it); it loads in a millisecond
     numba     compiled at its first use, by Numba if that is installed: up to a minute, then from a cache on disk
-    plain     the sources as they are, in Python: a hundred times slower or more, but available everywhere
+    plain     the sources as they are, in Python: about 200 times slower, but available everywhere
 
 Theory of operation. All three forms compute the same bits, so the choice affects speed alone: the first form that is
 available is used. The setting SOVEREIGN_KERNEL forces one. A prebuilt library carries a checksum of the sources and

@@ -416,7 +416,7 @@ def unpack_value(payload: bytes) -> Any:
     """
     try:
         return msgpack.unpackb(payload, max_array_len=PAYLOAD_MAX, max_map_len=TABLE_MAX)
-    except Exception as error:  # msgpack raises some ten kinds for bytes that are not MessagePack
+    except Exception as error:  # msgpack raises about ten types of exceptions for such bytes
         raise ProtocolError(f"payload: not MessagePack ({type(error).__name__})") from error
 
 
@@ -436,7 +436,7 @@ def decode(data: bytes, kinds: frozenset[int], longest: int, lists: int = LIST_M
         raise ProtocolError(f"message of {len(data)} bytes: longer than {longest}")
     try:
         parts = msgpack.unpackb(data, strict_map_key=True, max_array_len=lists, max_map_len=TABLE_MAX)
-    except Exception as error:  # msgpack raises some ten kinds for bytes that are not MessagePack
+    except Exception as error:  # msgpack raises about ten types of exceptions for such bytes
         raise ProtocolError(f"not MessagePack ({type(error).__name__})") from error
     if type(parts) is not list or not parts or type(parts[0]) is not int or parts[0] not in kinds:
         raise ProtocolError("not a list that begins with a kind of message which this side may send")

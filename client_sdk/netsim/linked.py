@@ -21,7 +21,7 @@ LOST = b""
 CLEAR = Path()
 """Link without delay, loss or limits."""
 SLOW_READ_BYTES = 1152
-"""Number of bytes that a slow line takes at once."""
+"""Number of bytes that a transport reads at once while a slow link is set."""
 
 
 class LinkedPort:

@@ -213,8 +213,8 @@ MEMORY_S = 120.0
 FIRST_S = 20.0
 """Shortest time that shares of late inputs refer to, in seconds. With fewer inputs than that, the reserve is larger."""
 FINE_RATE = 32.0
-"""Tick rate below which `SAFETY_S`, `SURPRISE_S` and `SHIFT_S` count in ticks: they stay the share of a tick that they
-are at this rate."""
+"""Tick rate, in ticks per second, below which `SAFETY_S`, `SURPRISE_S` and `SHIFT_S` no longer shrink in ticks: they
+stay the share of a tick that they are at this rate."""
 FIRST_INPUTS_S, FIRST_INPUTS_MIN = 0.5, 8
 """Inputs to learn from before the first lead is changed: those of `FIRST_INPUTS_S` seconds, at least
 `FIRST_INPUTS_MIN`."""
