@@ -34,7 +34,8 @@ from client_sdk.prediction.prediction import Prediction
 from client_sdk.reconnect import Comeback
 from client_sdk.replica import Replica
 from client_sdk.stats import Stats
-from client_sdk.timing.clock import ServerClock, Timeline
+from client_sdk.timing.server_clock import ServerClock
+from client_sdk.timing.timeline import Timeline
 from client_sdk.view import NOTHING, View
 from shared import edits, kernels, messages
 from shared.checks import SceneError, duration, shown, text, whole

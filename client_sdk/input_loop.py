@@ -17,7 +17,8 @@ from client_sdk.pending_events import PendingEvents
 from client_sdk.prediction.prediction import NONDETERMINISM, NOTHING
 from client_sdk.replica import Replica
 from client_sdk.stats import Stats
-from client_sdk.timing.clock import PricedLead, Timeline, jump_ticks
+from client_sdk.timing.lead import PricedLead, jump_ticks
+from client_sdk.timing.timeline import Timeline
 from client_sdk.view import View
 from shared.bounds import AHEAD_S, bounds
 from shared.inputs import row

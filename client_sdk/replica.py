@@ -10,7 +10,7 @@ welcome agrees with it within `CLOCK_S` seconds: then the client's timeline goes
 from client_sdk.controls import Controls
 from client_sdk.prediction.confirmed import Confirmed
 from client_sdk.prediction.prediction import Prediction
-from client_sdk.timing.clock import ServerClock
+from client_sdk.timing.server_clock import ServerClock
 from client_sdk.view import Picture
 from shared.blocks import unpack
 from shared.checks import Cell

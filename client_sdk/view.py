@@ -14,7 +14,8 @@ import numpy as np
 from client_sdk.interpolation import Interpolation
 from client_sdk.interpolation.smoothing import Smoothing
 from client_sdk.prediction.prediction import Prediction, Reconciled
-from client_sdk.timing.clock import ServerClock, Timeline
+from client_sdk.timing.server_clock import ServerClock
+from client_sdk.timing.timeline import Timeline
 from shared.checks import Vec
 from shared.layout import ID, TEMPLATE, VX, X
 from shared.scene import Scene

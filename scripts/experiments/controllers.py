@@ -2,14 +2,14 @@
 
 Each controller gets only the data that its system has: pings at its own interval, the ticks of arriving snapshots, or
 the margins that the server reports. The rules are those of the systems, the code is ours. Each docstring names the
-files in which a project states its rule. Times are in seconds, timelines in ticks (`client_sdk.timing.clock`). A rule's
+files in which a project states its rule. Times are in seconds, timelines in ticks (`client_sdk.timing.lead`). A rule's
 safety distance is a parameter here, so that the league can measure the rule with a better one.
 """
 
 import math
 from collections import deque
 
-from client_sdk.timing.clock import ServerClock
+from client_sdk.timing.server_clock import ServerClock
 from scripts.experiments.rival import Rival
 
 

@@ -15,7 +15,9 @@ from itertools import count
 from typing import Any
 
 from client_sdk.netsim.links import PRESETS, Weather, Wire
-from client_sdk.timing.clock import LeadController, PricedLead, ServerClock, Timeline
+from client_sdk.timing.lead import LeadController, PricedLead
+from client_sdk.timing.server_clock import ServerClock
+from client_sdk.timing.timeline import Timeline
 from scripts.experiments.controllers import RIVALS
 from scripts.experiments.rival import Rival
 

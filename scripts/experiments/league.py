@@ -28,7 +28,7 @@ from rich.console import Console
 from rich.table import Table
 
 from client_sdk.netsim.links import PRESETS
-from client_sdk.timing.clock import PRICE_S, SAFETY_S, STALL_S
+from client_sdk.timing.lead import PRICE_S, SAFETY_S, STALL_S
 from scripts.experiments.controllers import RIVALS
 from scripts.experiments.lead_trial import OURS, RATE, TICK_MS, Row, trial
 

@@ -1,6 +1,6 @@
 """The base of the lead controllers that the league compares with ours."""
 
-from client_sdk.timing.clock import ServerClock
+from client_sdk.timing.server_clock import ServerClock
 
 
 class Rival:

@@ -6,7 +6,7 @@ from itertools import pairwise
 
 import pytest
 
-from client_sdk.timing.clock import (
+from client_sdk.timing.lead import (
     CALM_S,
     FASTER,
     FIRST_INPUTS_S,
@@ -14,16 +14,13 @@ from client_sdk.timing.clock import (
     HURRY,
     JUMP_S,
     MEMORY_S,
-    PING_FIRST_S,
-    PING_LATER_S,
-    PINGS,
     PRICE_S,
     SAFETY_S,
     SHIFT_S,
     PricedLead,
-    ServerClock,
-    Timeline,
 )
+from client_sdk.timing.server_clock import PING_FIRST_S, PING_LATER_S, PINGS, ServerClock
+from client_sdk.timing.timeline import Timeline
 
 RATE = 32.0
 FIRST_INPUTS, JUMP, PRICE, SHIFT = int(FIRST_INPUTS_S * RATE), JUMP_S * RATE, PRICE_S * RATE, SHIFT_S * RATE

@@ -9,7 +9,7 @@ import pytest
 
 from client_sdk.core import Core
 from client_sdk.events import Joined, Left
-from client_sdk.timing.clock import PINGS
+from client_sdk.timing.server_clock import PINGS
 from shared import messages
 from shared.blocks import pack
 from shared.bounds import bounds

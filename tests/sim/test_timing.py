@@ -12,7 +12,7 @@ import pytest
 
 from client_sdk.core import Core
 from client_sdk.netsim.links import PRESETS
-from client_sdk.timing.clock import PricedLead
+from client_sdk.timing.lead import PricedLead
 from scripts.experiments import lead_trial, league
 from shared.inputs import Input
 from shared.scene import load_scene

@@ -1,21 +1,10 @@
-r"""The client's estimate of the server time, and its own timeline, which runs ahead of the server.
+r"""The lead: how far ahead of the server a client makes its inputs, learned from their arrival margins.
 
-Theory of operation. The *phase* of a clock is its tick minus `rate` times the local time: a constant, apart from drift.
-`ServerClock` estimates the server's phase from pings. The third of the pings with the shortest round trips waited in no
-queue; their median is the estimate.
-
-Both clocks may step: a server that stood still drops the ticks that it missed, and a computer that sleeps stops its
-monotonic clock. A pong bounds the phase without any assumption about the path, because the server read its time after
-the ping was sent and before the pong arrived. A snapshot bounds it from below. A bound that contradicts the earlier
-ones therefore proves a step. Then the samples from before the step are void, and pings follow each other quickly again.
-What the lead has learned about stalls stays valid, but the current needs have to be learned again
-(`LeadController.step`).
-
-The client sends an input for tick t when its own *timeline* reaches t, and the server reports by how many ticks the
-input was early: its margin. The timeline's phase at that moment minus the margin is the phase that would just have been
-enough: the *need* of this input. The need depends on the path alone, not on where the timeline was. So the client's own
-adjustments cancel out of the measurement, exactly and at once, and the loop cannot oscillate, however long the round
-trip is.
+Theory of operation. The client sends an input for tick t when its own *timeline* reaches t, and the server reports by
+how many ticks the input was early: its margin. The timeline's phase (its tick minus the tick rate times the local time)
+at that moment minus the margin is the phase that would just have been enough: the *need* of this input. The need
+depends on the path alone, not on where the timeline was. So the client's own adjustments cancel out of the measurement,
+exactly and at once, and the loop cannot oscillate, however long the round trip is.
 
 `PricedLead` splits a need into the *base*, which is the path as it is now, and the *excess* of this one input:
 
@@ -44,143 +33,7 @@ from typing import Protocol
 import numpy as np
 import numpy.typing as npt
 
-from shared.bounds import UPDATE_S
-
-PINGS = 5
-"""Number of pings that follow each other quickly; the clock is ready when all of them are answered."""
-PING_FIRST_S = 0.1
-"""Time between two of the first pings, in seconds."""
-PING_LATER_S = 1.0
-"""Time between two later pings, in seconds."""
-PINGS_KEPT = 15
-"""Number of the newest pongs that the estimate uses."""
-STEP_S = 0.1
-"""Contradiction between two bounds that is tolerated, in seconds, because clocks drift and programs read them late."""
-
-
-class ServerClock:
-    """An estimate of the server time in ticks, as a function of the local time.
-
-    `rate` is the tick rate in ticks per second (0: not known yet), `phase` the server's phase in ticks, `rtt_s` the
-    shortest round trip of the kept pongs, and `spread_s` the difference between their longest and shortest one.
-    """
-
-    def __init__(self) -> None:
-        self.rate = 0.0
-        self._samples: deque[tuple[float, float]] = deque(maxlen=PINGS_KEPT)  # round trip, phase
-        self._least, self._most = -math.inf, math.inf  # bounds of the phase, from the samples
-        self._answers = 0
-        self._sent = 0
-        self._next = 0.0
-        self.phase = 0.0
-        self.rtt_s = 0.0
-        self.spread_s = 0.0
-
-    def due(self, now: float) -> bool:
-        """Returns whether to send a ping now, and counts it as sent if so. False as long as `rate` is not known."""
-        if self.rate == 0 or now < self._next:
-            return False
-        self._sent += 1
-        self._next = now + (PING_FIRST_S if self._sent < PINGS else PING_LATER_S)
-        return True
-
-    @property
-    def next_ping(self) -> float:
-        """The local time at which the next ping is due, in seconds; `inf` as long as `rate` is not known."""
-        return self._next if self.rate else math.inf
-
-    @property
-    def ready(self) -> bool:
-        """Whether enough pings were answered for an estimate."""
-        return self.rate > 0 and self._answers >= PINGS
-
-    def answered(self, sent: float, tick: float, now: float) -> float:
-        """Takes the answer to a ping.
-
-        Do not pass answers to pings that were sent before a step: they describe the time before it.
-
-        Args:
-            sent: local time at which the ping was sent, in seconds.
-            tick: the server time in the answer, in ticks.
-            now: local time at which the answer arrived, in seconds.
-
-        Returns:
-            By how many ticks the server's time has stepped; 0 if it has not.
-        """
-        if not sent <= now:
-            return 0.0
-        least, most = tick - self.rate * now, tick - self.rate * sent
-        if step := self._step(least, most):
-            return step
-        self._answers += 1
-        self._samples.append((now - sent, tick - self.rate * (sent + now) / 2))
-        bounds = [(phase - rtt_s * self.rate / 2, phase + rtt_s * self.rate / 2) for rtt_s, phase in self._samples]
-        self._least, self._most = max(least for least, _ in bounds), min(most for _, most in bounds)
-        by_rtt = sorted(self._samples)
-        best = sorted(phase for _, phase in by_rtt[: (len(by_rtt) + 2) // 3])
-        self.phase = best[len(best) // 2]
-        self.rtt_s = by_rtt[0][0]
-        self.spread_s = by_rtt[-1][0] - by_rtt[0][0]
-        return 0.0
-
-    def seen(self, tick: int, now: float) -> float:
-        """Takes the tick of a snapshot, which the server has reached. Returns by how many ticks its time has stepped.
-
-        The result is 0 if the time has not stepped.
-        """
-        least = tick - self.rate * now
-        return 0.0 if least <= self._most else self._step(least, math.inf)
-
-    def _step(self, least: float, most: float) -> float:
-        """Sets a new phase if `least` and `most` contradict the known bounds. Returns the step in ticks, or 0."""
-        slack = STEP_S * self.rate if self._samples else 0.0
-        if not (least > self._most + slack or most < self._least - slack):
-            return 0.0
-        before = self.phase
-        self.phase = self._most = min(least + self.rtt_s / 2 * self.rate, most)
-        self._least = -math.inf
-        self._samples.clear()
-        self._sent, self._next = 0, -math.inf
-        return self.phase - before
-
-    def tick(self, now: float) -> float:
-        """Returns the server time at the local time `now`, in ticks."""
-        return self.rate * now + self.phase
-
-
-def jump_ticks(rate: float) -> float:
-    """Returns the smallest difference of two phases that counts as a jump, in ticks: `JUMP_S`, at least one tick."""
-    return max(JUMP_S * rate, 1.0)
-
-
-class LeadController(Protocol):
-    """A controller of the timeline's phase, which decides how far the client runs ahead of the server.
-
-    All phases and margins are in ticks.
-    """
-
-    def start(self, clock: ServerClock, now: float) -> float:
-        """Returns the phase to begin with, before any input was sent."""
-        ...
-
-    def observe(self, tick: int, margin: float, phase: float, now: float) -> None:
-        """Takes the arrival margin of one input.
-
-        Args:
-            tick: the tick of the input.
-            margin: by how many ticks the input arrived before its deadline; negative if it was late.
-            phase: the timeline's phase when the input was sent.
-            now: local time in seconds.
-        """
-
-    def steer(self, phase: float, elapsed: float, clock: ServerClock, now: float) -> float:
-        """Returns the new phase, `elapsed` ticks after the last call. Called once per update."""
-        ...
-
-    def step(self, clock: ServerClock) -> float:
-        """Takes a step of the server's time. Returns the phase to go on with."""
-        ...
-
+from client_sdk.timing.server_clock import ServerClock
 
 FASTER, HURRY = 0.10, 0.50
 """Greatest deviation of the timeline from real time, as a share of it: `FASTER` in both directions, and `HURRY` forward
@@ -226,9 +79,40 @@ NEEDS_S, NEEDS_MIN = 32.0, 1024
 deleted, and the rest must hold two stalls."""
 REVIEW_S = 0.25
 """Time between two computations of the cover, in seconds."""
-SLOW_S = 0.1
-"""A program that makes an input this late, in seconds, three times in a row counts as slow; once or twice may be a
-short delay."""
+
+
+def jump_ticks(rate: float) -> float:
+    """Returns the smallest difference of two phases that counts as a jump, in ticks: `JUMP_S`, at least one tick."""
+    return max(JUMP_S * rate, 1.0)
+
+
+class LeadController(Protocol):
+    """A controller of the timeline's phase, which decides how far the client runs ahead of the server.
+
+    All phases and margins are in ticks.
+    """
+
+    def start(self, clock: ServerClock, now: float) -> float:
+        """Returns the phase to begin with, before any input was sent."""
+        ...
+
+    def observe(self, tick: int, margin: float, phase: float, now: float) -> None:
+        """Takes the arrival margin of one input.
+
+        Args:
+            tick: the tick of the input.
+            margin: by how many ticks the input arrived before its deadline; negative if it was late.
+            phase: the timeline's phase when the input was sent.
+            now: local time in seconds.
+        """
+
+    def steer(self, phase: float, elapsed: float, clock: ServerClock, now: float) -> float:
+        """Returns the new phase, `elapsed` ticks after the last call. Called once per update."""
+        ...
+
+    def step(self, clock: ServerClock) -> float:
+        """Takes a step of the server's time. Returns the phase to go on with."""
+        ...
 
 
 class PricedLead:
@@ -369,51 +253,3 @@ class PricedLead:
         most = int(self._prices.searchsorted(ordered[-1] - ordered[0], "right")) + 1
         falling = np.frombuffer(ordered)[: -most - 1 : -1]
         return float(falling[(falling + self._prices[:most]).argmin()])
-
-
-class Timeline:
-    """The client's own time in ticks: continuous, and ahead of the server.
-
-    It is ahead by the lead that a `LeadController` sets for the path, plus `own` ticks for a slow program: such a
-    program sends the inputs of one update together, the first of them long after its time.
-    """
-
-    def __init__(self, rate: float, phase: float, now: float) -> None:
-        self.rate = rate
-        self.phase = phase
-        self.own = 0.0
-        self._steered = now
-        self._late = (0.0, 0.0, 0.0)
-
-    def tick(self, now: float) -> float:
-        """Returns the timeline's tick at the local time `now`, with a fraction."""
-        return self.rate * now + self.phase
-
-    def when(self, tick: float) -> float:
-        """Returns the local time at which `tick` is reached if the phase stays as it is, in seconds."""
-        return (tick - self.phase) / self.rate
-
-    def made(self, late: float, now: float) -> None:
-        """Notes that the first input of an update was made `late` ticks after its time.
-
-        If that is more than `SLOW_S`, the next input may be as late as the time between two updates.
-        """
-        slow = late > SLOW_S * self.rate
-        self._late = (*self._late[1:], max(late, (now - self._steered) * self.rate) if slow else 0.0)
-
-    def steer(self, lead: LeadController, clock: ServerClock, now: float) -> bool:
-        """Moves the phase to where the controller wants it. Returns whether that was a jump."""
-        before = self.phase
-        elapsed = max(now - self._steered, 0.0) * self.rate
-        self._steered = now
-        path = lead.steer(before - self.own, elapsed, clock, now)
-        if self.own or min(self._late) > SLOW_S * self.rate:
-            self._follow_program(elapsed)
-        self.phase = path + self.own
-        return abs(self.phase - before) > jump_ticks(self.rate)
-
-    def _follow_program(self, elapsed: float) -> None:
-        """Adapts `own` to how late the program makes inputs: it rises at once and falls slowly."""
-        least = min(self._late)
-        slow = min(max(self._late), 2 * least, UPDATE_S * self.rate) if least > SLOW_S * self.rate else 0.0
-        self.own = max(slow, self.own - FASTER * elapsed)
