@@ -12,7 +12,7 @@ from shared import kernels
 from tests.lengths import EXAMPLES
 
 SAME = settings(derandomize=True, deadline=None, suppress_health_check=[HealthCheck.too_slow])
-settings.register_profile("short", SAME, max_examples=EXAMPLES // 4)
+settings.register_profile("short", SAME, max_examples=EXAMPLES // 5)
 settings.register_profile("long", SAME, max_examples=EXAMPLES)
 settings.load_profile("short")  # or the one that --hypothesis-profile names
 

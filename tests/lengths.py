@@ -24,5 +24,5 @@ def long_but(short: Collection[Any], every: Iterable[Any]) -> list[Any]:
 
 
 def examples(most: int) -> int:
-    """Returns the number of examples of a property test: `most` in a long run, a quarter of it in a short one."""
+    """Returns the number of examples of a property test: `most` in a long run, a fifth of it in a short one."""
     return most * settings().max_examples // EXAMPLES

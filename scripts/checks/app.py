@@ -1,49 +1,74 @@
 """Runs every check and every kind of test.
 
 scripts/test          the checks, and the tests in their short form: some minutes
-scripts/test --all    the checks, and all tests in their long form
-scripts/test --long   only the tests that are longer than in `scripts/test`, or have more examples
+scripts/test --all    the checks, and all tests, also in their long form
+scripts/test --long   only the long forms, and the property tests with all their examples
 scripts/test ARGS     pytest alone with these arguments
 """
 
-from scripts.environment import Step, run
+import subprocess
+import time
+from concurrent.futures import ThreadPoolExecutor
+
+from scripts.environment import PYTHON, ROOT, Step, run
 
 CHECKS = {
     "type stubs": ("hatch_build.py",),  # written from the modules as they are now; the others read them
     "ruff format": ("-m", "ruff", "format", "--check"),
     "ruff check": ("-m", "ruff", "check"),
     "language": ("-m", "scripts.checks.language"),
-    "mypy": ("-m", "mypy"),
     "import-linter": ("-c", "from importlinter.cli import lint_imports_command as run; run()", "--no-logo"),
 }
+LONG = "(slow or hypothesis)"
+"""Markers of the tests that are longer in a long run."""
 
 
 def main(arguments: list[str]) -> int:
     """Runs what the arguments of `scripts/test` ask for. Returns the exit code."""
     if arguments == ["--long"]:
-        steps = tests("(slow or hypothesis)", "long")
+        steps = [together(LONG, "long"), alone(LONG, "long")]
     elif arguments == ["--all"]:
-        steps = [*checks(), *tests("", "long")]
+        steps = everything("", "long")
     elif arguments:
         return run("pytest", "-m", "pytest", *arguments).status
     else:
-        steps = [*checks(), *tests("not slow", "short")]
+        steps = everything("not slow", "short")
     print()
     for step in steps:
         print(f"{step.title:<14} {'failed' if step.status else 'ok':<6} {step.seconds:6.1f} s")
     return int(any(step.status for step in steps))
 
 
-def checks() -> list[Step]:
-    """Runs all checks of the sources."""
-    return [run(title, *command) for title, command in CHECKS.items()]
+def everything(markers: str, profile: str) -> list[Step]:
+    """Runs all checks of the sources and the tests with these markers."""
+    steps = [run(title, *command) for title, command in CHECKS.items()]
+    with ThreadPoolExecutor(1) as pool:
+        types = pool.submit(mypy)  # beside the tests, many of which wait
+        steps.append(together(markers, profile))
+        step, output = types.result()
+    print(f"\n== {step.title}\n{output}", end="", flush=True)
+    return [*steps, step, alone(markers, profile)]
 
 
-def tests(markers: str, profile: str) -> list[Step]:
-    """Runs tests with these markers: two at a time, and then one by one those that measure time."""
-    together, alone = (" and ".join(filter(None, (markers, which))) for which in ("not alone", "alone"))
-    pytest = ("-m", "pytest", "--hypothesis-profile", profile, "-m")
-    return [
-        run("tests", *pytest, together, "-n", "2", "--dist", "worksteal"),
-        run("tests alone", *pytest, alone),
-    ]
+def mypy() -> tuple[Step, str]:
+    """Checks the types. Returns the output, too."""
+    started = time.perf_counter()
+    command = (str(PYTHON), "-m", "mypy")
+    done = subprocess.run(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, check=False)
+    return Step("mypy", done.returncode, time.perf_counter() - started), done.stdout
+
+
+def together(markers: str, profile: str) -> Step:
+    """Runs tests two at a time."""
+    return run("tests", *pytest(markers, "not alone", profile), "-n", "2", "--dist", "worksteal")
+
+
+def alone(markers: str, profile: str) -> Step:
+    """Runs the tests that measure time, one by one."""
+    return run("tests alone", *pytest(markers, "alone", profile))
+
+
+def pytest(markers: str, more: str, profile: str) -> tuple[str, ...]:
+    """Returns the arguments that run the tests with all these markers."""
+    both = f"{markers} and {more}" if markers else more
+    return "-m", "pytest", "--hypothesis-profile", profile, "-m", both

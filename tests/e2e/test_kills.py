@@ -27,10 +27,10 @@ from shared.snapshot import VERDICT, decode_parts
 from shared.units import BLOCK
 from shared.world import World
 from tests.e2e.processes import END_S, ServerProcess, page, running, stats, until
+from tests.lengths import long
 
 pytestmark = pytest.mark.e2e
 
-KILLS = 50
 BOTS = 6
 Cell = tuple[int, int, int]
 
@@ -150,14 +150,14 @@ def looked_at(data: Path, scene: Scene, copy: Path) -> tuple[World, tuple[int, s
     return store.world, store.restored
 
 
-@pytest.mark.slow
-def test_nothing_that_a_client_was_told_is_lost_in_fifty_kills(tmp_path: Path) -> None:
+@pytest.mark.parametrize("kills", [5, *long(50)])
+def test_nothing_that_a_client_was_told_is_lost_in_kills(tmp_path: Path, kills: int) -> None:
     seed = 17
     rng, cells, scene = random.Random(seed), Cells(), load_scene("flat")
     editors = [Editor(cells, scene) for _ in range(BOTS)]
     data, early = tmp_path / "data", 0
     expected: tuple[int, str] | None = None
-    for life in range(KILLS):
+    for life in range(kills):
         how = {"checkpoint_s": rng.choice(("0.1", "0.5", "60")), "durability": rng.choice(("process", "power"))}
         environment = {f"SOVEREIGN_{name.upper()}": value for name, value in how.items()}
         server = ServerProcess("--port", "0", "--scene", "flat", "--data", str(data), **environment)
@@ -177,12 +177,12 @@ def test_nothing_that_a_client_was_told_is_lost_in_fifty_kills(tmp_path: Path) -
         if (data / "world.db").exists():
             world, expected = looked_at(data, scene, tmp_path / "copy")
             cells.check(world)
-    assert early == KILLS // 5
-    assert sum(editor.returns for editor in editors) > BOTS * KILLS // 2
-    assert cells.done > 10 * KILLS, (cells.done, cells.refused)
+    assert early == kills // 5
+    assert sum(editor.returns for editor in editors) > BOTS * kills // 2
+    assert cells.done > 10 * kills, (cells.done, cells.refused)
     for editor in editors:  # they walk to and fro, in every life that they see
-        assert editor.used > KILLS
-        assert len(editor.places) > KILLS // 5, "a place is told where it turns"
+        assert editor.used > kills
+        assert len(editor.places) > kills // 5, "a place is told where it turns"
 
 
 async def one_life(

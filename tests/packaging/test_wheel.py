@@ -102,7 +102,8 @@ def test_the_wheel_has_one_package_with_every_file_of_the_product(wheel: Path) -
     own = {name.removeprefix("sovereign_netcode/") for name in known_to_git("sovereign_netcode")}
     missing = (known_to_git(*FOLDERS) | own - {"_checkout.py"}) - names(wheel)
     assert missing == set()
-    assert {"py.typed", "server/live.html", "shared/scenes/hills.toml", "server/__main__.py"} <= names(wheel)
+    page, scene = "server/observability/live.html", "shared/scenes/hills.toml"
+    assert {"py.typed", page, scene, "server/__main__.py"} <= names(wheel)
 
 
 def test_no_source_of_the_wheel_imports_a_folder(wheel: Path) -> None:

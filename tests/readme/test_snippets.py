@@ -50,7 +50,7 @@ def test_an_engines_loop(engine: str) -> None:
     assert engine != "pygame-ce" or said.endswith("the engine")
 
 
-@pytest.mark.parametrize(("name", "says"), list(zip(LOOPS, ("Joined(entity=1", "in hills as "), strict=True)))
+@pytest.mark.parametrize(("name", "says"), [(LOOPS[0], "Joined(entity=1"), *long((LOOPS[1], "in hills as "))])
 def test_a_bare_loop(name: str, says: str) -> None:
     lines = run(name).splitlines()
     assert any(line.startswith(says) for line in lines)

@@ -10,6 +10,7 @@ from shared.checks import SceneError
 from shared.inputs import Input
 from shared.terrain import generate
 from shared.world import OverlapError, World
+from tests.lengths import long
 from tests.worlds import EAST, JUMP, STEP, WEST, build, floor, high, low, settle, states
 
 
@@ -168,7 +169,7 @@ def test_h31_restored_from_its_states_and_replayed(compiled: bool) -> None:
         assert other.state_hash() == world.state_hash()
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", [0, *long(1, 2)])
 def test_h32_h33_the_order_of_entry_does_not_matter(compiled: bool, seed: int) -> None:
     """Segments, blocks and entities entered in any order; blocks edited there and back."""
     world = busy(compiled)
