@@ -25,6 +25,11 @@ def test_a_command_is_short_and_has_a_docstring(path: Path) -> None:
     assert os.name == "nt" or os.access(path, os.X_OK)
 
 
+@pytest.mark.parametrize("path", [*COMMANDS, SCRIPTS / "environment.py"], ids=lambda path: path.name)
+def test_an_older_python_can_look_for_a_newer_one(path: Path) -> None:
+    ast.parse(path.read_text("utf-8"), feature_version=(3, 7))
+
+
 def test_a_command_and_a_package_never_share_a_name() -> None:
     packages = {path.name for path in SCRIPTS.iterdir() if path.is_dir()}
     assert packages & {path.stem for path in COMMANDS if path.suffix} == set(), "Python would import the package"
