@@ -1,6 +1,7 @@
 """Compares lead controllers: late inputs against added latency, per link, in simulated time.
 
-`scripts.experiments.lead_trial` describes a trial and its *oracle*.
+A trial has no physics (`scripts.experiments.lead_trial`). Its *oracle* is the least constant lead that would have had the
+same share of late inputs.
 
     added latency   mean lead of an input over the server's true time when it was made, minus half the round trip
     fair            only inputs for which a controller could prepare: not those made during a spike or the 250 ms after
