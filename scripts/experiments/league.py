@@ -1,7 +1,7 @@
 """Compares lead controllers: late inputs against added latency, per link, in simulated time.
 
-A trial has no physics (`scripts.experiments.lead_trial`). Its *oracle* is the least constant lead that would have had the
-same share of late inputs.
+A trial has no physics (`scripts.experiments.lead_trial`). Its *oracle* is the least constant lead that would have had
+the same share of late inputs.
 
     added latency   mean lead of an input over the server's true time when it was made, minus half the round trip
     fair            only inputs for which a controller could prepare: not those made during a spike or the 250 ms after
@@ -34,8 +34,6 @@ from scripts.experiments.controllers import RIVALS
 from scripts.experiments.lead_trial import OURS, RATE, TICK_MS, Row, trial
 
 TIE_MS = 0.1 * TICK_MS
-BOUNDS = {"lan": 0.005, "regional": 0.005, "typical": 0.01, "far": 0.02, "wifi": 0.02, "dip": 0.01}
-"""Largest share of late inputs, among the fair ones, that each preset allows."""
 SHARE_MAX = 0.5
 """Share of late inputs from which a controller is not compared, because it does not try to be on time."""
 LONG_S = 4.0
