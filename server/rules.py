@@ -19,6 +19,7 @@ does not.
 import importlib
 import inspect
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -134,7 +135,7 @@ def check_rules(rules: object) -> None:
 
     Raises:
         RulesError: `rules` is not an instance of a subclass of `Rules`, a method has a name that looks like a hook's
-            and is none, or a hook cannot be called.
+            and is none, or a hook cannot be called, or not with the arguments that it gets.
     """
     if isinstance(rules, type) and issubclass(rules, Rules):
         raise RulesError(f"rules = {rules.__qualname__}: is a class; pass an instance, {rules.__name__}()")
@@ -153,7 +154,27 @@ def check_rules(rules: object) -> None:
                 f"{owner}.{name} is no hook, and nothing calls it{there}; the hooks are {', '.join(HOOKS)}"
             )
     for name in HOOKS:
-        checked_function(getattr(rules, name), f"{owner}.{name}")
+        hook = getattr(rules, name)
+        checked_function(hook, f"{owner}.{name}")
+        _check_parameters(hook, name, owner)
+
+
+def _check_parameters(hook: Callable[..., object], name: str, owner: str) -> None:
+    """Checks that a hook can be called with the arguments that it gets, by position.
+
+    Raises:
+        RulesError: it cannot; every call of it would fail.
+    """
+    wanted = [*inspect.signature(getattr(Rules, name)).parameters][1:]
+    takes = "(...)"
+    try:
+        signature = inspect.signature(hook)
+        takes = f"({', '.join(map(str, signature.parameters))})"
+        signature.bind(*wanted)
+    except (TypeError, ValueError) as error:
+        if isinstance(error, ValueError) and not inspect.ismethod(hook):
+            return  # a function in C that does not tell its parameters
+        raise RulesError(f"{owner}.{name}{takes}: is called with ({', '.join(wanted)}): {error}") from None
 
 
 def checked_function(act: object, at: str) -> None:

@@ -392,7 +392,7 @@ def test_rules_may_remove_who_leaves() -> None:
 
 
 class Broken(Rules):
-    def on_join(self, player: Player) -> None:
+    def on_join(self, *arguments: object) -> None:
         raise RuntimeError("on purpose")
 
     on_leave = on_tick = on_start = on_command = on_contact = on_fell_out = can_edit = on_join  # type: ignore[assignment]

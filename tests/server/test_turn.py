@@ -108,6 +108,34 @@ def test_what_prepare_raises_is_told_with_its_name() -> None:
         made().gane  # type: ignore[attr-defined]  # noqa: B018
 
 
+@pytest.mark.parametrize(
+    ("hook", "method", "why"),
+    [
+        ("on_join", lambda self: None, r"Mine\.on_join\(\): is called with \(player\): too many positional arguments"),
+        (
+            "on_tick",
+            lambda self, dt: None,
+            r"Mine\.on_tick\(dt\): is called with \(\): missing a",
+        ),
+        ("on_contact", lambda self, pair: None, r"on_contact\(pair\): is called with \(a, b\)"),
+        ("can_edit", lambda self, player, *, x, y, z, kind: True, r"is called with \(player, x, y, z, kind\)"),
+        ("prepare", lambda: None, r"prepare.*is called with \(scene\)"),
+    ],
+)
+def test_a_hook_that_does_not_take_its_arguments_is_refused_before_it_is_called(
+    hook: str, method: Callable[..., Any], why: str
+) -> None:
+    with pytest.raises(RulesError, match=why):
+        Table(rules=made(**{hook: method}))
+
+
+@pytest.mark.parametrize(
+    "method", [lambda self, *_: None, lambda self, a, b=0, c=0: None, lambda self, player=None: None]
+)
+def test_a_hook_may_take_more_than_it_gets(method: Callable[..., Any]) -> None:
+    Table(rules=made(on_join=method)).tick()
+
+
 class TooEarly(Rules):
     def __init__(self) -> None:
         self.game.share("score", 0)
