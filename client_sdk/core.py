@@ -12,24 +12,15 @@
 """
 
 import math
-from collections import deque
-from typing import Any, Protocol, SupportsIndex
+from typing import Any, SupportsIndex
 
 from client_sdk.advice import advised
 from client_sdk.commands import Orders
 from client_sdk.controls import Controls
-from client_sdk.events import (
-    Disconnected,
-    Event,
-    EventsDropped,
-    Happened,
-    Joined,
-    Left,
-    Resumed,
-    SegmentLoaded,
-)
-from client_sdk.input_loop import RECONNECTED, Play
-from client_sdk.pending_events import PendingEvents
+from client_sdk.events import Disconnected, Event, Joined, Left, Resumed, SegmentLoaded
+from client_sdk.input_loop import Play
+from client_sdk.pending_events import GameEvents, PendingEvents
+from client_sdk.port import Port
 from client_sdk.prediction.prediction import Prediction
 from client_sdk.reconnect import Comeback
 from client_sdk.replica import Replica
@@ -37,7 +28,8 @@ from client_sdk.stats import Stats
 from client_sdk.timing.server_clock import ServerClock
 from client_sdk.timing.timeline import Timeline
 from client_sdk.view import NOTHING, View
-from shared import edits, kernels, messages
+from client_sdk.worlds import Worlds
+from shared import edits, messages
 from shared.checks import SceneError, duration, shown, text, whole
 from shared.inputs import Input, checked_input, clamp
 from shared.messages import ProtocolError, decode_from_server, encode
@@ -51,39 +43,6 @@ NAME_MAX = 1 << 16
 """Longest name that a program may pass, in characters; only the first `messages.NAME_MAX` characters are sent."""
 READ_BYTES = 64 * 1024
 """Number of bytes that a transport reads at once from a connection without a simulated link."""
-
-
-class Port(Protocol):
-    """The side of a core that a transport talks to: the core itself, or a simulated link in front of it."""
-
-    @property
-    def appetite(self) -> int:
-        """The number of bytes that the transport should read at once; 0: it should not read now."""
-        ...
-
-    def open(self, now: float) -> None:
-        """Takes a new connection, and sends Hello."""
-
-    def receive(self, data: bytes, now: float) -> None:
-        """Takes one message of the server."""
-
-    def lost(self, code: int, reason: str, now: float) -> None:
-        """Takes the loss of the connection."""
-
-    def update(self, now: float) -> None:
-        """Does what is due."""
-
-    def next_update(self, now: float) -> float:
-        """Returns the local time at which `update` has something to do; `inf`: not before a message arrives."""
-        ...
-
-    def outgoing(self) -> list[bytes]:
-        """Returns the messages to send, and forgets them."""
-        ...
-
-    def outstanding(self) -> int:
-        """Returns the bytes on the way to this client that have not reached the core yet."""
-        ...
 
 
 class Core:
@@ -128,50 +87,35 @@ class Core:
         """The values that the rules of the game share with all clients, by name."""
         self._token = text(token, "token", messages.TOKEN_MAX, shortest=0)
         self._resume = b""
-        self._compiled = compiled
-        self._plain_for_now = False
-        self._neighbours = neighbours
         self._open = False
-        self._filled: Replica | None = None
-        """The replica that receives the server's messages; after a reconnect, `_play` uses the old one until this one
-        is complete."""
-        self._play: Play | None = None
         self._orders = Orders()
         self._out: list[bytes] = []
         self._events = PendingEvents()
-        self._held = PendingEvents()
-        """Game events that arrived before `Joined` or `Resumed`, and follow it."""
-        self._told = 0
-        """Number of game events for this player that have arrived, or are known to be lost."""
-        self._pings: deque[float] = deque(maxlen=16)
+        self._game_events = GameEvents(self._events)
+        self._worlds = Worlds(self.stats, self._events, self.controls, compiled=compiled, neighbours=neighbours)
 
     @property
     def prediction(self) -> Prediction | None:
         """The confirmed and the predicted world; None before the welcome."""
-        world = self._world
+        world = self._worlds.current
         return world.prediction if world else None
 
     @property
     def entity(self) -> int:
         """The number of the own entity; 0 before the welcome."""
-        world = self._world
+        world = self._worlds.current
         return world.prediction.entity if world else 0
 
     @property
     def clock(self) -> ServerClock:
         """The estimate of the server time."""
-        world = self._world
-        return world.clock if world else ServerClock()
+        return self._worlds.clock
 
     @property
     def timeline(self) -> Timeline | None:
         """The client's own time in ticks; None before the client has joined."""
-        return self._play.timeline if self._play else None
-
-    @property
-    def _world(self) -> Replica | None:
-        """The replica that the client plays in; before the play, the one that is being filled."""
-        return self._play.world if self._play else self._filled
+        play = self._worlds.play
+        return play.timeline if play else None
 
     @property
     def connected(self) -> bool:
@@ -274,27 +218,28 @@ class Core:
 
     def update(self, now: float) -> None:
         """Starts the play once the world is complete, predicts every tick that is due, and sends pings that are due."""
-        if self._plain_for_now and kernels.ready():
-            self._speed_up()
-        if self._play and self.state != "closed":
-            for message in self._play.follow(now, online=self.state == "playing"):
+        worlds = self._worlds
+        if worlds.plain_for_now:
+            worlds.speed_up()
+        if worlds.play and self.state != "closed":
+            for message in worlds.play.follow(now, online=self.state == "playing"):
                 self._send(message)
-        if self._open and self._told_clock.due(now):
+        if self._open and worlds.ping_due(now):
             self._send(messages.Ping(now, self.stats.corrections))
-            self._pings.append(now)
-        if self.state in ("joining", "away") and self._filled and self._filled.complete:
-            self._begin(self._filled, now)
-        if self._play and self.state != "closed":
-            for message in self._play.update(now, self.controls, online=self.state == "playing"):
+        if self.state in ("joining", "away") and worlds.filled and worlds.filled.complete:
+            self._begin(worlds.filled, now)
+        if worlds.play and self.state != "closed":
+            for message in worlds.play.update(now, self.controls, online=self.state == "playing"):
                 self._send(message)
         else:
             self.controls.forget()
 
     def next_update(self, now: float) -> float:
         """Returns the local time at which `update` has something to do; `inf`: not before a message arrives."""
-        due = self._told_clock.next_ping if self._open else self.comeback.retry_at
-        if self._play:
-            due = min(due, self._play.next_tick(now))
+        worlds = self._worlds
+        due = worlds.connection_clock.next_ping if self._open else self.comeback.retry_at
+        if worlds.play:
+            due = min(due, worlds.play.next_tick(now))
         return max(due, now)  # inf: nothing to do until a message arrives
 
     # -- what goes out -------------------------------------------------------------------------------------
@@ -313,40 +258,27 @@ class Core:
 
     def view(self, now: float) -> View:
         """Returns what to draw now: the own entity as predicted, the others a little in the past."""
-        return self._play.view(now) if self._play else NOTHING
+        play = self._worlds.play
+        return play.view(now) if play else NOTHING
 
     # -- inside --------------------------------------------------------------------------------------------
-
-    @property
-    def _told_clock(self) -> ServerClock:
-        """The clock that belongs to the current connection; after a reconnect, `_play` may still use the old one."""
-        return self._filled.clock if self._filled else self.clock
 
     def _take(self, message: messages.Message, now: float) -> None:
         match message:
             case messages.Snapshot():
-                self._snapshot(message, now)
+                self._worlds.snapshot(message, self._orders, now)
             case messages.Pong():
-                if message.sent in self._pings:  # otherwise it does not answer a ping of this client
-                    self._pings.remove(message.sent)
-                    self.stats.pinged(max(now - message.sent, 0.0))
-                    self._stepped(self._told_clock.answered(message.sent, message.tick, now), now)
-                    if self._play:
-                        self._play.answered(message.sent)
+                self._worlds.answered(message, now)
             case messages.Terrain():
-                segment = self._welcomed(message).terrain(message)
+                segment = self._worlds.welcomed(message).terrain(message)
                 if segment is not None:
                     self._events.append(SegmentLoaded(segment))
             case messages.Welcome():
                 self._welcome(message, now)
             case messages.Happened():
-                self._told += 1
-                data = messages.unpack_value(message.payload)
-                self._tell(Happened(message.tick, message.name, data))
+                self._game_events.happened(message, hold=self._joins)
             case messages.NextHappened():
-                if message.number > self._told:
-                    self._tell(EventsDropped(message.number - self._told))
-                self._told = message.number
+                self._game_events.next(message.number, hold=self._joins)
             case messages.Shared():
                 self.shared = message.values
             case messages.Bye():
@@ -358,95 +290,42 @@ class Core:
             case _:
                 raise ProtocolError(f"unexpected {type(message).__name__} message from a server")
 
+    @property
+    def _joins(self) -> bool:
+        """Whether the client waits for `Joined` or `Resumed` after a welcome."""
+        return self._worlds.filled is not None and self.state != "playing"
+
     def _welcome(self, welcome: messages.Welcome, now: float) -> None:
-        if self._filled:
+        worlds = self._worlds
+        if worlds.filled:
             raise ProtocolError("unexpected second Welcome message")
-        self._plain_for_now = self._compiled is None and not kernels.ready()
-        compiled = False if self._plain_for_now else self._compiled
-        world = Replica(
-            welcome, self.clock, now, controls=self.controls, neighbours=self._neighbours, compiled=compiled
-        )
-        self.stats.kernel = "plain for now" if self._plain_for_now else world.known.world.kernel.form
+        world = worlds.replica(welcome, now)
         if self.scene is not None and world.scene.digests != self.scene.digests:
             raise ProtocolError("Welcome.scene: not the scene that the client requested")
         self.scene, self._resume = world.scene, welcome.resume
         self.comeback.spread = welcome.entity
-        if self._play and welcome.entity == self.entity:
+        if worlds.play and welcome.entity == self.entity:
             self._out += self._orders.again()
-        elif self._play:
+        elif worlds.play:
             for answered in self._orders.give_up():
                 self._events.append(answered)
-            self._release()
-            self._told = 0
-        self._filled = world
-
-    def _speed_up(self) -> None:
-        """Replaces the plain kernel by the chosen one, which is ready now."""
-        self._plain_for_now = False
-        kernel = kernels.get()
-        if self._filled is not None:
-            self._filled.use(kernel)
-        if self._play is not None and self._play.world is not self._filled:
-            self._play.world.use(kernel)
-        self.stats.kernel = kernel.form
-
-    def _welcomed(self, message: messages.Message) -> Replica:
-        if self._filled is None:
-            raise ProtocolError(f"unexpected {type(message).__name__} message before Welcome")
-        return self._filled
-
-    def _snapshot(self, snapshot: messages.Snapshot, now: float) -> None:
-        world, play, stats = self._welcomed(snapshot), self._play, self.stats
-        stats.snapshots_skipped += world.skipped(snapshot)
-        stats.snapshots += 1
-        if play:
-            play.learn(snapshot, now)
-        for answered in self._orders.answer(snapshot.verdicts):
-            if play:
-                play.world.prediction.settle(answered.number, answered.done)
-            self._events.append(answered)
-        world.apply(snapshot)
-        self._stepped(world.clock.seen(snapshot.tick, now), now)
-
-    def _stepped(self, ticks: float, now: float) -> None:
-        """Follows a step of the server's time, by `ticks`; 0: there was none."""
-        if not ticks:
-            return
-        self._pings.clear()  # answers to earlier pings describe the time before the step
-        play = self._play
-        if play and play.world.clock is self._told_clock:
-            play.stepped(ticks, now)
+            self._game_events.restart()
+        worlds.filled = world
 
     def _begin(self, world: Replica, now: float) -> None:
         """Starts the play in a complete replica, for the first time or after a reconnect."""
-        old = self._play
-        same = old is not None and world.take_over(old.world)
-        if old is None or old.world.clock is not world.clock:
-            play = self._play = Play(world, self.stats, self._events, now)
-        else:
-            play = old
-            play.world = world
-        play.restart(now, RECONNECTED)
+        play, same = self._worlds.begin(world, now)
         self.state = "playing"
-        self.stats.reconnects += old is not None
         tick, away_s = world.prediction.predicted.tick, self.comeback.away_s(now)
         self._events.append(Resumed(tick, away_s) if same else Joined(self.entity, world.scene, tick))
-        self._release()
+        self._game_events.release()
         self.comeback.back()
         for inputs in play.unheard() if same else ():
             self._send(inputs)
 
-    def _tell(self, event: Event) -> None:
-        """Files a game event. After a welcome, it waits until `Joined` or `Resumed` has been filed."""
-        (self._held if self._filled and self.state != "playing" else self._events).append(event)
-
-    def _release(self) -> None:
-        for event in self._held.take():
-            self._events.append(event)
-
     def _cut_off(self, left: Left, now: float) -> None:
         """Starts to reconnect after a lost connection, or ends if the client may not reconnect."""
-        self._open, self._filled = False, None
+        self._open, self._worlds.filled = False, None
         self._out.clear()
         wait = max(left.wait_s, 0.0)
         if not self._resume or not self.comeback.lost(now, wait):
@@ -456,9 +335,10 @@ class Core:
         self._events.append(Disconnected(left.reason, self.comeback.retry_at - now))
 
     def _joined(self, what: str) -> Play:
-        if self._play is None or self.state == "closed":
+        play = self._worlds.play
+        if play is None or self.state == "closed":
             raise RuntimeError(f"{what}: the client has not joined")
-        return self._play
+        return play
 
     def _order(self, command: messages.Command) -> int:
         """Sends a command now, or over the next connection. Returns its number."""
@@ -478,6 +358,6 @@ class Core:
         if self.state != "closed":
             self.state = "closed"
             self._open = False
-            if self._play:
-                self._release()
+            if self._worlds.play:
+                self._game_events.release()
             self._events.append(left)

@@ -1,6 +1,7 @@
 """The events that wait until the program takes them: in order and bounded; dropped ones are counted."""
 
 from client_sdk.events import Disconnected, Event, EventsDropped, Happened, Joined, Left, Resumed
+from shared import messages
 
 EVENTS_MAX = 10_000
 """Limit of the waiting game events, and separately of the waiting other events that may be dropped."""
@@ -62,6 +63,53 @@ class PendingEvents(list[Event]):
         self[first] = EventsDropped(_weight(self[first]) + _weight(self[last]))
         del self[last]
         self._counts[kind] -= 1
+
+
+class GameEvents:
+    """The events that the rules of the game have sent to this player: counted, and in order with the SDK's own events.
+
+    Args:
+        events: receives the events.
+    """
+
+    def __init__(self, events: PendingEvents) -> None:
+        self._events = events
+        self._held = PendingEvents()
+        """Events that arrived before `Joined` or `Resumed`, and follow it."""
+        self._count = 0
+        """Number of events that have arrived, or are known to be lost."""
+
+    def happened(self, message: messages.Happened, *, hold: bool) -> None:
+        """Takes one event.
+
+        Args:
+            message: the event.
+            hold: whether to hold it back until `release`.
+
+        Raises:
+            ProtocolError: its payload is malformed.
+        """
+        self._count += 1
+        self._file(Happened(message.tick, message.name, messages.unpack_value(message.payload)), hold=hold)
+
+    def next(self, number: int, *, hold: bool) -> None:
+        """Takes the number of the server's next event. If events before it are missing, files an `EventsDropped`."""
+        if number > self._count:
+            self._file(EventsDropped(number - self._count), hold=hold)
+        self._count = number
+
+    def release(self) -> None:
+        """Files the events that were held back."""
+        for event in self._held.take():
+            self._events.append(event)
+
+    def restart(self) -> None:
+        """Releases the events, and counts from 0 again, because the player is a new one to the server."""
+        self.release()
+        self._count = 0
+
+    def _file(self, event: Event, *, hold: bool) -> None:
+        (self._held if hold else self._events).append(event)
 
 
 def _weight(event: Event) -> int:

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from server.game import game as games
+from server.game import joining
 from server.game.roster import Roster
 from server.game_api.api import Stage
 from server.persistence import store as stores
@@ -35,7 +35,7 @@ def fails(*args: Any, **given: Any) -> Any:
     [
         (Stage, "set", []),  # ahead of `on_join`
         (Roster, "issue", ["join", "leave"]),
-        (games, "Welcome", ["join", "leave"]),
+        (joining, "Welcome", ["join", "leave"]),
     ],
 )
 def test_a_join_that_fails_leaves_nothing_behind(

@@ -392,8 +392,8 @@ class Range:
         way = (aim[0] - eye[0], aim[1] - eye[1], aim[2] - eye[2])
         core = self.shooter.core
         core.update(self.shooter.local)
-        assert core._play is not None
-        seen = core._play.seen
+        assert core._worlds.play is not None
+        seen = core._worlds.play.seen
         self.match.at(self.match.now + delay_s, lambda: self._arrive(eye, way, seen))
 
     def _arrive(self, eye: Vec, way: Vec, seen: float) -> None:

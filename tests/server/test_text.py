@@ -61,7 +61,7 @@ def test_a_key_of_any_bytes_is_one() -> None:
 @pytest.mark.parametrize("bad", [*BAD, None, 7, b"ann", "a" * 65, ["ann"]])
 def test_what_a_check_of_ones_own_returns(bad: Any) -> None:
     table = Table()
-    table.game._authenticate = lambda token: bad
+    table.game.joining.authenticate = lambda token: bad
     code, reason = table.connect(Hello(messages.VERSION, {}, "Ann", "x")).refusal()
     assert (code, reason) == (messages.UNAUTHORISED, "the server's authenticator returned no valid subject")
     assert table.game.faults.total == 1
@@ -71,7 +71,7 @@ def test_what_a_check_of_ones_own_returns(bad: Any) -> None:
 
 def test_a_check_of_ones_own_that_fails_costs_its_client_alone() -> None:
     table = Table()
-    table.game._authenticate = lambda token: {"ann": "Ann"}[token]
+    table.game.joining.authenticate = lambda token: {"ann": "Ann"}[token]
     bad, good = (table.connect(Hello(messages.VERSION, {}, "", said)) for said in ("bob", "ann"))
     table.tick()
     assert bad.closings == [(messages.INTERNAL, "internal error")]
@@ -85,7 +85,7 @@ def test_the_reason_of_a_refusal_is_told_as_far_as_it_can_be(bad: str) -> None:
         raise AuthError(f"{bad} is not known")
 
     table = Table()
-    table.game._authenticate = check
+    table.game.joining.authenticate = check
     code, reason = table.connect(Hello(messages.VERSION, {}, "Ann", "x")).refusal()
     assert (code, reason) == (messages.UNAUTHORISED, f"{bad.encode(errors='replace').decode()} is not known")
 

@@ -1,0 +1,97 @@
+"""The connections of a game, and the ways in which one ends.
+
+A client that may not join is refused. A client that breaks a rule is kicked. An exception in our own code costs the
+client that it affected its connection, and the tick goes on. A link may report itself as lost during a call of its
+`send` or `close`, so loops in which that can happen iterate over a copy of the sessions.
+"""
+
+from server.game.roster import Roster
+from server.game.session import Session
+from server.observability.counters import Counters
+from server.observability.errors import Faults
+from server.replication.client_stream import Link
+from shared import messages
+from shared.messages import Bye, encode
+
+
+class Connections:
+    """The sessions of one game.
+
+    Args:
+        roster: the players, who may reconnect after some of the ends.
+        counters: where ends are counted.
+        faults: where exceptions in our own code are reported.
+    """
+
+    def __init__(self, roster: Roster, counters: Counters, faults: Faults) -> None:
+        self._roster, self._counters, self._faults = roster, counters, faults
+        self.sessions: list[Session] = []
+
+    def open(self, link: Link, now: float) -> Session:
+        """Adds a new connection and returns its session."""
+        session = Session(link, now)
+        self.sessions.append(session)
+        return session
+
+    def lost(self, session: Session, now: float) -> None:
+        """Removes a session whose connection is gone. Its player may reconnect."""
+        session.closed = True
+        if session in self.sessions:
+            self.sessions.remove(session)
+        self._roster.lost(session, now)
+
+    def leave(self, session: Session) -> None:
+        """Closes the connection of a client that has said goodbye. Its player leaves."""
+        self._roster.dismiss(session)
+        session.close(messages.GOING_AWAY, "goodbye")
+
+    def refuse(self, session: Session, code: int, reason: str) -> None:
+        """Closes the connection of a client that may not join."""
+        self._counters.refused += 1
+        self.end(session, code, reason)
+
+    def kick(self, session: Session, code: int, reason: str) -> None:
+        """Closes the connection of a client that has broken a rule. Its player may not reconnect."""
+        self._counters.kicked += 1
+        if code != messages.TOO_SLOW:  # slowness is the network's fault: the player may reconnect
+            self._roster.dismiss(session)
+        self.end(session, code, reason)
+
+    def fail(self, session: Session, what: str) -> None:
+        """Handles an exception in our own code that affects one client: closes its connection, and the tick goes on.
+
+        The player may reconnect.
+
+        Args:
+            session: the client's session.
+            what: what the exception interrupted, for the log.
+        """
+        self._faults.report(what)
+        try:
+            session.close(messages.INTERNAL, "internal error")
+        except Exception:
+            self._faults.report("closing a link")
+        self.lost(session, session.heard)
+
+    def end(self, session: Session, code: int, reason: str, wait: float = -1.0) -> None:
+        """Sends a Bye and closes the connection.
+
+        Args:
+            session: the client's session.
+            code: the close code.
+            reason: the reason, sent to the client.
+            wait: seconds after which the client should reconnect; negative: the client is not asked to.
+        """
+        reason = reason.encode(errors="replace").decode()[: messages.REASON_MAX]
+        self._counters.closed[code] = self._counters.closed.get(code, 0) + 1
+        try:
+            session.send(encode(Bye(code, reason, wait)))
+            session.close(code, reason)
+        except Exception:
+            self.fail(session, "saying goodbye")
+
+    def shut_down(self, reason: str, wait: float) -> None:
+        """Ends all connections. Arguments as for `end`."""
+        for session in tuple(self.sessions):
+            if not session.closed:
+                self.end(session, messages.GOING_AWAY, reason, wait)

@@ -1,0 +1,144 @@
+"""The handshake of a client: its Hello is checked when it arrives, and answered by a Welcome in a tick."""
+
+from collections.abc import Callable
+
+from server.auth.identity import checked_subject
+from server.config.limits import Limits
+from server.game.commands import Orders
+from server.game.connections import Connections
+from server.game.roster import Roster
+from server.game.session import Session
+from server.journal.recorded_world import RecordedWorld
+from server.observability.counters import Counters
+from server.observability.errors import Faults
+from shared import messages
+from shared.messages import Hello, Welcome, encode
+
+
+class Joining:
+    """The handshakes of one game.
+
+    Args:
+        world: the world.
+        limits: the limits.
+        counters: where reconnects are counted.
+        faults: where wrong results of `authenticate` are reported.
+        connections: the sessions.
+        roster: the players.
+        orders: says up to which tick the world is durable.
+        authenticate: returns the subject of a token, as for `Game`; None: anyone may play.
+    """
+
+    def __init__(
+        self,
+        world: RecordedWorld,
+        limits: Limits,
+        counters: Counters,
+        faults: Faults,
+        connections: Connections,
+        roster: Roster,
+        orders: Orders,
+        authenticate: Callable[[str], str] | None,
+    ) -> None:
+        self._world, self._limits, self._counters, self._faults = world, limits, counters, faults
+        self._connections, self._roster, self._orders = connections, roster, orders
+        self._rules = world.scene.to_table()
+        self.authenticate = authenticate
+
+    def hello(self, session: Session, hello: Hello, now: float) -> None:
+        """Checks a Hello. Its client joins in one of the next ticks, or is refused now."""
+        if hello.version != messages.VERSION:
+            newer = "older" if hello.version < messages.VERSION else "newer"
+            reason = f"the client is {newer}: protocol version {hello.version}, the server speaks {messages.VERSION}"
+            self._connections.refuse(session, messages.WRONG_VERSION, reason)
+            return
+        mine = self._world.scene.digests
+        differ = sorted(name for name in mine | hello.scene if mine.get(name) != hello.scene.get(name))
+        if hello.scene and differ:
+            reason = f"the server plays another scene ({', '.join(name[:40] for name in differ)} differ)"
+            self._connections.refuse(session, messages.WRONG_SCENE, reason)
+            return
+        if len(hello.name) > self._limits.name_max:
+            reason = f"a name longer than {self._limits.name_max} characters"
+            self._connections.refuse(session, messages.MALFORMED, reason)
+            return
+        if not self._authenticated(session, hello.token):
+            return
+        session.stream.pacing.answered(now - session.opened, 0, now)  # a round trip with nothing on the way
+        session.hello = hello._replace(token="")
+
+    def join(self) -> None:
+        """Lets the clients that wait join, at most `Limits.joins_per_tick` of them. Call it before the step."""
+        sessions = self._connections.sessions
+        joining = [session for session in sessions if session.hello is not None and not session.closed]
+        for session in joining[: self._limits.joins_per_tick]:
+            try:
+                self._welcome(session)
+            except Exception:
+                self._connections.fail(session, "a join")
+
+    def greet(self, session: Session, tick: int, welcome: bytes) -> bool:
+        """Sends the welcome once the resume token in it is durable, or at once if nothing can be saved.
+
+        Args:
+            session: the client's session.
+            tick, welcome: `Session.greeting`.
+
+        Returns:
+            Whether the welcome has been sent.
+        """
+        if self._orders.durable_tick < tick and not self._orders.trouble:
+            return False
+        session.send(welcome)
+        session.greeting = None
+        return True
+
+    def _authenticated(self, session: Session, token: str) -> bool:
+        """Sets the subject of a session. Returns False if the client was refused."""
+        if self.authenticate is None:
+            return True
+        try:
+            subject = self.authenticate(token)
+        except ValueError as error:
+            self._connections.refuse(session, messages.UNAUTHORISED, str(error))
+            return False
+        except Exception:
+            self._connections.fail(session, "authenticating a client")
+            return False
+        try:
+            session.subject = checked_subject(subject)
+        except ValueError:
+            self._faults.report("the result of the authenticator")
+            reason = "the server's authenticator returned no valid subject"
+            self._connections.refuse(session, messages.UNAUTHORISED, reason)
+            return False
+        return True
+
+    def _welcome(self, session: Session) -> None:
+        """Seats a session at its player, a known or a new one, and prepares the welcome; or refuses the client."""
+        assert session.hello is not None
+        player, new = self._roster.find(session.hello.resume, session.subject), False
+        if player is not None:
+            self._counters.resumed += 1
+            player.outbox.reconnect()
+            if player.session is not None and not player.session.closed:
+                reason = "the player goes on over another connection"
+                self._connections.end(player.session, messages.TAKEN_OVER, reason)
+            session.seat(player)
+        elif self._roster.connected >= self._limits.clients_max:
+            reason = f"the server is full ({self._limits.clients_max} clients)"
+            self._connections.refuse(session, messages.FULL, reason)
+            return
+        else:
+            player, new = self._roster.enter(session, session.hello.name), True
+            if player is None:
+                self._connections.refuse(session, messages.FULL, "no room to spawn")
+                return
+        try:
+            token = self._roster.issue(player)
+            welcome = encode(Welcome(messages.VERSION, self._world.tick, player.entity, self._rules, token))
+        except Exception:
+            if new:
+                self._roster.expel(player)
+            raise
+        session.greeting = (self._world.tick + 1, welcome)
