@@ -15,6 +15,7 @@ unchanged, and a key does not help, because every client would have to know it.
 
 import hashlib
 import itertools
+import math
 import zlib
 from collections.abc import Iterator
 from typing import TypeVar
@@ -22,9 +23,9 @@ from typing import TypeVar
 import numpy as np
 import numpy.typing as npt
 
-from shared.checks import Cell, MissingError, SceneError, shown
+from shared.checks import Cell, MissingError, SceneError, cell, shown, whole
 from shared.layout import CELLS
-from shared.units import SEGMENT, SEGMENT_SHIFT
+from shared.units import RANGE_BLOCKS, SEGMENT, SEGMENT_SHIFT
 
 BLOCKS = SEGMENT**3
 """Number of blocks in a segment."""
@@ -32,6 +33,10 @@ AIR = 0
 """Kind of a block that is not solid; all other kinds are."""
 KIND_MAX = 255
 """Greatest kind of a block."""
+SEGMENT_MAX = RANGE_BLOCKS // SEGMENT
+"""Bound of a segment's index along each axis, in segments: from `-SEGMENT_MAX` to `SEGMENT_MAX - 1`."""
+FILL_MAX = 1 << 20
+"""Limit of the blocks of one `World.fill`."""
 PACKED_MAX = 48 * 1024
 """Longest packed segment, in bytes (random blocks of 256 kinds pack to 33 KB)."""
 
@@ -83,6 +88,41 @@ def checked_kinds(kinds: npt.ArrayLike) -> Kinds:
     if not good or (found.dtype != np.uint8 and not AIR <= found.min() <= found.max() <= KIND_MAX):
         raise SceneError(f"kinds = {shown(kinds)}: must be {BLOCKS} whole numbers from {AIR} to {KIND_MAX}")
     return found.reshape(-1).astype(np.uint8, copy=False)
+
+
+def checked_block(x: object, y: object, z: object) -> Cell:
+    """Returns the coordinates of a block.
+
+    Raises:
+        SceneError: one is not a whole number, or is out of range.
+    """
+    i, j, k = (whole(part, at, -RANGE_BLOCKS, RANGE_BLOCKS - 1) for at, part in (("x", x), ("y", y), ("z", z)))
+    return i, j, k
+
+
+def checked_segment(index: object) -> Cell:
+    """Returns the index of a segment.
+
+    Raises:
+        SceneError: it is not three whole numbers, or one is out of range.
+    """
+    return cell(index, "segment", -SEGMENT_MAX, SEGMENT_MAX - 1)
+
+
+def checked_box(low: object, high: object) -> tuple[Cell, Cell]:
+    """Returns the corners of a box of blocks, `low` and `high` (excluded).
+
+    Raises:
+        SceneError: a corner is not three whole numbers or is out of range, `high` is below `low`, or the box has more
+            than `FILL_MAX` blocks.
+    """
+    first, end = (cell(corner, at, -RANGE_BLOCKS, RANGE_BLOCKS) for corner, at in ((low, "low"), (high, "high")))
+    sides = [b - a for a, b in zip(first, end, strict=True)]
+    if min(sides) < 0:
+        raise SceneError(f"high = {end}: must not be below low = {first} along any axis")
+    if math.prod(sides) > FILL_MAX:
+        raise SceneError(f"low = {first}, high = {end}: {math.prod(sides)} blocks; at most {FILL_MAX} at once")
+    return first, end
 
 
 def segment_of(x: int, y: int, z: int) -> Cell:

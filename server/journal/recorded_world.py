@@ -1,15 +1,15 @@
-"""A world with observers: it reports every change to recordings (format: `server.journal.records`) and to a store."""
+"""A world with pens: they note every change for recordings (format: `server.journal.records`) and for a store."""
 
 import math
 import struct
 import zlib
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
+from itertools import product
 from typing import Any, Protocol
 
 import msgpack
 import numpy as np
-import numpy.typing as npt
 
 from server.journal.records import (
     FILL,
@@ -28,12 +28,13 @@ from server.journal.records import (
     mark,
 )
 from shared import terrain
-from shared.blocks import Kinds, pack, segment_of
+from shared.blocks import pack
 from shared.checks import Cell, SceneError
 from shared.inputs import Input
-from shared.layout import FALLING, FLAGS, ID, Int64s
-from shared.states import STATES
-from shared.world import OverlapError, World
+from shared.layout import ID, Int64s
+from shared.scene import Scene
+from shared.world import World
+from shared.world_state import WorldState
 
 FRESHENED_PER_TICK = 1
 """Digests of changed segments that are computed after each step, so that no later tick has to compute many at once."""
@@ -69,7 +70,7 @@ class Saves(Protocol):
 
 
 class Pen:
-    """An observer of a world. It collects the calls since the last tick and the inputs that differ from the last ones.
+    """The notes on one world: the calls since the last tick, and the inputs that differ from the last ones.
 
     Args:
         first: whether the first tick gets no mark, because states written before it may be among its changes without a
@@ -93,11 +94,11 @@ class Pen:
     def touch(self, segment: Cell) -> None:
         """Is called before the blocks of a segment may change."""
 
-    def tick(self, world: World, inputs: Mapping[int, Input]) -> None:
+    def tick(self, world: WorldState, inputs: Mapping[int, Input]) -> None:
         """Is called after each step of the world with the inputs of the step."""
         raise NotImplementedError
 
-    def taken(self, world: World, inputs: Mapping[int, Input]) -> list[Any]:
+    def taken(self, world: WorldState, inputs: Mapping[int, Input]) -> list[Any]:
         """Makes the record of a tick: `[inputs, calls, mark]`, and the hash if one is due. Clears the calls."""
         calls, self.calls = self.calls, []
         held = self._held
@@ -114,19 +115,77 @@ class Pen:
         return parts
 
 
-class RecordedWorld(World):
-    """A world with pens (observers). Without any, a change costs one more comparison than in a `World`."""
+class Pens:
+    """The observer of a recorded world (`shared.world_changes.Observer`): it notes each change with all pens."""
 
-    _pens: tuple[Pen, ...] = ()
-    _inside = 0
+    def __init__(self) -> None:
+        self.all: tuple[Pen, ...] = ()
+
+    def note(self, call: Call) -> None:
+        """Adds a call to the calls before the coming tick."""
+        for pen in self.all:
+            pen.calls.append(call)
+
+    def touching(self, low: Cell, high: Cell) -> None:
+        if self.all:
+            (x0, y0, z0), (x1, y1, z1) = low, high
+            for z, y, x in product(range(z0, z1 + 1), range(y0, y1 + 1), range(x0, x1 + 1)):
+                for pen in self.all:
+                    pen.touch((x, y, z))
+
+    def filled(self, low: Cell, high: Cell, kind: int, push: bool) -> None:
+        self.note([FILL, *low, *high, kind, push])
+
+    def loaded(self, world: WorldState, segment: Cell) -> None:
+        if self.all:
+            self.note([LOAD, *segment, packed(world, segment)])
+
+    def unloaded(self, segment: Cell) -> None:
+        self.note([UNLOAD, *segment])
+
+    def wrote_blocks(self, segment: Cell, offsets: list[int], kinds: list[int]) -> None:
+        self.note([WRITE, *segment, offsets, kinds])
+
+    def put(self, states: Int64s) -> None:
+        if self.all:
+            self._forget(states[:, ID].tolist())
+            self.note([PUT, *states.ravel().tolist()])
+
+    def removed(self, entity: int) -> None:
+        self._forget([entity])
+        self.note([REMOVE, entity])
+
+    def rebased(self, tick: int) -> None:
+        self.note([REBASE, tick])
+
+    def restoring(self) -> None:
+        if self.all:
+            raise JournalError("a world that is being recorded cannot become another; end the recording first")
+
+    def stepped(self, world: WorldState, inputs: Mapping[int, Input]) -> None:
+        world.blocks.freshen(FRESHENED_PER_TICK)
+        for pen in self.all:
+            pen.tick(world, inputs)
+
+    def _forget(self, entities: list[int]) -> None:
+        for pen in self.all:
+            pen.forget(entities)
+
+
+class RecordedWorld(World):
+    """A world whose changes are noted with pens. Without any, a change costs one more call than in a `World`."""
+
+    def __init__(self, scene: Scene, *, compiled: bool | None = None) -> None:
+        super().__init__(scene, compiled=compiled)
+        self.observer = self._pens = Pens()
 
     def attach(self, pen: Pen) -> None:
         """Adds a pen. It is notified of every change from now on."""
-        self._pens = (*self._pens, pen)
+        self._pens.all = (*self._pens.all, pen)
 
     def detach(self, pen: Pen) -> None:
         """Removes a pen. Does nothing if it is not attached."""
-        self._pens = tuple(each for each in self._pens if each is not pen)
+        self._pens.all = tuple(each for each in self._pens.all if each is not pen)
 
     def record(self, file: Sink, failed: Callable[[OSError], None] | None = None) -> None:
         """Starts a recording. Writes the present state at once, and one record per tick from now on.
@@ -139,7 +198,7 @@ class RecordedWorld(World):
         Raises:
             JournalError: the world is being recorded already.
         """
-        if any(isinstance(pen, _FilePen) for pen in self._pens):
+        if any(isinstance(pen, _FilePen) for pen in self._pens.all):
             raise JournalError("this world is being recorded already")
         pen = _FilePen(file, self, failed or _reraise)
         self.attach(pen)
@@ -147,7 +206,7 @@ class RecordedWorld(World):
 
     def end_recording(self) -> None:
         """Ends the recording with a hash. Then the file can be closed. Does nothing if there is no recording."""
-        for pen in self._pens:
+        for pen in self._pens.all:
             if isinstance(pen, _FilePen):
                 pen.end()
                 self.detach(pen)
@@ -161,102 +220,8 @@ class RecordedWorld(World):
         Raises:
             TypeError, ValueError, OverflowError: MessagePack cannot encode the value.
         """
-        if self._pens:
-            self._call([NOTE, msgpack.packb(value)])
-
-    # -- what changes a world --------------------------------------------------------------------------------
-
-    def _put(self, states: Iterable[tuple[int, ...]] | Int64s) -> None:
-        if self._pens and not self._inside:
-            states = states if isinstance(states, np.ndarray) else list(states)
-            rows = np.array(states, np.int64).reshape(-1, STATES)
-            self._forget(rows[:, ID].tolist())
-            self._call([PUT, *rows.ravel().tolist()])
-        super()._put(states)
-
-    def spawn_many(self, template: str, positions: npt.ArrayLike) -> range:
-        self._inside += 1  # a failed call removes what it has put, which changes nothing
-        try:
-            ids = super().spawn_many(template, positions)
-        finally:
-            self._inside -= 1
-        if self._pens and ids:
-            states = self.rows(ids)[:, :STATES]
-            states[:, FLAGS] &= FALLING
-            self._call([PUT, *states.ravel().tolist()])
-        return ids
-
-    def _remove(self, entity: int) -> None:
-        super()._remove(entity)
-        if self._pens and not self._inside:
-            self._forget([entity])
-            self._call([REMOVE, entity])
-
-    def _fill(self, low: Cell, high: Cell, kind: int, push: bool) -> int:
-        if not self._pens:
-            return super()._fill(low, high, kind, push)
-        (x0, y0, z0), (x1, y1, z1) = segment_of(*low), segment_of(*(part - 1 for part in high))
-        for segment in ((x, y, z) for z in range(z0, z1 + 1) for y in range(y0, y1 + 1) for x in range(x0, x1 + 1)):
-            self._touch(segment)
-        call = [FILL, *low, *high, kind, push]
-        self._inside += 1  # pushed entities are part of this call
-        try:
-            changed = super()._fill(low, high, kind, push)
-        except OverlapError:
-            self._call(call)
-            raise
-        finally:
-            self._inside -= 1
-        self._call(call)
-        return changed
-
-    def _load(self, index: Cell, kinds: Kinds) -> None:
-        self._touch(index)
-        super()._load(index, kinds)
-        if self._pens:
-            self._call([LOAD, *index, packed(self, index)])
-
-    def _unload(self, index: Cell) -> None:
-        self._touch(index)
-        super()._unload(index)
-        if self._pens:
-            self._call([UNLOAD, *index])
-
-    def _write_blocks(self, segment: Cell, offsets: list[int], kinds: list[int]) -> None:
-        self._touch(segment)
-        super()._write_blocks(segment, offsets, kinds)
-        if self._pens:
-            self._call([WRITE, *segment, offsets, kinds])
-
-    def _rebase(self, tick: int) -> None:
-        super()._rebase(tick)
-        if self._pens:
-            self._call([REBASE, tick])
-
-    def restore(self, other: World) -> None:
-        if self._pens:
-            raise JournalError("a world that is being recorded cannot become another; end the recording first")
-        super().restore(other)
-
-    def step(self, inputs: Mapping[int, Input] | None = None) -> None:
-        super().step(inputs)
-        self.blocks.freshen(FRESHENED_PER_TICK)
-        for pen in self._pens:
-            pen.tick(self, inputs or {})
-
-    # -- inside ----------------------------------------------------------------------------------------------
-
-    def _call(self, call: Call) -> None:
-        for pen in self._pens:
-            pen.calls.append(call)
-
-    def _forget(self, entities: list[int]) -> None:
-        for pen in self._pens:
-            pen.forget(entities)
-
-    def _touch(self, segment: Cell) -> None:
-        for pen in self._pens:
-            pen.touch(segment)
+        if self._pens.all:
+            self._pens.note([NOTE, msgpack.packb(value)])
 
 
 class _FilePen(Pen):
@@ -276,7 +241,7 @@ class _FilePen(Pen):
         self._chain = zlib.crc32(head)
         self._record([world.scene.to_table(), world.tick, world.next_id, states, segments], head)
 
-    def tick(self, world: World, inputs: Mapping[int, Input]) -> None:
+    def tick(self, world: WorldState, inputs: Mapping[int, Input]) -> None:
         self._record(self.taken(world, inputs))
 
     def end(self) -> None:
@@ -296,7 +261,7 @@ class _FilePen(Pen):
         self._chain = check
 
 
-def packed(world: World, index: Cell) -> bytes | None:
+def packed(world: WorldState, index: Cell) -> bytes | None:
     """Returns the packed blocks of a loaded segment; None if they are as generated."""
     kinds = world.blocks.segment(index)
     with suppress(SceneError):

@@ -44,6 +44,7 @@ from shared.layout import FALLING, FLAGS, ID, Int64s
 from shared.scene import Scene
 from shared.states import STATES
 from shared.world import World
+from shared.world_state import WorldState
 
 MAGIC = b"\x89SNJ\r\n\x1a\n"
 """First bytes of a recording."""
@@ -72,7 +73,7 @@ class DivergedError(JournalError):
         self.tick = tick
 
 
-def mark(world: World) -> int:
+def mark(world: WorldState) -> int:
     """Returns a checksum of the entities that the latest step changed.
 
     It is cheap enough for every tick, so a replay finds the exact tick that differs.

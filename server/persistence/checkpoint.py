@@ -16,7 +16,8 @@ from shared.checks import Cell
 from shared.layout import FALLING, FLAGS, ID, Int64s
 from shared.scene import Scene
 from shared.states import STATES
-from shared.world import World, hash_of
+from shared.world import World
+from shared.world_state import hash_of
 
 Segment = tuple[int, int, int, bytes | None]
 """Index of a loaded segment, and its packed blocks (None: as generated)."""

@@ -54,7 +54,7 @@ from server.persistence.restore import claimed, load
 from shared.checks import Cell, text
 from shared.inputs import Input
 from shared.scene import Scene
-from shared.world import World
+from shared.world_state import WorldState
 
 LOG_BYTES_MAX = 32 << 20
 """Size of the log in bytes that triggers a checkpoint ahead of time."""
@@ -182,7 +182,7 @@ class Store(Pen):
         if copy is not None:
             copy.touch(segment)
 
-    def tick(self, world: World, inputs: Mapping[int, Input]) -> None:
+    def tick(self, world: WorldState, inputs: Mapping[int, Input]) -> None:
         tick = world.tick
         try:
             parts = self.taken(world, inputs)

@@ -31,6 +31,7 @@ from server.journal.records import (
 )
 from shared.inputs import Input
 from shared.world import OverlapError, World
+from shared.world_state import WorldState
 from tests import worlds
 from tests.lengths import examples
 
@@ -171,7 +172,7 @@ def test_two_pens_write_the_same_and_each_ends_on_its_own() -> None:
             super().__init__(first=False)
             self.records: list[list[Any]] = []
 
-        def tick(self, world: World, inputs: Mapping[int, Input]) -> None:
+        def tick(self, world: WorldState, inputs: Mapping[int, Input]) -> None:
             self.records.append(self.taken(world, inputs))
 
     pen = Second()

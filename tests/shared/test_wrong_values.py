@@ -11,10 +11,12 @@ import numpy as np
 import pytest
 
 from server.journal.recorded_world import Pen, RecordedWorld
+from shared.blocks import FILL_MAX
 from shared.checks import MissingError, SceneError
 from shared.inputs import Input, make_input
 from shared.scene import Scene, Template, load_scene
-from shared.world import FILL_MAX, World
+from shared.world import World
+from shared.world_state import WorldState
 from tests.worlds import build, floor, scene
 
 NAN, INF = math.nan, math.inf
@@ -61,7 +63,7 @@ def kept_world(compiled: bool) -> RecordedWorld:
 
 
 class Calls(Pen):
-    def tick(self, world: World, inputs: Any) -> None: ...
+    def tick(self, world: WorldState, inputs: Any) -> None: ...
 
 
 def refused(world: RecordedWorld, act: Act, error: type[Exception], said: str) -> None:

@@ -1,0 +1,325 @@
+"""The changes of a world, without checks of their arguments. Every change goes through a method of this module.
+
+The methods of `shared.world.World` check their arguments and call these. An observer, if there is one, is notified of
+each change: a recording is nothing but the calls of its observer. A change that is part of another (an entity that a
+block pushes aside) is not reported by itself.
+"""
+
+from collections.abc import Iterable, Mapping
+from typing import Protocol
+
+import numpy as np
+
+from shared import blocks, layout
+from shared.checks import Cell, SceneError, shown
+from shared.free_places import OverlapError, box_at, free_place, overlapping
+from shared.inputs import BUTTONS_MAX, WISH_MAX, Input, checked_input
+from shared.layout import FALLING, FLAGS, ID, PREV, TEMPLATE, Int64s, X
+from shared.states import STATES
+from shared.units import BLOCK, SEGMENT
+from shared.world_state import WorldState
+
+LISTS = (
+    ("_awake", layout.N_AWAKE), ("_woken", layout.N_WOKEN), ("_changed", layout.N_CHANGED), ("_fell", layout.N_FELL),
+)  # fmt: skip
+"""Names of the lists that a world keeps between two steps, with the place of each list's length in `_lengths`."""
+
+
+class Observer(Protocol):
+    """The target of the reports of a world's changes. Each method is called after the change unless it says otherwise.
+
+    Only `UncheckedWorld.follow` and setting `next_id` are not reported.
+    """
+
+    def touching(self, low: Cell, high: Cell) -> None:
+        """Is called before blocks of the segments from index `low` to index `high` (included) may change."""
+
+    def filled(self, low: Cell, high: Cell, kind: int, push: bool) -> None:
+        """Is called after `fill` or `set_block`. It may have raised `OverlapError`, which changes no block."""
+
+    def loaded(self, world: WorldState, segment: Cell) -> None:
+        """Is called after a segment was loaded or replaced."""
+
+    def unloaded(self, segment: Cell) -> None:
+        """Is called after a segment was unloaded."""
+
+    def wrote_blocks(self, segment: Cell, offsets: list[int], kinds: list[int]) -> None:
+        """Is called after blocks of a segment were written."""
+
+    def put(self, states: Int64s) -> None:
+        """Is called before states ([n, 12]) are written, and after `spawn_many`."""
+
+    def removed(self, entity: int) -> None:
+        """Is called after an entity was removed."""
+
+    def rebased(self, tick: int) -> None:
+        """Is called after the tick was set without a step."""
+
+    def restoring(self) -> None:
+        """Is called before the world becomes equal to another. It may raise, and then nothing changes."""
+
+    def stepped(self, world: WorldState, inputs: Mapping[int, Input]) -> None:
+        """Is called after a step with its inputs."""
+
+
+class UncheckedWorld(WorldState):
+    """A world without checks of arguments. Games use `shared.world.World`, which checks them."""
+
+    observer: Observer | None = None
+    """Target of the reports of all changes; None: there is none."""
+
+    def _load(self, index: Cell, kinds: blocks.Kinds) -> None:
+        """Adds or replaces a segment, and wakes the entities that overlap or touch it."""
+        observer = self.observer
+        if observer is not None:
+            observer.touching(index, index)
+        if self.blocks.load(index, kinds):
+            self._bind()
+        if self._lengths[layout.N_HOMELESS]:
+            self.kernel.relink_range(self.bound, 0, self._rows)
+        self._wake_segment(index)
+        if observer is not None:
+            observer.loaded(self, index)
+
+    def _unload(self, index: Cell) -> None:
+        """Removes a segment without entities.
+
+        Raises:
+            MissingError: the segment is not loaded.
+        """
+        observer = self.observer
+        if observer is not None:
+            observer.touching(index, index)
+        self.blocks.unload(index)
+        self._wake_segment(index)  # below the scene's floor, a segment that is not loaded is void, so things may fall
+        if observer is not None:
+            observer.unloaded(index)
+
+    def _fill(self, low: Cell, high: Cell, kind: int, push: bool) -> int:
+        """Sets every block of a box (`high` excluded), or none. Returns the number of blocks that changed.
+
+        Raises:
+            OverlapError: a solid entity is in the way (and, with `push`, cannot be pushed out of it).
+            SceneError: a segment is not loaded.
+        """
+        observer = self.observer
+        if observer is None:
+            return self._set_box(low, high, kind, push)
+        x, y, z = high
+        observer.touching(blocks.segment_of(*low), blocks.segment_of(x - 1, y - 1, z - 1))
+        try:
+            changed = self._set_box(low, high, kind, push)
+        except OverlapError:
+            observer.filled(low, high, kind, push)  # entities may have been woken
+            raise
+        observer.filled(low, high, kind, push)
+        return changed
+
+    def _set_box(self, low: Cell, high: Cell, kind: int, push: bool) -> int:
+        changed = self.blocks.different(low, high, kind)
+        in_the_way: list[int] = []
+        if kind != blocks.AIR:
+            in_the_way = overlapping(self, -1, [part * BLOCK for part in (*low, *high)])
+            if in_the_way and not push:
+                raise OverlapError(f"blocks {low} to {high}: entity {in_the_way[0]} is there")
+        for (x, y, z), before in changed:
+            self.blocks.set(x, y, z, kind)
+            self.editing.setdefault((x, y, z), before)
+            if kind == blocks.AIR:
+                face = (x * BLOCK, y * BLOCK, (x + 1) * BLOCK, (y + 1) * BLOCK, (z + 1) * BLOCK)
+                self.kernel.wake_on(self.bound, -1, *face)
+        states, placing = [self.state(entity) for entity in in_the_way], set(self.placing)
+        try:
+            for entity in in_the_way:
+                self._store([self._placed(entity, self.position(entity), push=True)])
+                self.placing.add(entity)
+        except OverlapError:
+            for cell, before in changed:
+                self.blocks.set(*cell, before)
+            self._store(states)
+            self.placing = placing
+            raise
+        return len(changed)
+
+    def _write_blocks(self, segment: Cell, offsets: list[int], kinds: list[int]) -> None:
+        """Changes blocks of a loaded segment (by index z << 10 | y << 5 | x) without a look for entities in the way."""
+        observer = self.observer
+        if observer is not None:
+            observer.touching(segment, segment)
+        for at, kind in zip(offsets, kinds, strict=True):
+            x, y, z = (
+                part * SEGMENT + ((at >> shift) & (SEGMENT - 1))
+                for part, shift in zip(segment, (0, 5, 10), strict=True)
+            )
+            self.editing.setdefault((x, y, z), self.blocks.get(x, y, z) or blocks.AIR)
+            self.blocks.set(x, y, z, kind)
+            self.kernel.wake_on(self.bound, -1, x * BLOCK, y * BLOCK, (x + 1) * BLOCK, (y + 1) * BLOCK, (z + 1) * BLOCK)
+        if observer is not None:
+            observer.wrote_blocks(segment, offsets, kinds)
+
+    def _placed(self, entity: int, position: object, *, push: bool) -> tuple[int, ...]:
+        """Returns the state of an entity as it would be at a free place: at the position, or with `push` near it.
+
+        Raises:
+            MissingError: there is no such entity.
+            OverlapError: the place is occupied (and, with `push`, so are the places near it).
+            SceneError: the position is not finite or out of range.
+        """
+        row = self._row_at(entity)
+        state = list(self.state(entity))
+        state[X : X + 3] = free_place(self, row, state[TEMPLATE], position, push)
+        return tuple(state)
+
+    def _put(self, states: Iterable[tuple[int, ...]] | Int64s) -> None:
+        """Writes states; ids that are not known become new entities."""
+        if self.observer is not None:
+            states = _matrix(states)
+            self.observer.put(states)
+        self._store(states)
+
+    def _store(self, states: Iterable[tuple[int, ...]] | Int64s) -> None:
+        """Writes states without a report."""
+        new = _matrix(states)
+        ids = new[:, ID].tolist()
+        known = list(map(self._row_of.get, ids))
+        rows = np.array([self._row(entity) for entity in ids] if None in known else known, np.int64)
+        self.kernel.store(self.bound, self.kernel.lent(rows), self.kernel.lent(new), len(rows), self.tick + 1)
+
+    def _settle(self, template: int, positions: Int64s) -> int:
+        """Adds entities at rest, in order, until one has no room. Returns how many have room; then it removes them all.
+
+        Args:
+            template: number of the entities' template.
+            positions: [n, 3] in grid steps.
+        """
+        n, first = len(positions), self._next_id
+        ids = range(first, first + n)
+        states = np.zeros((n, STATES), np.int64)
+        states[:, ID] = ids
+        states[:, TEMPLATE] = template
+        states[:, X : X + 3] = positions
+        rows = np.array([self._row(entity) for entity in ids], np.int64)
+        settled: int = self.kernel.settle(
+            self.bound, self.kernel.lent(rows), self.kernel.lent(states), n, self.tick + 1
+        )
+        if settled < n:
+            for entity in ids[settled:]:
+                self._free.append(self._row_of.pop(entity))
+            for entity in ids[:settled]:
+                self._take_out(entity)
+            self._next_id = first
+        elif n and self.observer is not None:
+            self.observer.put(self.states_of(ids))
+        return settled
+
+    def _remove(self, entity: int) -> None:
+        """Removes an entity, and wakes the entities that stood on it."""
+        self._take_out(entity)
+        if self.observer is not None:
+            self.observer.removed(entity)
+
+    def _take_out(self, entity: int) -> None:
+        """Removes an entity without a report."""
+        row = self._row_of.pop(entity)
+        self._leave(row)
+        self.kernel.unlink(self.bound, row)
+        self._entities[row, ID] = 0
+        (self._limbo if self._entities[row, FLAGS] & layout.AWAKE else self._free).append(row)
+
+    def _thrown(self, speed: int) -> int:
+        """Returns the flags for a vertical speed: an entity that moves up falls, even if something supports it."""
+        return FALLING if speed > 0 and self.parameters[layout.GRAVITY] else 0
+
+    def _wake_segment(self, index: Cell) -> None:
+        """Wakes the entities that overlap or touch a segment."""
+        low = [part * SEGMENT * BLOCK for part in index]
+        self.kernel.wake_in(self.bound, *low, *(part + SEGMENT * BLOCK for part in low))
+
+    def _leave(self, row: int) -> None:
+        """Wakes the entities that stand on an entity that is about to be removed or changed."""
+        box = box_at(self, int(self._entities[row, TEMPLATE]), self._entities[row, X : X + 3].tolist())
+        self.kernel.wake_on(self.bound, row, box[0], box[1], box[3], box[4], box[5])
+
+    def _told_of(self, inputs: Mapping[int, Input]) -> list[int]:
+        """Returns inputs as the kernel takes them: row, move_x, move_y and buttons for each."""
+        told: list[int] = []
+        rows, most = self._row_of, WISH_MAX
+        try:
+            for entity, (x, y, buttons) in inputs.items():
+                if not (
+                    type(x) is type(y) is type(buttons) is int
+                    and -most <= x <= most >= y >= -most
+                    and 0 <= buttons <= BUTTONS_MAX
+                ):
+                    raise ValueError
+                told += (rows[entity], x, y, buttons)
+        except (KeyError, TypeError, ValueError):  # one of them is wrong, or has numbers of numpy
+            told = []
+            for entity, wish in inputs.items():
+                told += (self._row_at(entity), *checked_input(wish, f"inputs[{entity}]"))
+        return told
+
+    def _rebase(self, tick: int) -> None:
+        """Sets the tick without a step."""
+        self._entities[: self._rows, layout.CHANGED] = -1  # the new tick may be an earlier one
+        self._lengths[layout.N_CHANGED] = self._lengths[layout.N_FELL] = 0
+        self._arrive(tick)
+        if self.observer is not None:
+            self.observer.rebased(tick)
+
+    def _arrive(self, tick: int) -> None:
+        """Sets the tick and forgets what changed before it."""
+        self.tick = tick
+        self.editing, self.edited = {}, {}
+        self.placing, self.placed = set(), set()
+        if self._limbo:
+            for name, length in (("_awake", layout.N_AWAKE), ("_woken", layout.N_WOKEN)):
+                keys = getattr(self, name)[: self._lengths[length]]
+                alive = np.sort(keys[self._entities[keys & 0xFFFFFFFF, ID] == keys >> 32])
+                getattr(self, name)[: len(alive)] = alive
+                self._lengths[length] = len(alive)
+            self._free += self._limbo
+            self._limbo.clear()
+
+    def restore(self, other: WorldState) -> None:
+        """Makes this world equal to `other`, a world of the same scene. Cheap if few segments differ.
+
+        Raises:
+            SceneError: `other` is not a world of the same scene.
+        """
+        if self.observer is not None:
+            self.observer.restoring()
+        source: object = other
+        if not isinstance(source, WorldState):
+            raise SceneError(f"other = {shown(source)}: must be a `World`")
+        theirs, mine = other.scene, self.scene
+        if theirs is not mine and theirs.fingerprint != mine.fingerprint:
+            differ = sorted(name for name, digest in mine.digests.items() if theirs.digests[name] != digest)
+            raise SceneError(f"other = a world of {theirs.name!r}: its scene differs in {', '.join(differ)}")
+        cells = self._entities[: self._rows, layout.CELL]
+        self.blocks.heads[cells[cells >= 0]] = -1
+        moved = len(self._entities) != len(other._entities)
+        if moved:
+            self._allocate(len(other._entities))
+        self.editing, self.edited = dict(other.editing), dict(other.edited)
+        self.placing, self.placed = set(other.placing), set(other.placed)
+        self.tick, self._next_id, self._rows = other.tick, other._next_id, other._rows
+        self._row_of, self._free, self._limbo = dict(other._row_of), list(other._free), list(other._limbo)
+        n = self._rows
+        self._entities[:n] = other._entities[:n]
+        self._entities[n:, ID] = 0
+        self._lengths[:] = other._lengths
+        for name, length in LISTS:
+            count = int(self._lengths[length])
+            getattr(self, name)[:count] = getattr(other, name)[:count]
+        moved |= self.blocks.restore(other.blocks)
+        rows = self._entities[:n]
+        first = np.flatnonzero((rows[:, layout.CELL] >= 0) & (rows[:, PREV] < 0) & (rows[:, ID] != 0))
+        self.blocks.heads[rows[first, layout.CELL]] = first
+        if moved:
+            self._bind()
+
+
+def _matrix(states: Iterable[tuple[int, ...]] | Int64s) -> Int64s:
+    """Returns states as a matrix [n, 12]."""
+    return np.asarray(states if isinstance(states, np.ndarray) else list(states), np.int64).reshape(-1, STATES)
