@@ -23,7 +23,7 @@ from server.game import Game
 from server.journal.recorded_world import RecordedWorld
 from server.net.addresses import bracketed, reachable
 from server.net.admission import Door
-from server.net.websocket import Gateway
+from server.net.gateway import Gateway
 from server.observability.histogram import Histogram
 from server.observability.live import Live
 from server.observability.metrics import metrics_page

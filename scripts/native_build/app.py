@@ -29,11 +29,11 @@ MODULES = (
     "client_sdk/timing/server_clock.py", "client_sdk/timing/timeline.py", "client_sdk/view.py", "client_sdk/worlds.py",
     "server/game/clocks.py", "server/game/commands.py", "server/game/connections.py", "server/game/game.py",
     "server/game/joining.py", "server/game/roster.py", "server/game/session.py", "server/net/admission.py",
-    "server/net/websocket.py", "server/observability/counters.py", "server/players/input_queue.py",
-    "server/players/player.py", "server/replication/change_log.py", "server/replication/client_stream.py",
-    "server/replication/client_view.py", "server/replication/flow_control.py", "server/replication/interest.py",
-    "server/replication/sender.py", "shared/inputs.py", "shared/messages.py", "shared/ring.py", "shared/snapshot.py",
-    "sovereign_netcode/playtest/match.py",
+    "server/net/gateway.py", "server/net/websocket.py", "server/observability/counters.py",
+    "server/players/input_queue.py", "server/players/player.py", "server/replication/change_log.py",
+    "server/replication/client_stream.py", "server/replication/client_view.py", "server/replication/flow_control.py",
+    "server/replication/interest.py", "server/replication/sender.py", "shared/inputs.py", "shared/messages.py",
+    "shared/ring.py", "shared/snapshot.py", "sovereign_netcode/playtest/match.py",
 )  # fmt: skip
 """Modules that a tick of a server and of a client runs. Other programs cannot derive from the classes of a compiled
 module, so rules, policies and transports are not among them."""

@@ -1,4 +1,4 @@
-"""The gateway between WebSockets and the game; the only file of the server that uses the library websockets.
+"""The WebSocket of one client, which passes its messages to the game, and the game's messages to the client.
 
 Theory of operation. websockets parses the protocol (with its Sans-I/O `ServerProtocol`); only plain messages are parsed
 here. asyncio moves the bytes. Except for the TLS handshake there is no task and no await per connection: a message is
@@ -15,25 +15,16 @@ for the peer has a time limit.
 import asyncio
 import logging
 import socket
-import ssl
 import sys
 import time
-from http import HTTPStatus
-from typing import Any, Protocol, cast
+from typing import TYPE_CHECKING, Any, cast
 
-from websockets.datastructures import Headers
-from websockets.exceptions import InvalidMessage
 from websockets.frames import CloseCode, Frame, Opcode
-from websockets.http11 import Request as HttpRequest
-from websockets.http11 import Response
 from websockets.protocol import CONNECTING, OPEN
 from websockets.server import ServerProtocol
 
-from server.net.addresses import listeners
-from server.net.admission import Door, Request
-from server.net.tls_accept import Guest, Handshakes
-from server.observability.errors import Faults
-from server.observability.pages import Page
+from server.net.http import answer_request
+from server.net.tls_accept import Guest
 from shared.messages import CLIENT_MESSAGE_MAX
 
 try:
@@ -43,6 +34,8 @@ except ImportError:  # the same function in Python
 if sys.platform == "linux":
     import fcntl
     from termios import TIOCOUTQ as SIOCOUTQ
+if TYPE_CHECKING:
+    from server.net.gateway import Gateway
 
 CLOSE_S = 2.0
 """Seconds in which a peer must finish closing before it is aborted."""
@@ -58,10 +51,6 @@ MASKED = 0x80
 """Bit of the second byte of a frame that every client must set."""
 REASON_BYTES_MAX = 123
 """Maximum bytes of the reason in a close frame."""
-ACCEPT_BACKLOG = 1024
-"""Connections that may wait to be accepted."""
-
-logger = logging.getLogger(__name__)
 _quiet = logging.getLogger(f"{__name__}.websockets")
 _quiet.setLevel(logging.WARNING)  # otherwise websockets logs two lines per connection
 
@@ -75,99 +64,10 @@ def _frame_head(size: int) -> bytes:
     return b"\x82\x7f" + size.to_bytes(8, "big")
 
 
-def _response(page: Page) -> Response:
-    status = HTTPStatus(page.status)
-    fixed = (("Connection", "close"), ("Content-Length", str(len(page.body))), ("Content-Type", page.content_type))
-    return Response(status.value, status.phrase, Headers(fixed + page.headers), page.body)
-
-
-class Events(Protocol):
-    """The functions of a game that the gateway calls. `now` is the current time in seconds."""
-
-    def open(self, link: "Connection", now: float) -> Any:
-        """Handles an open WebSocket. Returns an object (not None) that identifies it in later calls."""
-
-    def receive(self, session: Any, data: bytes, now: float) -> None:
-        """Handles one binary message."""
-
-    def lost(self, session: Any, now: float) -> None:
-        """Handles the end of a WebSocket. Called once per session."""
-
-
-class Gateway:
-    """The listener and the set of its connections.
-
-    Args:
-        game: gets every event.
-        door: decides which connections are accepted, and answers requests for pages.
-        faults: where exceptions of the game are reported.
-    """
-
-    def __init__(self, game: Events, door: Door | None = None, faults: Faults | None = None) -> None:
-        self.game = game
-        self.door = door or Door()
-        self.faults = faults or Faults()
-        self.connections: set[Connection] = set()
-        self._servers: list[asyncio.Server | Handshakes] = []
-        self._fewer: asyncio.Event = asyncio.Event()
-        self._closing = False
-
-    async def listen(self, host: str, port: int, tls: ssl.SSLContext | None = None) -> tuple[str, int]:
-        """Starts to accept connections on every address of a host.
-
-        Args:
-            host: a host name or an address; empty: every interface.
-            port: the port; 0: the system picks one.
-            tls: the TLS context; None: no TLS.
-
-        Returns:
-            The first of the host's addresses, and the port.
-
-        Raises:
-            OSError: no address can be used, or one of them is in use.
-        """
-        loop = asyncio.get_running_loop()
-        sockets = await listeners(host, port, ACCEPT_BACKLOG)
-        address: tuple[str, int] = sockets[0].getsockname()[:2]
-        if tls is not None:
-            handshakes = Handshakes(lambda: Connection(self, loop), tls, self.door.limits.handshake_s)
-            handshakes.listen(sockets)
-            self._servers = [handshakes]
-            return address
-        for listener in sockets:
-            server = await loop.create_server(lambda: Connection(self, loop), sock=listener, backlog=ACCEPT_BACKLOG)
-            self._servers.append(server)
-        return address
-
-    def stop_listening(self) -> None:
-        """Stops accepting, and aborts the connections that have not become WebSockets."""
-        self._closing = True
-        for server in self._servers:
-            server.close()
-        for connection in list(self.connections):
-            if not connection.opened:
-                connection.abort()
-
-    async def drained(self) -> None:
-        """Waits until no WebSocket is left."""
-        while any(connection.opened for connection in self.connections):
-            self._fewer.clear()
-            await self._fewer.wait()
-
-    def made(self, connection: "Connection") -> None:
-        self.connections.add(connection)
-        if self._closing:
-            connection.abort()
-
-    def gone(self, connection: "Connection") -> None:
-        self.connections.discard(connection)
-        self._fewer.set()
-
-
 class Connection(Guest):
     """One accepted socket, which the game uses as a `server.replication.client_stream.Link`."""
 
-    def __init__(self, gateway: Gateway, loop: asyncio.AbstractEventLoop) -> None:
+    def __init__(self, gateway: "Gateway", loop: asyncio.AbstractEventLoop) -> None:
         self.opened = False
         self._gateway = gateway
         self._loop = loop
@@ -282,37 +182,13 @@ class Connection(Guest):
             self._transport.abort()
 
     def _shake_hands(self, data: bytes) -> bytes:
-        """Handles the HTTP request. Returns the bytes after it, from clients that do not wait for the answer.
-
-        The request is passed on line by line, because websockets would parse the bytes after it before it is answered.
-        """
-        protocol, start = self._protocol, 0
-        while start < len(data):
-            end = data.find(b"\n", start) + 1 or len(data)
-            protocol.receive_data(data[start:end])
-            start = end
-            events = protocol.events_received()
-            if events:
-                self._answer(cast("HttpRequest", events[0]))
-                break
-            if isinstance(protocol.handshake_exc, InvalidMessage):  # websockets itself closes without an answer
-                response = protocol.reject(HTTPStatus.BAD_REQUEST, "this is not an HTTP request\n")
-                protocol.writes.insert(0, response.serialize())
-            if protocol.eof_sent:
-                break
+        """Handles the HTTP request. Returns the bytes after it, from clients that do not wait for the answer."""
+        rest = answer_request(self._protocol, data, self._gateway.door, self._address or "")
         self._flush()
         if not self._live:
             return b""
         self._open()
-        return data[start:]
-
-    def _answer(self, request: HttpRequest) -> None:
-        protocol, headers = self._protocol, request.headers
-        upgrade = any("websocket" in value.lower() for value in headers.get_all("Upgrade"))
-        origins, hosts = headers.get_all("Origin"), headers.get_all("Host")
-        asked = Request(request.method, request.path, " ".join(hosts), " ".join(origins) if origins else None, upgrade)
-        page = self._gateway.door.answer(asked, self._address or "", time.monotonic())
-        protocol.send_response(protocol.accept(request) if page is None else _response(page))
+        return rest
 
     def _open(self) -> None:
         if self._timer is not None:

@@ -20,7 +20,8 @@ from websockets.utils import apply_mask
 from server.config.limits import Limits
 from server.net import websocket as module
 from server.net.admission import SPARE_PER_ADDRESS, Door
-from server.net.websocket import Connection, Gateway
+from server.net.gateway import Gateway
+from server.net.websocket import Connection
 from server.observability.pages import Pages, json_page
 from shared.messages import CLIENT_MESSAGE_MAX
 from tests.lengths import examples

@@ -12,7 +12,7 @@ import trustme
 from server.config.limits import Limits
 from server.net import tls_accept
 from server.net.admission import SPARE_PER_ADDRESS, Door
-from server.net.websocket import Gateway
+from server.net.gateway import Gateway
 
 TIME_OUT_S = 30.0
 ALLOWED = 3

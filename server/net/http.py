@@ -1,0 +1,60 @@
+"""The HTTP request that a connection begins with: it opens a WebSocket or asks for a page, as admission decides."""
+
+import time
+from http import HTTPStatus
+from typing import cast
+
+from websockets.datastructures import Headers
+from websockets.exceptions import InvalidMessage
+from websockets.http11 import Request as HttpRequest
+from websockets.http11 import Response
+from websockets.server import ServerProtocol
+
+from server.net.admission import Door, Request
+from server.observability.pages import Page
+
+
+def answer_request(protocol: ServerProtocol, data: bytes, door: Door, address: str) -> bytes:
+    """Passes data to websockets until the request is complete, and answers it.
+
+    The request is passed on line by line, because websockets would parse the bytes after it before it is answered.
+
+    Args:
+        protocol: the protocol of the connection. The answer waits in its `data_to_send`.
+        data: bytes of the peer.
+        door: decides about the request.
+        address: the peer's address; empty if it is unknown.
+
+    Returns:
+        The bytes after the request.
+    """
+    start = 0
+    while start < len(data):
+        end = data.find(b"\n", start) + 1 or len(data)
+        protocol.receive_data(data[start:end])
+        start = end
+        events = protocol.events_received()
+        if events:
+            _answer(protocol, cast("HttpRequest", events[0]), door, address)
+            break
+        if isinstance(protocol.handshake_exc, InvalidMessage):  # websockets itself closes without an answer
+            response = protocol.reject(HTTPStatus.BAD_REQUEST, "this is not an HTTP request\n")
+            protocol.writes.insert(0, response.serialize())
+        if protocol.eof_sent:
+            break
+    return data[start:]
+
+
+def _answer(protocol: ServerProtocol, request: HttpRequest, door: Door, address: str) -> None:
+    headers = request.headers
+    upgrade = any("websocket" in value.lower() for value in headers.get_all("Upgrade"))
+    origins, hosts = headers.get_all("Origin"), headers.get_all("Host")
+    asked = Request(request.method, request.path, " ".join(hosts), " ".join(origins) if origins else None, upgrade)
+    page = door.answer(asked, address, time.monotonic())
+    protocol.send_response(protocol.accept(request) if page is None else _response(page))
+
+
+def _response(page: Page) -> Response:
+    status = HTTPStatus(page.status)
+    fixed = (("Connection", "close"), ("Content-Length", str(len(page.body))), ("Content-Type", page.content_type))
+    return Response(status.value, status.phrase, Headers(fixed + page.headers), page.body)
