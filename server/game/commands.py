@@ -102,7 +102,4 @@ class Orders:
         player.edits_left -= 1
         if not self._stage.may_edit(player, edit):
             return messages.FORBIDDEN
-        verdict = edits.apply(self._world, player.entity, edit)
-        if verdict == messages.DONE:
-            self._stage.log.note_edit(*edit[:3])
-        return verdict
+        return edits.apply(self._world, player.entity, edit)

@@ -109,7 +109,14 @@ class Game:
         self.connections = Connections(self.roster, self.counters, self.faults)
         self.clocks = Clocks(scene.tick_rate, self.limits, self.connections, self.roster)
         self.joining = Joining(
-            self.world, self.limits, self.counters, self.faults, self.connections, self.roster, self.orders, authenticate
+            self.world,
+            self.limits,
+            self.counters,
+            self.faults,
+            self.connections,
+            self.roster,
+            self.orders,
+            authenticate,
         )
 
     @property

@@ -250,8 +250,7 @@ class Stage:
             SceneError: the place is not loaded, or there is no such kind.
         """
         self.turn.check("set_block")
-        if self._world.set_block(x, y, z, kind):
-            self.log.note_edit(int(x), int(y), int(z))
+        self._world.set_block(x, y, z, kind)
 
     def rewound(self, player: Player, seen: float | None = None) -> Past:
         """Returns the world as a player saw it, for queries of rays and boxes (lag compensation).

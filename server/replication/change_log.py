@@ -135,12 +135,8 @@ class ChangeLog:
         """Returns the segment of an entity at the end of the latest recorded tick."""
         return self._home[entity]
 
-    def note_edit(self, x: int, y: int, z: int) -> None:
-        """Notes that a block was changed before the coming step."""
-        self._now.edited[segment_of(x, y, z)].add(offset_of(x, y, z))
-
     def note_act(self, entity: int) -> None:
-        """Notes that the rules changed an entity before the coming step. The world itself notes placed entities."""
+        """Notes that the rules changed an entity before the coming step. The world notes placed entities and edits."""
         self._now.acted.add(entity)
 
     def note_attributes(self, entity: int) -> None:
@@ -164,6 +160,8 @@ class ChangeLog:
         now.placed = self._world.placed
         if now.placed:
             self._placed_at = self._world.tick
+        for x, y, z in self._world.edited:
+            now.edited[segment_of(x, y, z)].add(offset_of(x, y, z))
         shares, self._due = self._news.pack(now.acted, now.placed)
         self._latest = {}
         for segment, ids, whole, packed in shares:

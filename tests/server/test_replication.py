@@ -55,8 +55,7 @@ class Recorded:
         self.log.note_removal(entity)
 
     def edit(self, x: int, y: int, z: int, kind: int) -> None:
-        if self.world.set_block(x, y, z, kind):
-            self.log.note_edit(x, y, z)
+        self.world.set_block(x, y, z, kind)
 
     def changed(self, since: int) -> set[Cell]:
         """The segments of which there is something to tell."""
@@ -154,6 +153,23 @@ def test_an_edit_back_is_told_too(told: Recorded) -> None:
     told.tick()
     assert told.part(WEST, 1)[2] == [(31 << 10 | 31 << 5 | 31, 0)]
     assert told.changed(1) == {WEST}
+
+
+def test_every_change_of_a_block_in_the_world_is_told(told: Recorded) -> None:
+    told.world.fill((1, 2, 3), (3, 3, 4), 7)
+    told.world.write_blocks(WEST, [5], [9])
+    told.tick()
+    at = 3 << 10 | 2 << 5 | 1
+    assert told.part(HOME, 0)[2] == [(at, 7), (at + 1, 7)]
+    assert told.part(WEST, 0)[2] == [(5, 9)]
+
+
+def test_an_edit_that_changes_nothing_is_not_told(told: Recorded) -> None:
+    told.edit(1, 2, 3, 7)
+    told.tick()
+    told.edit(1, 2, 3, 7)
+    told.tick()
+    assert told.changed(1) == set()
 
 
 def test_who_was_acted_upon_is_flagged_in_every_part_that_tells_of_it(told: Recorded) -> None:
@@ -418,8 +434,7 @@ class Told:
                     world.place(self.session.entity, self.place())
                 case 5 | 6 | 7:
                     at = (rng.choice([-33, -32, -1, 0, 31, 32, 64]), rng.choice([3, 4]), rng.choice([2, 3]))
-                    if world.set_block(*at, rng.choice([0, 0, 1, 200])):
-                        log.note_edit(*at)
+                    world.set_block(*at, rng.choice([0, 0, 1, 200]))
                 case 8 if rng.random() < 0.3:
                     self.game.receive(self.session, encode(Resync()), self.now)
         except OverlapError:
