@@ -93,13 +93,13 @@ class Orders:
 
     def _verdict(self, player: Player, command: Command) -> int:
         if command.name != edits.NAME:
-            return self._stage.command(player, command)
+            return self._stage.hooks.command(player, command)
         edit = edits.unpack(command.payload)
         if edit is None:
             return messages.INVALID
         if player.edits_left < 1:
             return messages.TOO_MANY
         player.edits_left -= 1
-        if not self._stage.may_edit(player, edit):
+        if not self._stage.hooks.may_edit(player, edit):
             return messages.FORBIDDEN
         return edits.apply(self._world, player.entity, edit)

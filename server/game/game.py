@@ -212,20 +212,20 @@ class Game:
         """
         self.clocks.begin(deadline, now)
         with self.stage.turn:
-            self.stage.start()
+            self.stage.hooks.start()
             self.roster.leave(now)
             self.joining.join()
             self.roster.revive()
             self.orders.carry_out()
-            self.stage.act()
+            self.stage.hooks.act()
         inputs = self._take_inputs()
         self.world.step(inputs)
-        self.stage.stepped()
+        self.stage.hooks.stepped()
         self.log.record()
         self.rewind.record()
         self.roster.fell_out()
         self.orders.answer()
-        self.stage.tell(self.limits.outbox_max)
+        self.stage.outgoing.deliver(self.players, self.world.tick, self.limits.outbox_max)
         self.clocks.refill()
         self._send(now)
         self.clocks.check(now)
@@ -242,7 +242,7 @@ class Game:
         for session in tuple(self.sessions):
             if session.entity and not session.closed:
                 try:
-                    self.stage.show(session.stream)
+                    self.stage.shared_values.show(session.stream)
                     if session.greeting is None or self.joining.greet(session, *session.greeting):
                         assert session.player is not None
                         self.delivery.serve(session.stream, session.player, now)

@@ -68,7 +68,7 @@ class Roster:
         self._counters.joined += 1
         try:
             session.seat(player)
-            self._stage.joined(player)
+            self._stage.hooks.joined(player)
         except Exception:
             self.expel(player)
             raise
@@ -144,7 +144,7 @@ class Roster:
     def revive(self) -> None:
         """Puts the entities that fell out in the last tick at spawn points, unless the rules deal with them."""
         for entity in self._fallen:
-            if entity in self._world and not self._stage.fell_out(entity):
+            if entity in self._world and not self._stage.hooks.fell_out(entity):
                 self._spawns.put_back(entity)
         self._fallen.clear()
 
@@ -160,7 +160,7 @@ class Roster:
             del self._stage.players[player.entity]
             self._counters.left += 1
             self._counters.add(player.inputs)
-            self._stage.left(player)
+            self._stage.hooks.left(player)
 
 
 def _digest(token: bytes) -> bytes:

@@ -4,43 +4,29 @@ A change takes effect in the world at once, before the step of the coming tick. 
 every other change of the world, so it is sent to clients, recorded and replayed like them.
 """
 
-from collections import deque
 from collections.abc import Callable, Iterable, Mapping
 from random import Random
-from types import MappingProxyType
 from typing import Any
 
-import numpy as np
-
-from server.game_api import values
-from server.game_api.contacts import Contacts
-from server.game_api.turn import OutOfTurnError, Turn
-from server.game_api.values import ATTRIBUTES_MAX as ATTRIBUTES_MAX
+from server.game_api import attributes as attribute_tables
+from server.game_api.attributes import Attributes
+from server.game_api.hooks import Hooks
+from server.game_api.outgoing import Outgoing
+from server.game_api.shared_values import SharedValues
+from server.game_api.turn import Turn
 from server.journal.recorded_world import RecordedWorld
 from server.observability.counters import Counters
-from server.observability.errors import Faults
-from server.players.persisted_state import LEFT, SAID, SHARED, Kept
+from server.players.persisted_state import LEFT, Kept
 from server.players.player import Player
 from server.replication.change_log import ChangeLog
-from server.replication.client_stream import ClientStream
 from server.rewind import Rewind
 from server.rewind.history import Past
-from server.rules import Rules, RulesError, check_rules, checked_function, checked_result
-from shared import messages
-from shared.checks import SceneError, Vec, finite, shown, text, whole
-from shared.edits import Edit
+from server.rules import Rules, check_rules
+from shared.checks import SceneError, Vec, finite, shown, whole
 from shared.inputs import Input, make_input
 from shared.layout import TEMPLATE
-from shared.messages import ENTITY_MAX, Command, Happened, ProtocolError, Shared, encode, pack_value, unpack_value
+from shared.messages import ENTITY_MAX
 from shared.scene import Scene
-
-SOON_MAX = 10_000
-"""Maximum number of functions that wait for the next tick."""
-
-TRUTH = (bool, np.bool_)
-"""Types of the results of hooks that count as a truth value."""
-_FAILED = object()
-"""Result of `Stage._call` for a command whose hook raised."""
 
 
 class Stage:
@@ -73,22 +59,15 @@ class Stage:
     ) -> None:
         check_rules(rules)
         self.turn = Turn()
-        self._soon: deque[tuple[Callable[..., object], tuple[Any, ...]]] = deque()
         self.kept = kept or Kept({}, {}, {})
         self.steered: dict[int, Input] = {}
-        self._attributes = self.kept.attributes
-        self.log = ChangeLog(world, self._attributes)
-        self._world, self._rewind, self._counters, self._rules, self._seed = world, rewind, counters, rules, seed
-        self._shared = self.kept.shared
-        self._version = int(bool(self._shared))
-        self._shared_message = encode(Shared(self._shared))
+        self.log = ChangeLog(world, self.kept.attributes)
+        self.shared_values = SharedValues(world, self.kept.shared)
+        self.outgoing = Outgoing(counters)
+        self.hooks = Hooks(self, world, rules, counters, goes_on=kept is not None)
+        self._attributes = Attributes(world, self.log, self.kept.attributes)
+        self._world, self._rewind, self._seed = world, rewind, seed
         self._random = (-1, Random())
-        self._seen = 0.0
-        self._outgoing: list[tuple[frozenset[int] | None, bytes]] = []
-        self._contacts = Contacts(world, goes_on=kept is not None)
-        self._told_contacts = _overrides(rules, "on_contact")
-        self._started = kept is not None
-        self._faults = Faults("the rules have failed")
         rules.game = self
 
     @property
@@ -150,7 +129,7 @@ class Stage:
 
         Unlike the hook `on_contact`, this includes contacts that began earlier.
         """
-        return self._contacts.of(self._known(entity))
+        return self.hooks.touching(self._known(entity))
 
     def template(self, entity: int) -> str:
         """Returns the name of an entity's template."""
@@ -170,12 +149,10 @@ class Stage:
             SceneError: there is no such template, or a value is out of range.
         """
         self.turn.check("spawn")
-        said: Mapping[str, Any] = {}
-        for name, value in attributes.items():
-            said = values.with_value(said, name, values.checked(name, value), f"template {template!r}")
+        checked = attribute_tables.checked(attributes, f"template {template!r}")
         entity = self._world.spawn(template, position, velocity, push=True)
-        if said:
-            self._say(entity, said)
+        if checked:
+            self._attributes.put(entity, checked)
         return entity
 
     def remove(self, entity: int) -> None:
@@ -188,7 +165,7 @@ class Stage:
         entity = self._known(entity)
         if entity in self.players:
             raise SceneError(f"entity = {entity}: is a player's and cannot be removed before the player leaves")
-        self._remove(entity)
+        self.discard(entity)
 
     def place(self, entity: int, position: Vec) -> None:
         """Moves an entity to a position in blocks, or to the nearest free place within a block. Keeps its velocity.
@@ -266,7 +243,7 @@ class Stage:
             raise SceneError(f"player = {shown(player)}: must be a `Player`, as hooks get it")
         seen = None if seen is None else finite(seen, "seen")
         gaps = player.session.stream.gaps if player.session is not None else ()
-        return self._rewind.at(self._seen if seen is None else seen, player.entity, gaps)
+        return self._rewind.at(self.hooks.seen if seen is None else seen, player.entity, gaps)
 
     # -- what clients receive --------------------------------------------------------------------------------
 
@@ -284,20 +261,16 @@ class Stage:
             SceneError: the entity would have more than 32 attributes, or the value has more than 256 bytes.
         """
         self.turn.check("set")
-        entity = self._known(entity)
-        before, payload = self._attributes.get(entity, {}), values.checked(name, value)
-        if payload != values.packed(before.get(name)):
-            self._say(entity, values.with_value(before, name, payload, f"entity {entity}"))
+        self._attributes.set(self._known(entity), name, value)
 
     def get(self, entity: int, name: str, default: Any = None) -> Any:
         """Returns an attribute of an entity, or `default` if it is not set. A list or a table is a copy."""
-        said = self._attributes.get(self._number(entity), {})
-        return values.copied(said.get(text(name, "name", messages.NAME_MAX), default))
+        return self._attributes.get(self._number(entity), name, default)
 
     @property
     def shared(self) -> Mapping[str, Any]:
         """The shared values of the game by name, as a copy."""
-        return MappingProxyType({name: values.copied(value) for name, value in self._shared.items()})
+        return self.shared_values.copy()
 
     def share(self, name: str, value: Any) -> None:
         """Sets a shared value of the game, such as the time left. It is sent to all clients, also to later ones.
@@ -312,15 +285,7 @@ class Stage:
             SceneError: the game would have more than 32 shared values, or the value has more than 256 bytes.
         """
         self.turn.check("share")
-        payload = values.checked(name, value)
-        if payload == values.packed(self._shared.get(name)):
-            return
-        after = values.with_value(self._shared, name, payload, "the game")
-        self._shared.clear()
-        self._shared.update(after)
-        self._world.note([SHARED, after])
-        self._version += 1
-        self._shared_message = encode(Shared(self._shared))
+        self.shared_values.set(name, value)
 
     def send(self, name: str, data: Any = None, to: Player | Iterable[Player] | None = None) -> None:
         """Sends a game event; the client gets it as `Happened`.
@@ -334,13 +299,7 @@ class Stage:
             SceneError: the name or the data are too long, the data are no MessagePack value, or `to` is wrong.
         """
         self.turn.check("send")
-        text(name, "name", messages.NAME_MAX)
-        try:
-            payload = pack_value(data)
-        except ValueError as error:
-            raise SceneError(f"send {name!r}: data = {error}") from error
-        entities = None if to is None else _entities_of(to)
-        self._outgoing.append((entities, encode(Happened(self.tick, name, payload))))
+        self.outgoing.send(self.tick, name, data, to)
 
     def soon(self, act: Callable[..., object], *arguments: Any) -> None:
         """Calls a function within the next tick, before the other hooks.
@@ -357,107 +316,19 @@ class Stage:
             OutOfTurnError: 10,000 functions wait already; the game probably does not tick.
             RulesError: `act` is not a function, or is async.
         """
-        checked_function(act, "soon: act")
-        if len(self._soon) >= SOON_MAX:
-            raise OutOfTurnError(f"soon: {SOON_MAX} functions wait already; does the game tick?")
-        self._soon.append((act, arguments))
+        self.hooks.soon(act, arguments)
 
     # -- called by the game ------------------------------------------------------------------------------------
 
-    def joined(self, player: Player) -> None:
-        """Sets the name of a new player as an attribute, and calls `on_join`."""
-        if player.name:
-            self.set(player.entity, "name", player.name)
-        player.announced = True
-        self._call(self._rules.on_join, player)
-
-    def left(self, player: Player) -> None:
-        """Calls `on_leave`, and removes the player's entity if the rules have not removed it."""
-        if player.announced:
-            self._call(self._rules.on_leave, player)
-        if player.entity in self._world:
-            self._remove(player.entity)
-
-    def fell_out(self, entity: int) -> bool:
-        """Calls `on_fell_out` for an entity below the floor. Returns whether the rules dealt with it or removed it."""
-        seen_to = self._call(self._rules.on_fell_out, entity)
-        return (isinstance(seen_to, TRUTH) and bool(seen_to)) or entity not in self._world
-
-    def command(self, player: Player, command: Command) -> int:
-        """Carries out a command of a client by `on_command`. Returns the verdict."""
-        try:
-            payload = unpack_value(command.payload)
-        except ProtocolError:
-            return messages.INVALID
-        self._seen = command.seen
-        if not _overrides(self._rules, "on_command"):
-            return messages.INVALID
-        done = self._call(self._rules.on_command, player, command.name, payload, failed=_FAILED)
-        if done is _FAILED:
-            return messages.FAILED
-        return messages.FORBIDDEN if isinstance(done, TRUTH) and not done else messages.DONE
-
-    def may_edit(self, player: Player, edit: Edit) -> bool:
-        """Returns whether the rules allow an edit. A `can_edit` that raises does not allow it."""
-        return bool(self._call(self._can_edit, player, edit, failed=False))
-
-    def _can_edit(self, player: Player, edit: Edit) -> object:
-        allowed: object = self._rules.can_edit(player, *edit)
-        if allowed is None:
-            raise RulesError("can_edit returned None: it must return True or False")
-        return checked_result(allowed, "can_edit")
-
-    def start(self) -> None:
-        """Calls `on_start` in the first tick of a new game, then the functions that were passed to `soon`."""
-        if not self._started:
-            self._started = True
-            self._call(self._rules.on_start)
-        for _ in range(len(self._soon)):  # functions that these pass to `soon` wait for the next tick
-            act, arguments = self._soon.popleft()
-            self._call(act, *arguments)
-
-    def act(self) -> None:
-        """Calls `on_contact` for new contacts, then `on_tick`."""
-        for a, b in self._contacts.begun() if self._told_contacts else ():
-            if a in self._world and b in self._world:
-                self._call(self._rules.on_contact, a, b)
-        self._call(self._rules.on_tick)
-
-    def stepped(self) -> None:
-        """Takes note of what the step has changed, for `on_contact`. Call it after the step."""
-        if self._told_contacts:
-            self._contacts.stepped()
-
-    def tell(self, most: int) -> None:
-        """Puts the game events of this tick into the players' outboxes, also of players without a connection.
-
-        Args:
-            most: maximum number of events in one outbox.
-        """
-        for entities, message in self._outgoing:
-            for entity in self.players if entities is None else entities & self.players.keys():
-                player = self.players[entity]
-                if player.inputs.wheel is None:  # an in-process player has no client to send to
-                    self._counters.events_dropped += player.outbox.add(self._world.tick, message, most)
-        self._outgoing.clear()
-
-    def show(self, stream: ClientStream) -> None:
-        """Queues the shared values for a client if they have changed since it got them."""
-        if stream.shared != self._version:
-            stream.shared = self._version
-            stream.shared_due = self._shared_message
-
-    def _say(self, entity: int, attributes: Mapping[str, Any]) -> None:
-        self._attributes[entity] = dict(attributes)
-        self.log.note_attributes(entity)
-        self._world.note([SAID, entity, attributes])
-
-    def _remove(self, entity: int) -> None:
+    def discard(self, entity: int) -> None:
+        """Removes an existing entity, which may be a player's."""
         self._world.remove(entity)
         self._world.note([LEFT, entity])
-        self._attributes.pop(entity, None)
+        self._attributes.forget(entity)
         self.steered.pop(entity, None)
         self.log.note_removal(entity)
+
+    # -- inside ------------------------------------------------------------------------------------------------
 
     def _number(self, entity: object) -> int:
         """Checks the number of an entity, which need not exist, and returns it as an int of Python.
@@ -479,28 +350,3 @@ class Stage:
         number = self._number(entity)
         self._world.awake(number)  # raises MissingError if there is no such entity
         return number
-
-    def _call(self, hook: Any, *arguments: Any, failed: Any = None) -> Any:
-        """Calls a hook and returns its result. If it raises, counts and logs that, and returns `failed`."""
-        try:
-            return checked_result(hook(*arguments), getattr(hook, "__name__", "a function"))
-        except Exception:
-            self._counters.rules_failed += 1
-            self._faults.report(getattr(hook, "__qualname__", repr(hook)))
-            return failed
-
-
-def _overrides(rules: Rules, name: str) -> bool:
-    return getattr(type(rules), name) is not getattr(Rules, name)
-
-
-def _entities_of(to: object) -> frozenset[int]:
-    """Returns the entities of a player or of several players.
-
-    Raises:
-        SceneError: `to` is neither.
-    """
-    players = [to] if isinstance(to, Player) else list(to) if isinstance(to, Iterable) else [None]
-    if not all(isinstance(player, Player) for player in players):
-        raise SceneError(f"to = {shown(to)}: must be a `Player`, several of them, or None for all")
-    return frozenset(player.entity for player in players if isinstance(player, Player))

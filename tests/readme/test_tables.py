@@ -14,7 +14,7 @@ from tests.readme.pages import ROOT, section
 
 README = ROOT / "README.md"
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
-CALLED_BY_THE_GAME = {"joined", "left", "fell_out", "command", "may_edit", "start", "act", "stepped", "tell", "show"}
+CALLED_BY_THE_GAME = {"discard"}
 """Methods of the game API's class that hooks do not call."""
 
 

@@ -6,7 +6,7 @@ import msgpack
 import pytest
 
 from server.config.limits import Limits
-from server.game_api.api import ATTRIBUTES_MAX
+from server.game_api.values import ATTRIBUTES_MAX
 from server.players.player import Player
 from server.replication.flow_control import Pacing
 from server.rules import Rules, RulesError, load_rules

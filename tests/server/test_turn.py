@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from server.game import Game
-from server.game_api.api import SOON_MAX
+from server.game_api.hooks import SOON_MAX
 from server.game_api.turn import OutOfTurnError
 from server.players.player import Player
 from server.rules import HOOKS, Rules, RulesError, check_rules, load_rules, prepared

@@ -46,7 +46,7 @@ def marks(table: Played) -> tuple[Any, ...]:
     stage, kept = table.stage, table.stage.kept
     return (
         table.game.world.state_hash(), len(table.game.world), table.game.world.next_id, dict(stage.steered),
-        repr(kept.attributes), repr(kept.shared), len(stage._outgoing), len(stage._soon), list(table.game.players),
+        repr(kept.attributes), repr(kept.shared), len(stage.outgoing), stage.hooks.waiting, list(table.game.players),
     )  # fmt: skip
 
 

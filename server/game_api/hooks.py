@@ -1,0 +1,159 @@
+"""The calls of the rules' hooks by the game, and of the functions that wait for the next tick.
+
+If a hook raises, the exception is logged and counted, and the game goes on.
+"""
+
+from collections import deque
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from server.game_api.contacts import Contacts
+from server.game_api.turn import OutOfTurnError
+from server.journal.recorded_world import RecordedWorld
+from server.observability.counters import Counters
+from server.observability.errors import Faults
+from server.players.player import Player
+from server.rules import Rules, RulesError, checked_function, checked_result
+from shared import messages
+from shared.edits import Edit
+from shared.messages import Command, ProtocolError, unpack_value
+
+if TYPE_CHECKING:
+    from server.game_api.api import Stage
+
+SOON_MAX = 10_000
+"""Maximum number of functions that wait for the next tick."""
+TRUTH = (bool, np.bool_)
+"""Types of the results of hooks that count as a truth value."""
+_FAILED = object()
+"""Result of `Hooks._call` for a command whose hook raised."""
+
+
+class Hooks:
+    """The hooks of one game.
+
+    Args:
+        stage: the game API.
+        world: the world of the game.
+        rules: the rules of the game.
+        counters: where failed hooks are counted.
+        goes_on: whether the game is restored, so that it has started and the present contacts were reported.
+    """
+
+    def __init__(
+        self, stage: "Stage", world: RecordedWorld, rules: Rules, counters: Counters, *, goes_on: bool
+    ) -> None:
+        self.seen = 0.0
+        """View tick of the latest command: server time in ticks at which its sender drew the other entities."""
+        self._stage, self._world, self._rules, self._counters = stage, world, rules, counters
+        self._soon: deque[tuple[Callable[..., object], tuple[Any, ...]]] = deque()
+        self._contacts = Contacts(world, goes_on=goes_on)
+        self._reports_contacts = _overrides(rules, "on_contact")
+        self._started = goes_on
+        self._faults = Faults("the rules have failed")
+
+    # -- in the order of a tick ------------------------------------------------------------------------------
+
+    def start(self) -> None:
+        """Calls `on_start` in the first tick of a new game, then the functions that were passed to `soon`."""
+        if not self._started:
+            self._started = True
+            self._call(self._rules.on_start)
+        for _ in range(len(self._soon)):  # functions that these pass to `soon` wait for the next tick
+            act, arguments = self._soon.popleft()
+            self._call(act, *arguments)
+
+    def left(self, player: Player) -> None:
+        """Calls `on_leave`, and removes the player's entity if the rules have not removed it."""
+        if player.announced:
+            self._call(self._rules.on_leave, player)
+        if player.entity in self._world:
+            self._stage.discard(player.entity)
+
+    def joined(self, player: Player) -> None:
+        """Sets the name of a new player as an attribute, and calls `on_join`."""
+        if player.name:
+            self._stage.set(player.entity, "name", player.name)
+        player.announced = True
+        self._call(self._rules.on_join, player)
+
+    def fell_out(self, entity: int) -> bool:
+        """Calls `on_fell_out` for an entity below the floor. Returns whether the rules dealt with it or removed it."""
+        seen_to = self._call(self._rules.on_fell_out, entity)
+        return (isinstance(seen_to, TRUTH) and bool(seen_to)) or entity not in self._world
+
+    def command(self, player: Player, command: Command) -> int:
+        """Carries out a command of a client by `on_command`. Returns the verdict."""
+        try:
+            payload = unpack_value(command.payload)
+        except ProtocolError:
+            return messages.INVALID
+        self.seen = command.seen
+        if not _overrides(self._rules, "on_command"):
+            return messages.INVALID
+        done = self._call(self._rules.on_command, player, command.name, payload, failed=_FAILED)
+        if done is _FAILED:
+            return messages.FAILED
+        return messages.FORBIDDEN if isinstance(done, TRUTH) and not done else messages.DONE
+
+    def may_edit(self, player: Player, edit: Edit) -> bool:
+        """Returns whether the rules allow an edit. A `can_edit` that raises does not allow it."""
+        return bool(self._call(self._can_edit, player, edit, failed=False))
+
+    def act(self) -> None:
+        """Calls `on_contact` for new contacts, then `on_tick`."""
+        for a, b in self._contacts.begun() if self._reports_contacts else ():
+            if a in self._world and b in self._world:
+                self._call(self._rules.on_contact, a, b)
+        self._call(self._rules.on_tick)
+
+    def stepped(self) -> None:
+        """Takes note of what the step has changed, for `on_contact`. Call it after the step."""
+        if self._reports_contacts:
+            self._contacts.stepped()
+
+    # -- called by the game API ------------------------------------------------------------------------------
+
+    @property
+    def waiting(self) -> int:
+        """The number of functions that wait for the next tick."""
+        return len(self._soon)
+
+    def soon(self, act: Callable[..., object], arguments: tuple[Any, ...]) -> None:
+        """Adds a function to those that the next tick calls.
+
+        Raises:
+            OutOfTurnError: too many functions wait already.
+            RulesError: `act` is not a function, or is async.
+        """
+        checked_function(act, "soon: act")
+        if len(self._soon) >= SOON_MAX:
+            raise OutOfTurnError(f"soon: {SOON_MAX} functions wait already; does the game tick?")
+        self._soon.append((act, arguments))
+
+    def touching(self, entity: int) -> list[int]:
+        """Returns the entities that touch an entity now, in ascending order."""
+        return self._contacts.of(entity)
+
+    # -- inside ----------------------------------------------------------------------------------------------
+
+    def _can_edit(self, player: Player, edit: Edit) -> object:
+        allowed: object = self._rules.can_edit(player, *edit)
+        if allowed is None:
+            raise RulesError("can_edit returned None: it must return True or False")
+        return checked_result(allowed, "can_edit")
+
+    def _call(self, hook: Any, *arguments: Any, failed: Any = None) -> Any:
+        """Calls a hook and returns its result. If it raises, counts and logs that, and returns `failed`."""
+        try:
+            return checked_result(hook(*arguments), getattr(hook, "__name__", "a function"))
+        except Exception:
+            self._counters.rules_failed += 1
+            self._faults.report(getattr(hook, "__qualname__", repr(hook)))
+            return failed
+
+
+def _overrides(rules: Rules, name: str) -> bool:
+    return getattr(type(rules), name) is not getattr(Rules, name)
