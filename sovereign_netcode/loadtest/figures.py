@@ -50,22 +50,13 @@ def figures(
         rss_mb: samples of the server's memory in the window.
     """
     clients = [client for result in results for client in result["clients"]]
-    bots_cpu_s = sum(result["cpu_s"] for result in results)
     n = len(clients)
     ticks = after["ticks"] - before["ticks"] if before and after else None
-    expected = max((client["ticks"] for client in clients), default=0)
-    shares = sorted(min(1.0, client["snapshots"] / expected) if expected else 0.0 for client in clients)
-    causes: Counter[str] = Counter()
-    for client in clients:
-        causes.update(client["causes"])
+    server_cpu_s = after["cpu_s"] - before["cpu_s"] if ticks else 0.0
     gone = [client["left"] for client in clients if client["left"]]
-
     lag_counts: Counter[int] = Counter()
     for result in results:
         lag_counts.update(dict(result["lag_counts"]))
-
-    def total(name: str) -> int:
-        return int(sum(client[name] for client in clients))
 
     def per_client_tick_us(cpu_s: float) -> float | None:
         return round(cpu_s * 1e6 / (n * ticks), 2) if ticks and n else None
@@ -76,6 +67,39 @@ def figures(
         "tick_rate": after.get("tick_rate"),
         "server_ticks": ticks,
         "tick_lateness_ms": between(before[LATENESS], after[LATENESS]) if LATENESS in before and after else None,
+        **_of_clients(clients, seconds),
+        "server_cpu_us_per_client_tick": per_client_tick_us(server_cpu_s) if ticks else None,
+        "server_cpu_share": round(server_cpu_s / seconds, 4) if ticks else None,
+        "bots_cpu_us_per_client_tick": per_client_tick_us(sum(result["cpu_s"] for result in results)),
+        "bots_lag_ms": between([], sorted(lag_counts.items())),
+        "bots": [
+            {
+                "clients": len(result["clients"]),
+                "cpu_share": round(result["cpu_s"] / seconds, 4),
+                "lag_ms": between([], result["lag_counts"]),
+            }
+            for result in results
+        ],
+        "server_rss_mb": rss_mb,
+        "disconnects": len(gone),
+        "malformed": sum(left["code"] == MALFORMED for left in gone),
+        "reasons": dict(Counter(left["reason"] for left in gone)),
+    }
+
+
+def _of_clients(clients: Sequence[Figures], seconds: float) -> Figures:
+    """Returns the figures of all clients together: snapshots, inputs, corrections, and the connection."""
+    n = len(clients)
+    expected = max((client["ticks"] for client in clients), default=0)
+    shares = sorted(min(1.0, client["snapshots"] / expected) if expected else 0.0 for client in clients)
+    causes: Counter[str] = Counter()
+    for client in clients:
+        causes.update(client["causes"])
+
+    def total(name: str) -> int:
+        return int(sum(client[name] for client in clients))
+
+    return {
         "snapshots_per_client_per_s": round(total("snapshots") / n / seconds, 3),
         "snapshots_share": {"worst": round(shares[0], 4), "p50": round(shares[n // 2], 4)},
         "clients_with_95_percent": sum(share >= SNAPSHOTS_SHARE_MIN for share in shares),
@@ -94,22 +118,6 @@ def figures(
             "up": round(total("bytes_up") / n / seconds, 1),
             "down": round(total("bytes_down") / n / seconds, 1),
         },
-        "server_cpu_us_per_client_tick": per_client_tick_us(after["cpu_s"] - before["cpu_s"]) if ticks else None,
-        "server_cpu_share": round((after["cpu_s"] - before["cpu_s"]) / seconds, 4) if ticks else None,
-        "bots_cpu_us_per_client_tick": per_client_tick_us(bots_cpu_s),
-        "bots_lag_ms": between([], sorted(lag_counts.items())),
-        "bots": [
-            {
-                "clients": len(result["clients"]),
-                "cpu_share": round(result["cpu_s"] / seconds, 4),
-                "lag_ms": between([], result["lag_counts"]),
-            }
-            for result in results
-        ],
-        "server_rss_mb": rss_mb,
-        "disconnects": len(gone),
-        "malformed": sum(left["code"] == MALFORMED for left in gone),
-        "reasons": dict(Counter(left["reason"] for left in gone)),
     }
 
 
