@@ -21,6 +21,7 @@ from client_sdk.timing.lead import (
 )
 from client_sdk.timing.server_clock import PING_FIRST_S, PING_LATER_S, PINGS, ServerClock
 from client_sdk.timing.timeline import Timeline
+from tests.lengths import long
 
 RATE = 32.0
 FIRST_INPUTS, JUMP, PRICE, SHIFT = int(FIRST_INPUTS_S * RATE), JUMP_S * RATE, PRICE_S * RATE, SHIFT_S * RATE
@@ -279,13 +280,13 @@ def test_bounded_jitter_never_makes_an_input_late() -> None:
     assert sum(loop.phases[1000:]) / 19_000 < max(needs) + SAFETY + 0.05
 
 
-def test_the_cover_is_where_one_tick_more_is_worth_one_tick() -> None:
+@pytest.mark.parametrize("price", [10.0, *long(50.0, 2.5)])
+def test_the_cover_is_where_one_tick_more_is_worth_one_tick(price: float) -> None:
     """Needs fall off as exp(-2 x), so one tick more is worth 2 exp(-2 x) prices: 1 in 2 prices is late."""
     rng = random.Random(4)
     needs = [100.0 + rng.expovariate(2.0) for _ in range(40_000)]
-    for price in (50.0, 10.0, 2.5):
-        loop = Loop(needs.__getitem__, PricedLead(price / RATE, safety_s=0.0)).run(40_000)
-        assert len([i for i in loop.late if i > 4000]) / 36_000 == pytest.approx(1 / (2 * price), rel=0.2)
+    loop = Loop(needs.__getitem__, PricedLead(price / RATE, safety_s=0.0)).run(40_000)
+    assert len([i for i in loop.late if i > 4000]) / 36_000 == pytest.approx(1 / (2 * price), rel=0.2)
 
 
 def test_a_change_of_the_path_for_good_is_the_path_after_a_while() -> None:

@@ -75,7 +75,7 @@ def test_one_seed_is_one_story() -> None:
         ann, bob = program.join("Ann"), program.join("Bob", link="wifi")
         ann.set_input(1, 0)
         bob.set_input(0, 1)
-        program.run(20)
+        program.run(12)
         names = [event.name for event in program.events[ann] if isinstance(event, Happened)]
         return str(program.game.world.state_hash()), names
 

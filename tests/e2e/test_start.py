@@ -187,14 +187,19 @@ def start(*arguments: str, **variables: str) -> Start:
     return arguments, variables
 
 
-def fail(*cases: tuple[Start, str]) -> None:
-    """Checks that each start ends with exit code 2 and prints one line, which has this text."""
+def ended(*starts: Start) -> list[tuple[int, str, str]]:
+    """Returns the exit code, the output and the errors of each start."""
     clean = {name: value for name, value in os.environ.items() if not name.startswith("SOVEREIGN_")}
     done = subprocess.run(
-        (sys.executable, "-c", STARTS), cwd=ROOT, env=clean, input=json.dumps([case for case, _ in cases]),
-        capture_output=True, text=True, check=True,
+        (sys.executable, "-c", STARTS), cwd=ROOT, env=clean, input=json.dumps(starts), capture_output=True, text=True,
+        check=True,
     )  # fmt: skip
-    for (code, out, err), (case, text) in zip(json.loads(done.stdout), cases, strict=True):
+    return [(code, out, err) for code, out, err in json.loads(done.stdout)]
+
+
+def fail(*cases: tuple[Start, str]) -> None:
+    """Checks that each start ends with exit code 2 and prints one line, which has this text."""
+    for (code, out, err), (case, text) in zip(ended(*(case for case, _ in cases)), cases, strict=True):
         assert (code, out) == (2, ""), case
         assert text in err, case
         assert err.startswith("error: "), case
@@ -269,9 +274,11 @@ def test_check_says_whether_a_server_is_ready() -> None:
         port = server.address()[1]
         url = f"ws://127.0.0.1:{port}"
         until(lambda: stats(("127.0.0.1", port))["ready"])
-        assert other("check", "--url", url) == (0, ["ready\n"])
-        assert other("check", SOVEREIGN_PORT=str(port)) == (0, ["ready\n"])
-        assert other("check", "--url", f"http://127.0.0.1:{port}/x") == (1, ["/x: no such page\n"])
+        assert ended(
+            start("check", "--url", url),
+            start("check", SOVEREIGN_PORT=str(port)),
+            start("check", "--url", f"http://127.0.0.1:{port}/x"),
+        ) == [(0, "ready\n", ""), (0, "ready\n", ""), (1, "/x: no such page\n", "")]
         assert server.end(signal.SIGTERM) == 0
     code, lines = other("check", "--url", url)
     assert (code, len(lines)) == (1, 1)

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 import hatch_build
+from tests.lengths import long
 
 ROOT = Path(__file__).resolve().parents[2]
 MODULES = sorted(name for name in hatch_build.module_names(ROOT) if not name.endswith(".__main__"))
@@ -49,7 +50,7 @@ def test_a_package_runs_under_the_long_name(tmp_path: Path) -> None:
     assert "hills" in done.stdout
 
 
-@pytest.mark.parametrize("theirs", ["server.py", "shared/__init__.py", "client_sdk.py"])
+@pytest.mark.parametrize("theirs", ["shared/__init__.py", *long("server.py", "client_sdk.py")])
 def test_a_module_of_the_program_with_the_same_name_is_told(tmp_path: Path, theirs: str) -> None:
     (tmp_path / theirs).parent.mkdir(exist_ok=True)
     (tmp_path / theirs).write_text("", "utf-8")

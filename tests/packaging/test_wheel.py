@@ -176,6 +176,7 @@ def test_a_command_runs_as_a_module_too(installed: Installed, name: str) -> None
     assert installed.run("-m", f"sovereign_netcode.{name.replace('-', '_')}", "--help") == said
 
 
+@pytest.mark.slow
 def test_a_command_says_what_it_lacks(wheel: Path, tmp_path: Path) -> None:
     alone = Installed(environment(tmp_path / "venv", wheel, "numpy", "websockets", "msgpack"), tmp_path)
     for name, module, extra in (

@@ -17,10 +17,11 @@ def test_a_hundred_that_move_are_few_bytes_and_every_tick_of_them_is_exact(motio
     assert 0 < found["bytes_per_s"] < most
 
 
-def test_nothing_stays_of_clients_entities_and_segments_that_are_gone() -> None:
+@pytest.mark.parametrize("rounds", [3, *long(5)])
+def test_nothing_stays_of_clients_entities_and_segments_that_are_gone(rounds: int) -> None:
     tracemalloc.start()
     try:
-        after = memory.churn(5)
+        after = memory.churn(rounds)
     finally:
         tracemalloc.stop()
     # 20 clients, 100 entities and a segment take 300,000 bytes; what still grows at first are tables.

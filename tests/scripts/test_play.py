@@ -222,7 +222,7 @@ def test_the_latency_of_the_keys_is_as_much_as_they_say() -> None:
     assert core.stats.corrections == 0
 
 
-SHORT = [(Freeze, "meadow"), (Rules, "topdown")]
+SHORT = [(Freeze, "topdown")]
 EVERY = itertools.product([Rules, Tag, Freeze], sorted(path.stem for path in SCENES.glob("*.toml")))
 
 

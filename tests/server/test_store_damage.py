@@ -118,13 +118,14 @@ def test_a_flipped_bit_in_the_file_is_named_or_makes_no_difference(torn: Torn, t
     assert named > len(pages) / 2
 
 
-def test_a_mark_that_is_damaged_costs_no_world(torn: Torn, tmp_path: Path) -> None:
+@pytest.mark.parametrize("every", [9, *long(3)])
+def test_a_mark_that_is_damaged_costs_no_world(torn: Torn, tmp_path: Path, every: int) -> None:
     whole = (torn.last, torn.hashes[torn.last])
     good = (torn.good / "world.mark").read_bytes()
     rng = random.Random(9)
     size = mark.SLOT.size + mark.CHECK.size
     for slot in (0, mark.APART):
-        for at in (*range(slot, slot + size, 3), slot + size + 1):
+        for at in (*range(slot, slot + size, every), slot + size + 1):
             assert outcome(damaged_copy(torn, tmp_path, "world.mark", flipped(good, at, rng))) == whole
     for data in (b"", good[:40], bytes(len(good)), rng.randbytes(len(good))):
         assert "world.mark: damaged (it holds no mark)" in refused(damaged_copy(torn, tmp_path, "world.mark", data))
