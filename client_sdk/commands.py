@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 
 from client_sdk.events import Answered
-from shared import edits, messages
+from shared import edits, fields, messages, payloads
 from shared.checks import text
 from shared.messages import Command, encode
 from shared.snapshot import VERDICT
@@ -35,10 +35,10 @@ class Orders:
         Raises:
             ValueError: the name or the data are too long, or MessagePack cannot hold the data.
         """
-        if text(name, "name", messages.NAME_MAX) == edits.NAME:
+        if text(name, "name", fields.NAME_MAX) == edits.NAME:
             raise ValueError(f"name = {name!r}: must be another name, because the client uses this one for edits")
         try:
-            payload = messages.pack_value(data)
+            payload = payloads.pack_value(data)
         except ValueError as error:
             raise ValueError(f"{name}: data = {error}") from error
         return Command(self.number(), tick, seen, name, payload)

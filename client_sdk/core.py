@@ -29,7 +29,7 @@ from client_sdk.timing.server_clock import ServerClock
 from client_sdk.timing.timeline import Timeline
 from client_sdk.view import NOTHING, View
 from client_sdk.worlds import Worlds
-from shared import edits, messages
+from shared import edits, fields, messages
 from shared.checks import SceneError, duration, shown, text, whole
 from shared.inputs import Input, checked_input, clamp
 from shared.messages import ProtocolError, decode_from_server, encode
@@ -40,7 +40,7 @@ INPUT_DELAY_MAX = 3
 COME_AGAIN = (messages.TOO_SLOW, messages.GOING_AWAY, messages.NO_HELLO)
 """Close codes after which a client reconnects although the server did not ask for it: the connection was at fault."""
 NAME_MAX = 1 << 16
-"""Longest name that a program may pass, in characters; only the first `messages.NAME_MAX` characters are sent."""
+"""Longest name that a program may pass, in characters; only the first `fields.NAME_MAX` characters are sent."""
 READ_BYTES = 64 * 1024
 """Number of bytes that a transport reads at once from a connection without a simulated link."""
 
@@ -85,7 +85,7 @@ class Core:
         self.controls = Controls()
         self.shared: dict[str, Any] = {}
         """The values that the rules of the game share with all clients, by name."""
-        self._token = text(token, "token", messages.TOKEN_MAX, shortest=0)
+        self._token = text(token, "token", fields.TOKEN_MAX, shortest=0)
         self._resume = b""
         self._open = False
         self._orders = Orders()
@@ -140,7 +140,7 @@ class Core:
         self._open = True
         self._out.clear()
         digests = self.scene.digests if self.scene else {}
-        self._send(messages.Hello(messages.VERSION, digests, self.name[: messages.NAME_MAX], self._token, self._resume))
+        self._send(messages.Hello(messages.VERSION, digests, self.name[: fields.NAME_MAX], self._token, self._resume))
 
     def receive(self, data: bytes, now: float) -> None:
         """Takes one message of the server. A malformed message closes the connection."""

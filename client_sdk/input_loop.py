@@ -21,10 +21,10 @@ from client_sdk.timing.lead import PricedLead, jump_ticks
 from client_sdk.timing.timeline import Timeline
 from client_sdk.view import View
 from shared.bounds import AHEAD_S, bounds
+from shared.fields import INPUT_ROW_BYTES
 from shared.inputs import row
 from shared.messages import (
     IDLE,
-    INPUT_ROW_BYTES,
     MARGIN_REFUSED,
     NEUTRALISED,
     REPEATED,

@@ -1,7 +1,7 @@
 """The events that wait until the program takes them: in order and bounded; dropped ones are counted."""
 
 from client_sdk.events import Disconnected, Event, EventsDropped, Happened, Joined, Left, Resumed
-from shared import messages
+from shared import messages, payloads
 
 EVENTS_MAX = 10_000
 """Limit of the waiting game events, and separately of the waiting other events that may be dropped."""
@@ -90,7 +90,7 @@ class GameEvents:
             ProtocolError: its payload is malformed.
         """
         self._count += 1
-        self._file(Happened(message.tick, message.name, messages.unpack_value(message.payload)), hold=hold)
+        self._file(Happened(message.tick, message.name, payloads.unpack_value(message.payload)), hold=hold)
 
     def next(self, number: int, *, hold: bool) -> None:
         """Takes the number of the server's next event. If events before it are missing, files an `EventsDropped`."""

@@ -26,9 +26,11 @@ from server.journal.recorded_world import RecordedWorld
 from server.players.input_queue import InputQueue
 from server.rules import Rules, prepared
 from shared.checks import finite, text, whole
+from shared.fields import NAME_MAX
 from shared.inputs import MOVE_MAX, NEUTRAL, Input, clamp
 from shared.layout import FALLING, FLAGS, ID, TEMPLATE, VX, Int64s, X
-from shared.messages import NAME_MAX, Command, pack_value
+from shared.messages import Command
+from shared.payloads import pack_value
 from shared.scene import Scene, load_scene
 from shared.units import BLOCK, BLOCK_SHIFT, RANGE_BLOCKS, SEGMENT, SEGMENT_SHIFT, SPEED, SPEED_MAX
 from shared.world import World

@@ -34,65 +34,32 @@ packed little-endian records in a MessagePack `bin`. docs/protocol.md explains e
     Ping           `corrections`: number of corrections of the client's prediction so far, for the operator.
     Pong.tick      the server time in ticks when it answered: 17.25 is a quarter of a tick after tick 17.
 
-`decode(any bytes)` returns a message whose fields have all been checked, or raises `ProtocolError`.
+`decode(any bytes)` returns a message whose fields have all been checked (`shared.fields`), or raises `ProtocolError`.
 """
 
-import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import msgpack
 
-from shared import checks
-from shared.blocks import PACKED_MAX
-from shared.bounds import FATES_S, TICK_RATE_MAX, in_ticks
+from shared import fields
+from shared.fields import (
+    CLIENT_LIST_MAX,
+    CLIENT_MESSAGE_MAX,
+    FATES_MAX,
+    FIRST_MAX,
+    INPUT_ROW_BYTES,
+    INPUT_ROWS_MAX,
+    LIST_MAX,
+    MESSAGE_MAX,
+    SEGMENTS_MAX,
+    TABLE_MAX,
+    TICK_MAX,
+    shown,
+)
 
 VERSION = 3
 """Version of the protocol; both sides must have the same one."""
-
-MESSAGE_MAX = 256 * 1024
-"""Longest message of a server, in bytes."""
-CLIENT_MESSAGE_MAX = 8 * 1024
-"""Longest message of a client, in bytes."""
-INPUT_ROWS_MAX = 64
-"""Limit of the inputs in one message."""
-INPUT_ROW_BYTES = 3
-"""Length of one input in `Inputs.rows`, in bytes."""
-NAME_MAX = 32
-"""Longest name of a player, a command or a game event, in characters."""
-SCENE_FIELDS_MAX = 32
-"""Limit of the scene's fields in `Hello.scene`."""
-REASON_MAX = 500
-"""Longest reason in a `Bye`, in characters."""
-FATES_MAX = in_ticks(FATES_S, TICK_RATE_MAX, 1)
-"""Limit of the margins, and of the input statuses, in one snapshot."""
-DROPS_MAX = 4096
-"""Limit of the dropped segments in one snapshot."""
-VERDICTS_MAX = 128
-"""Limit of the verdicts in one snapshot."""
-COMMAND_MAX = (1 << 32) - 1
-"""Greatest number of a command."""
-PAYLOAD_MAX = 1024
-"""Longest payload of a command or a game event, in bytes."""
-SEGMENTS_MAX = 1024
-"""Limit of the segments in one snapshot."""
-TOKEN_MAX = 2048
-"""Longest token, in characters."""
-RESUME_BYTES = 16
-"""Length of a resume token, in bytes."""
-LIST_MAX = 8 * 1024
-"""Limit of the items of a list in a message of the server. A MessagePack decoder reserves memory for the length that a
-list claims, so the length of the message alone is no bound."""
-CLIENT_LIST_MAX = 8
-"""Limit of the items of a list in a message of a client."""
-TABLE_MAX = 64
-"""Limit of the items of a table in any message."""
-TICK_MAX = (1 << 53) - 1
-"""Greatest tick in a message."""
-FIRST_MAX = TICK_MAX - INPUT_ROWS_MAX
-"""Greatest first tick of an `Inputs` message."""
-ENTITY_MAX = (1 << 31) - 1
-"""Greatest number of an entity."""
 
 # Input statuses: the server reports one for each tick.
 USED, REPEATED, NEUTRALISED, IDLE = range(4)
@@ -270,78 +237,24 @@ Message = (
     | Shared
     | NextHappened
 )
-Check = Callable[[Any], bool]
-
-
-def _whole(low: int, high: int) -> Check:
-    return lambda value: type(value) is int and low <= value <= high
-
-
-def _bytes(longest: int, of: int = 1) -> Check:
-    return lambda value: type(value) is bytes and len(value) <= longest and len(value) % of == 0
-
-
-def _text(longest: int) -> Check:
-    return lambda value: type(value) is str and len(value) <= longest
-
-
-def _finite(value: Any) -> bool:
-    return type(value) in (int, float) and math.isfinite(value)
-
-
-def _named(value: Any) -> bool:
-    return type(value) is dict and all(type(name) is str for name in value)
-
-
-def _resume(value: Any) -> bool:
-    return type(value) is bytes and len(value) in (0, RESUME_BYTES)
-
-
-def _digests(value: Any) -> bool:
-    return (
-        type(value) is dict
-        and len(value) <= SCENE_FIELDS_MAX
-        and all(type(name) is str and type(digest) is bytes and len(digest) <= 8 for name, digest in value.items())
-    )
-
-
-_tick = _whole(-1, TICK_MAX)
-_first = _whole(0, FIRST_MAX)
-_rows = _bytes(INPUT_ROWS_MAX * INPUT_ROW_BYTES, INPUT_ROW_BYTES)
-_segment = _whole(-(1 << 23), (1 << 23) - 1)
-
-KINDS: dict[int, tuple[type[Any], tuple[Check, ...]]] = {
-    1: (Hello, (_whole(0, 1 << 31), _digests, _text(NAME_MAX), _text(TOKEN_MAX), _resume)),
-    2: (
-        Inputs,
-        (_first, _tick, _rows),
-    ),
-    3: (Ping, (_finite, _whole(0, COMMAND_MAX))),
-    4: (Bye, (_whole(0, 4999), _text(REASON_MAX), _finite)),
-    5: (Command, (_whole(0, COMMAND_MAX), _tick, _finite, _text(NAME_MAX), _bytes(PAYLOAD_MAX))),
+KINDS: dict[int, tuple[type[Any], tuple[fields.Check, ...]]] = {
+    1: (Hello, (fields.version, fields.digests, fields.name, fields.token, fields.resume)),
+    2: (Inputs, (fields.first, fields.tick, fields.rows)),
+    3: (Ping, (fields.number, fields.count)),
+    4: (Bye, (fields.code, fields.reason, fields.number)),
+    5: (Command, (fields.count, fields.tick, fields.number, fields.name, fields.payload)),
     6: (Resync, ()),
-    7: (Restart, (_first,)),
-    17: (
-        Welcome,
-        (_whole(0, 1 << 31), _tick, _whole(1, ENTITY_MAX), lambda value: type(value) is dict, _resume),
-    ),
+    7: (Restart, (fields.first,)),
+    17: (Welcome, (fields.version, fields.tick, fields.entity, fields.table, fields.resume)),
     18: (
         Snapshot,
-        (
-            _tick,
-            _tick,
-            _bytes(FATES_MAX * 2, 2),
-            _tick,
-            _bytes(FATES_MAX),
-            _bytes(VERDICTS_MAX * 5, 5),
-            _bytes(DROPS_MAX * 12, 12),
-        ),
+        (fields.tick, fields.tick, fields.margins, fields.tick, fields.fates, fields.verdicts, fields.drops),
     ),
-    19: (Terrain, (_segment, _segment, _segment, _whole(0, PACKED_MAX), _whole(1, PACKED_MAX), _bytes(PACKED_MAX))),
-    20: (Pong, (_finite, _finite)),
-    21: (Happened, (_tick, _text(NAME_MAX), _bytes(PAYLOAD_MAX))),
-    22: (Shared, (_named,)),
-    23: (NextHappened, (_whole(0, TICK_MAX),)),
+    19: (Terrain, (fields.segment, fields.segment, fields.segment, fields.offset, fields.total, fields.chunk)),
+    20: (Pong, (fields.number, fields.number)),
+    21: (Happened, (fields.tick, fields.name, fields.payload)),
+    22: (Shared, (fields.names,)),
+    23: (NextHappened, (fields.index,)),
 }
 """Message class and checks of the fields, by the number of the kind. A snapshot's last field has no check here:
 `shared.snapshot` checks the segments."""
@@ -350,6 +263,7 @@ CLIENT_KINDS = frozenset({1, 2, 3, 4, 5, 6, 7})
 SERVER_KINDS = frozenset({4, 17, 18, 19, 20, 21, 22, 23})
 """Kinds of messages that a server may send."""
 _KIND_OF = {kind: number for number, (kind, _) in KINDS.items()}
+_is_rows = fields.rows
 _INPUTS_HEAD = bytes((0x94, _KIND_OF[Inputs]))
 _SNAPSHOT_HEAD, _SNAPSHOT_KIND = b"\xdc", bytes((_KIND_OF[Snapshot],))
 pack: Callable[[Any], bytes] = msgpack.Packer().pack
@@ -360,8 +274,8 @@ message."""
 def encode(message: Message) -> bytes:
     """Returns a message as bytes."""
     kind = _KIND_OF[type(message)]
-    fields = (*message[:-1], *message.segments) if isinstance(message, Snapshot) else message
-    return pack((kind, *fields))
+    values = (*message[:-1], *message.segments) if isinstance(message, Snapshot) else message
+    return pack((kind, *values))
 
 
 def join_snapshot(header: tuple[int, int, bytes, int, bytes, bytes, bytes], segments: int, parts: bytes) -> bytes:
@@ -373,51 +287,8 @@ def join_snapshot(header: tuple[int, int, bytes, int, bytes, bytes, bytes], segm
         parts: the segments' fields, encoded already.
     """
     n = 1 + len(header) + segments
-    fields = pack(header)[1:]  # without the array's head, which is one byte
-    return b"".join((_SNAPSHOT_HEAD, n.to_bytes(2, "big"), _SNAPSHOT_KIND, fields, parts))
-
-
-def shown(value: Any) -> str:
-    """Returns a peer's value for the text of an error: short, and only the type of a list or table.
-
-    A list may be nested a thousand levels deep, so `repr` is not safe.
-    """
-    return type(value).__name__ if isinstance(value, list | dict) else str(value)[:40]
-
-
-def pack_value(value: Any) -> bytes:
-    """Returns a value packed as the payload of a command or of `Happened`.
-
-    Raises:
-        ValueError: MessagePack cannot hold the value, or it is longer than `PAYLOAD_MAX` bytes.
-    """
-    try:
-        payload: bytes = msgpack.packb(value)
-        unpack_value(payload)
-    except (TypeError, ValueError, OverflowError, RecursionError) as error:
-        raise ValueError(f"{checks.shown(value)}: {_unpackable(error)}") from error
-    if len(payload) > PAYLOAD_MAX:
-        raise ValueError(f"a value of {len(payload)} bytes: longer than {PAYLOAD_MAX}")
-    return payload
-
-
-def _unpackable(error: Exception) -> str:
-    """Returns the reason why a value cannot be packed."""
-    if isinstance(error, UnicodeEncodeError):
-        return f"it has a text that UTF-8 cannot hold: {checks.shown(error.object)}"
-    return f"not a MessagePack value ({' '.join(str(error).split())[:80]})"
-
-
-def unpack_value(payload: bytes) -> Any:
-    """Returns the value in a payload that `pack_value` made.
-
-    Raises:
-        ProtocolError: the bytes are not MessagePack.
-    """
-    try:
-        return msgpack.unpackb(payload, max_array_len=PAYLOAD_MAX, max_map_len=TABLE_MAX)
-    except Exception as error:  # msgpack raises about ten types of exceptions for such bytes
-        raise ProtocolError(f"payload: not MessagePack ({type(error).__name__})") from error
+    head = pack(header)[1:]  # without the array's head, which is one byte
+    return b"".join((_SNAPSHOT_HEAD, n.to_bytes(2, "big"), _SNAPSHOT_KIND, head, parts))
 
 
 def decode(data: bytes, kinds: frozenset[int], longest: int, lists: int = LIST_MAX) -> Message:
@@ -466,7 +337,7 @@ def decode_from_client(data: bytes) -> Message:
             _, first, acked, rows = msgpack.unpackb(data)
         except Exception:
             return decode(data, CLIENT_KINDS, CLIENT_MESSAGE_MAX, CLIENT_LIST_MAX)
-        if type(first) is type(acked) is int and 0 <= first <= FIRST_MAX and -1 <= acked <= TICK_MAX and _rows(rows):
+        if type(first) is type(acked) is int and 0 <= first <= FIRST_MAX and -1 <= acked <= TICK_MAX and _is_rows(rows):
             return Inputs(first, acked, rows)
     return decode(data, CLIENT_KINDS, CLIENT_MESSAGE_MAX, CLIENT_LIST_MAX)
 

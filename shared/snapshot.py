@@ -34,6 +34,7 @@ import numpy as np
 
 from shared import bulk, kernels
 from shared.checks import Cell
+from shared.fields import ENTITY_MAX, shown
 from shared.kernels import Kernel
 from shared.layout import (
     BUTTONS,
@@ -46,7 +47,7 @@ from shared.layout import (
     Int64s,
     X,
 )
-from shared.messages import ENTITY_MAX, ProtocolError, pack, shown
+from shared.messages import ProtocolError, pack
 from shared.units import BLOCK, SEGMENT
 from shared.world import World
 

@@ -10,17 +10,9 @@ from server.game import Game
 from server.game.session import Session
 from server.journal.recorded_world import Saves
 from server.rules import Rules
-from shared import edits, messages
+from shared import edits, fields, messages
 from shared.edits import Edit
-from shared.messages import (
-    Bye,
-    Command,
-    Hello,
-    Message,
-    Snapshot,
-    decode_from_server,
-    encode,
-)
+from shared.messages import Bye, Command, Hello, Message, Snapshot, decode_from_server, encode
 from shared.snapshot import HEAD, NO_FIELDS, ROW
 from tests.worlds import scene
 
@@ -40,7 +32,7 @@ class FakeLink:
         self.session: Session
 
     def send(self, message: bytes) -> None:
-        assert len(message) <= messages.MESSAGE_MAX
+        assert len(message) <= fields.MESSAGE_MAX
         self.sent.append(decode_from_server(message))
 
     @property

@@ -23,7 +23,8 @@ from websockets.uri import WebSocketURI, parse_uri
 from client_sdk.advice import TLS_ALERT, untrusted
 from client_sdk.core import Core
 from shared.checks import shown
-from shared.messages import MESSAGE_MAX, REASON_MAX, TEXT, TOO_SLOW
+from shared.fields import MESSAGE_MAX, REASON_MAX
+from shared.messages import TEXT, TOO_SLOW
 
 UNSENT_MAX = 64 * 1024
 """Limit of the bytes that wait for a server that does not read: about 90 s of 32 inputs per second. Beyond it, the

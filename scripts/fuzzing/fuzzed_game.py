@@ -8,10 +8,10 @@ from server.game import Game
 from server.game.session import Session
 from server.players.player import Player
 from server.rules import Rules
-from shared import edits, messages
+from shared import edits, fields, messages
 from shared.bounds import bounds
+from shared.fields import COMMAND_MAX
 from shared.messages import (
-    COMMAND_MAX,
     Command,
     Hello,
     Inputs,
@@ -46,7 +46,7 @@ class _Deaf:
         self.game, self.number, self.waiting = game, number, 0
 
     def send(self, message: bytes) -> None:
-        assert len(message) <= messages.MESSAGE_MAX
+        assert len(message) <= fields.MESSAGE_MAX
         if message[1] == WELCOME:
             welcome = decode_from_server(message)
             assert isinstance(welcome, Welcome)

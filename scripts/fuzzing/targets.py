@@ -16,13 +16,10 @@ from scripts.fuzzing.fuzzed_game import FuzzedGame
 from server.config.options import SettingsError
 from server.config.settings import KINDS, Settings, parse
 from shared import edits
+from shared.fields import CLIENT_LIST_MAX, CLIENT_MESSAGE_MAX, COMMAND_MAX, TICK_MAX
 from shared.layout import STOP_X, TOLD, WHOLE
 from shared.messages import (
     CLIENT_KINDS,
-    CLIENT_LIST_MAX,
-    CLIENT_MESSAGE_MAX,
-    COMMAND_MAX,
-    TICK_MAX,
     VERSION,
     Bye,
     Command,
@@ -42,8 +39,8 @@ from shared.messages import (
     decode_from_client,
     decode_from_server,
     encode,
-    unpack_value,
 )
+from shared.payloads import unpack_value
 from shared.snapshot import STATE_HIGH, STATE_LOW, decode_parts
 
 Target = Callable[[bytes], str]

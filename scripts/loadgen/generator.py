@@ -26,7 +26,7 @@ from typing import Any
 
 from scripts.loadgen.player import Player, frame
 from server.observability.histogram import between
-from shared import messages
+from shared import fields, messages
 from shared.messages import Bye, Hello, Inputs, Ping, decode_from_server, encode
 
 LEAD_TICKS = 2
@@ -146,7 +146,7 @@ class Swarm:
         if player.acked < 0 or self.server_tick_0 == -math.inf:
             return
         due = int(now * self.rate + self.server_tick_0 + LEAD_TICKS)
-        n = min(due - player.sent, messages.INPUT_ROWS_MAX) if player.sent >= 0 else 1
+        n = min(due - player.sent, fields.INPUT_ROWS_MAX) if player.sent >= 0 else 1
         if n <= 0:
             return
         rng = player.rng

@@ -21,7 +21,8 @@ from collections.abc import Awaitable, Callable
 
 from scripts.loadgen.player import REQUEST, frame
 from shared import messages
-from shared.messages import CLIENT_MESSAGE_MAX, Command, Hello, Inputs, Ping, encode
+from shared.fields import CLIENT_MESSAGE_MAX
+from shared.messages import Command, Hello, Inputs, Ping, encode
 
 PATIENCE_S = 8.0
 """Seconds after which a peer disconnects if the server has not ended its connection."""

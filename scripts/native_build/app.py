@@ -32,8 +32,8 @@ MODULES = (
     "server/net/gateway.py", "server/net/websocket.py", "server/observability/counters.py",
     "server/players/input_queue.py", "server/players/player.py", "server/replication/change_log.py",
     "server/replication/client_stream.py", "server/replication/client_view.py", "server/replication/flow_control.py",
-    "server/replication/interest.py", "server/replication/sender.py", "shared/inputs.py", "shared/messages.py",
-    "shared/ring.py", "shared/snapshot.py", "sovereign_netcode/playtest/match.py",
+    "server/replication/interest.py", "server/replication/sender.py", "shared/fields.py", "shared/inputs.py",
+    "shared/messages.py", "shared/ring.py", "shared/snapshot.py", "sovereign_netcode/playtest/match.py",
 )  # fmt: skip
 """Modules that a tick of a server and of a client runs. Other programs cannot derive from the classes of a compiled
 module, so rules, policies and transports are not among them."""

@@ -18,7 +18,7 @@ from client_sdk.replica import check_scene
 from scripts.loadgen.player import REQUEST, frame
 from scripts.soak_test.cells import Cell, Cells
 from scripts.soak_test.progress import Progress
-from shared import edits, messages
+from shared import edits, fields, messages
 from shared.messages import Bye, Command, Hello, Inputs, Ping, Snapshot, Welcome, decode_from_server, encode
 from shared.snapshot import VERDICT
 
@@ -199,7 +199,7 @@ class Honest:
             self._row = bytes((int(127 * math.cos(angle)) & 255, int(127 * math.sin(angle)) & 255, rng.random() < 0.1))
             link.send(Ping(0.0))
         due = tick + LEAD_TICKS
-        n = min(due - self._sent, messages.INPUT_ROWS_MAX) if self._sent >= 0 else 1
+        n = min(due - self._sent, fields.INPUT_ROWS_MAX) if self._sent >= 0 else 1
         if n > 0:
             self._sent = due
             link.send(Inputs(due - n + 1, tick, self._row * n))

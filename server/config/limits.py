@@ -8,7 +8,7 @@ from dataclasses import dataclass, fields
 from server.config.options import Kind, setting
 from shared.bounds import in_ticks
 from shared.checks import boolean, duration, whole
-from shared.messages import CLIENT_MESSAGE_MAX, INPUT_ROWS_MAX, NAME_MAX
+from shared.fields import CLIENT_MESSAGE_MAX, INPUT_ROWS_MAX, NAME_MAX
 
 HOUR_S = 3600.0
 """Upper bound of the times that an operator can set, in seconds."""

@@ -10,7 +10,7 @@ from server.game.session import Session
 from server.observability.counters import Counters
 from server.observability.errors import Faults
 from server.replication.client_stream import Link
-from shared import messages
+from shared import fields, messages
 from shared.messages import Bye, encode
 
 
@@ -82,7 +82,7 @@ class Connections:
             reason: the reason, sent to the client.
             wait: seconds after which the client should reconnect; negative: the client is not asked to.
         """
-        reason = reason.encode(errors="replace").decode()[: messages.REASON_MAX]
+        reason = reason.encode(errors="replace").decode()[: fields.REASON_MAX]
         self._counters.closed[code] = self._counters.closed.get(code, 0) + 1
         try:
             session.send(encode(Bye(code, reason, wait)))

@@ -29,9 +29,9 @@ from server.rewind import Rewind
 from server.rules import Rules, checked_function
 from shared import messages
 from shared.checks import SceneError, shown, whole
+from shared.fields import INPUT_ROW_BYTES
 from shared.inputs import Input
 from shared.messages import (
-    INPUT_ROW_BYTES,
     Bye,
     Command,
     Hello,

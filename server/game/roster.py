@@ -19,7 +19,7 @@ from server.players import persisted_state
 from server.players.input_queue import InputQueue
 from server.players.player import Player
 from shared.bounds import bounds
-from shared.messages import RESUME_BYTES
+from shared.fields import RESUME_BYTES
 
 UNHEARD_S = 2.0
 """Seconds that a new player may take to reconnect if its client has not acknowledged anything yet."""

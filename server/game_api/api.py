@@ -23,9 +23,9 @@ from server.rewind import Rewind
 from server.rewind.history import Past
 from server.rules import Rules, check_rules
 from shared.checks import SceneError, Vec, finite, shown, whole
+from shared.fields import ENTITY_MAX
 from shared.inputs import Input, make_input
 from shared.layout import TEMPLATE
-from shared.messages import ENTITY_MAX
 from shared.scene import Scene
 
 

@@ -8,7 +8,7 @@ from server.journal.recorded_world import RecordedWorld
 from server.players.persisted_state import SAID
 from server.replication.change_log import ChangeLog
 from shared.checks import text
-from shared.messages import NAME_MAX
+from shared.fields import NAME_MAX
 
 
 class Attributes:

@@ -18,7 +18,8 @@ from server.players.player import Player
 from server.rules import Rules, RulesError, checked_function, checked_result
 from shared import messages
 from shared.edits import Edit
-from shared.messages import Command, ProtocolError, unpack_value
+from shared.messages import Command, ProtocolError
+from shared.payloads import unpack_value
 
 if TYPE_CHECKING:
     from server.game_api.api import Stage

@@ -6,7 +6,9 @@ from typing import Any
 from server.observability.counters import Counters
 from server.players.player import Player
 from shared.checks import SceneError, shown, text
-from shared.messages import NAME_MAX, Happened, encode, pack_value
+from shared.fields import NAME_MAX
+from shared.messages import Happened, encode
+from shared.payloads import pack_value
 
 
 class Outgoing:

@@ -6,7 +6,8 @@ from typing import Any
 import msgpack
 
 from shared.checks import SceneError, text
-from shared.messages import NAME_MAX, pack_value, unpack_value
+from shared.fields import NAME_MAX
+from shared.payloads import pack_value, unpack_value
 
 ATTRIBUTES_MAX = 32
 """Maximum number of attributes of an entity, and of shared values of a game."""

@@ -25,7 +25,7 @@ from websockets.server import ServerProtocol
 
 from server.net.http import answer_request
 from server.net.tls_accept import Guest
-from shared.messages import CLIENT_MESSAGE_MAX
+from shared.fields import CLIENT_MESSAGE_MAX
 
 try:
     from websockets.speedups import apply_mask

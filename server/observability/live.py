@@ -26,8 +26,8 @@ import numpy as np
 from server.observability.histogram import Histogram
 from server.observability.pages import JSON, Page
 from shared.blocks import AIR, Kinds
+from shared.fields import NAME_MAX
 from shared.layout import ID, TEMPLATE, Int64s, X, Y, Z
-from shared.messages import NAME_MAX
 from shared.units import BLOCK, SEGMENT
 from shared.world import World
 

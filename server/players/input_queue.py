@@ -14,8 +14,9 @@ from array import array
 from functools import lru_cache
 
 from shared.bounds import Bounds, bounds
+from shared.fields import INPUT_ROW_BYTES
 from shared.inputs import NEUTRAL, Input, clamp
-from shared.messages import IDLE, INPUT_ROW_BYTES, MARGIN_REFUSED, NEUTRALISED, REPEATED, USED, Inputs
+from shared.messages import IDLE, MARGIN_REFUSED, NEUTRALISED, REPEATED, USED, Inputs
 
 INPUT_ROW = struct.Struct("<bbB")
 """Format of one input in a message: move_x, move_y, buttons."""

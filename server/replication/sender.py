@@ -19,7 +19,7 @@ from server.players.player import Player
 from server.replication import interest
 from server.replication.change_log import ChangeLog
 from server.replication.client_stream import ClientStream
-from shared import messages
+from shared import fields, messages
 from shared.checks import Cell
 from shared.messages import Terrain, encode
 from shared.snapshot import VERDICT
@@ -29,7 +29,7 @@ GAPS_S = 2.0
 """Seconds for which gaps between a client's snapshots are kept: longer than lag compensation can look back."""
 EVENT_BYTES = 128
 """Bytes of game events, about, that may go with each snapshot even if terrain waits."""
-SNAPSHOT_BYTES = messages.MESSAGE_MAX // 2
+SNAPSHOT_BYTES = fields.MESSAGE_MAX // 2
 """Maximum bytes of a snapshot, about. Further segments wait for the next snapshot, but never the own segment and one
 more."""
 
@@ -120,8 +120,8 @@ class Delivery:
         n, parts = sight.take(self._log, tick, room)
         verdicts = b""
         if player.verdicts:
-            verdicts = np.array(player.verdicts[: messages.VERDICTS_MAX], VERDICT).tobytes()
-            del player.verdicts[: messages.VERDICTS_MAX]
+            verdicts = np.array(player.verdicts[: fields.VERDICTS_MAX], VERDICT).tobytes()
+            del player.verdicts[: fields.VERDICTS_MAX]
         margins, fates = inputs.told()
         header = (tick, inputs.newest, margins, tick - len(fates) + 1, fates, verdicts, drops)
         message = messages.join_snapshot(header, n, parts)

@@ -6,7 +6,7 @@ from websockets.frames import Close, CloseCode, Frame, Opcode
 from client_sdk.core import Core
 from client_sdk.events import Left
 from client_sdk.transports.connection import CLOSE_S, LOOK_S, SILENCE_S, ConnectError, Connection
-from shared import messages
+from shared import fields, messages
 from shared.messages import Bye, Hello, decode_from_client, encode
 from tests.client_sdk.servers import Peer
 
@@ -104,7 +104,7 @@ def test_a_long_reason_is_cut_to_what_a_close_frame_holds() -> None:
 
 def test_an_oversized_message_closes() -> None:
     pair = Pair().open()
-    pair.peer.protocol.send_binary(bytes(messages.MESSAGE_MAX + 1))
+    pair.peer.protocol.send_binary(bytes(fields.MESSAGE_MAX + 1))
     pair.to_client()
     assert pair.left().code == messages.TOO_BIG
 

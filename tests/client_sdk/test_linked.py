@@ -16,7 +16,7 @@ from client_sdk.core import READ_BYTES, Core
 from client_sdk.events import Happened, Joined, Left
 from client_sdk.netsim.linked import SLOW_READ_BYTES, LinkedPort
 from client_sdk.netsim.links import PRESETS, Path
-from shared import messages
+from shared import messages, payloads
 from shared.messages import Bye, Hello, Inputs, Ping, decode_from_client, encode
 from shared.scene import load_scene
 from tests.client_sdk.servers import ROOT, real_server
@@ -36,7 +36,7 @@ def linked(link: str | Path | None, now: float = 16.0) -> LinkedPort:
 
 
 def told(number: int) -> bytes:
-    return encode(messages.Happened(number, "told", messages.pack_value(None)))
+    return encode(messages.Happened(number, "told", payloads.pack_value(None)))
 
 
 def heard(port: LinkedPort) -> list[int]:
@@ -163,7 +163,7 @@ def test_no_such_link_is_told_with_those_that_there_are() -> None:
 def test_while_a_slow_line_is_busy_nothing_more_is_read() -> None:
     port = linked(PRESETS["thin"])
     assert port.appetite == SLOW_READ_BYTES
-    port.receive(encode(messages.Happened(1, "told", messages.pack_value("x" * 1000))), 16.0)
+    port.receive(encode(messages.Happened(1, "told", payloads.pack_value("x" * 1000))), 16.0)
     assert port.appetite == 0
     port.update(16.25)
     assert port.appetite == 0

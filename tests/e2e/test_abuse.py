@@ -17,8 +17,8 @@ from websockets.frames import Frame, Opcode
 
 from client_sdk.async_client import AsyncClient
 from client_sdk.bots import Bot, Wander
+from shared.fields import CLIENT_MESSAGE_MAX
 from shared.messages import (
-    CLIENT_MESSAGE_MAX,
     MALFORMED,
     PROTOCOL,
     TEXT,

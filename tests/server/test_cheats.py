@@ -18,23 +18,10 @@ from server.rewind.history import WINDOW_S
 from server.rules import Rules
 from shared import edits, messages
 from shared.bounds import bounds
+from shared.fields import INPUT_ROW_BYTES, INPUT_ROWS_MAX, TICK_MAX
 from shared.inputs import Input, clamp
 from shared.layout import BUTTONS, CELL, MOVE_X, VZ, X, Y, Z
-from shared.messages import (
-    INPUT_ROW_BYTES,
-    INPUT_ROWS_MAX,
-    TICK_MAX,
-    Bye,
-    Command,
-    Hello,
-    Inputs,
-    Message,
-    Ping,
-    Restart,
-    Resync,
-    Welcome,
-    encode,
-)
+from shared.messages import Bye, Command, Hello, Inputs, Message, Ping, Restart, Resync, Welcome, encode
 from shared.units import BLOCK
 from tests.lengths import examples
 from tests.server.test_commands import verdicts

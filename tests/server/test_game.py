@@ -10,16 +10,7 @@ from hypothesis import strategies as st
 from server.config.limits import Limits
 from shared import messages
 from shared.bounds import bounds
-from shared.messages import (
-    Bye,
-    Command,
-    Inputs,
-    Ping,
-    Resync,
-    Snapshot,
-    Terrain,
-    encode,
-)
+from shared.messages import Bye, Command, Inputs, Ping, Resync, Snapshot, Terrain, encode
 from tests.lengths import examples
 from tests.tables import HELLO, FakeLink, Table, gone, ids, order
 from tests.worlds import EAST, STEP

@@ -23,7 +23,7 @@ from server.net.admission import SPARE_PER_ADDRESS, Door
 from server.net.gateway import Gateway
 from server.net.websocket import Connection
 from server.observability.pages import Pages, json_page
-from shared.messages import CLIENT_MESSAGE_MAX
+from shared.fields import CLIENT_MESSAGE_MAX
 from tests.lengths import examples
 
 UPGRADE = (

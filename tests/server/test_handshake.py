@@ -3,21 +3,8 @@
 import pytest
 
 from server.config.limits import Limits
-from shared import messages
-from shared.messages import (
-    Bye,
-    Command,
-    Hello,
-    Inputs,
-    Message,
-    Ping,
-    Pong,
-    Resync,
-    Snapshot,
-    Terrain,
-    Welcome,
-    encode,
-)
+from shared import fields, messages
+from shared.messages import Bye, Command, Hello, Inputs, Message, Ping, Pong, Resync, Snapshot, Terrain, Welcome, encode
 from tests.tables import HELLO, Table
 from tests.worlds import scene
 
@@ -50,7 +37,7 @@ def test_who_says_hello_is_welcomed_and_shown_the_world_in_the_next_tick(table: 
     welcome, snapshot, terrain = link.sent[:3]
     assert isinstance(welcome, Welcome)
     assert welcome == Welcome(messages.VERSION, 0, 1, table.game.scene.to_table(), welcome.resume)
-    assert len(welcome.resume) == messages.RESUME_BYTES
+    assert len(welcome.resume) == fields.RESUME_BYTES
     assert isinstance(snapshot, Snapshot)
     assert isinstance(terrain, Terrain)
     assert (snapshot.tick, snapshot.newest, len(snapshot.fates), len(snapshot.segments)) == (1, -1, 1, 1)
@@ -85,7 +72,7 @@ def test_a_field_that_only_one_side_has_differs_too(table: Table) -> None:
     code, reason = table.connect(Hello(messages.VERSION, mine | {"wind": b"1"}, "")).refusal()
     assert (code, reason) == (messages.WRONG_SCENE, "the server plays another scene (wind differ)")
     long = {f"{i:02}" + "x" * 200: b"" for i in range(32)}
-    assert len(table.connect(Hello(messages.VERSION, long, "")).refusal()[1]) <= messages.REASON_MAX
+    assert len(table.connect(Hello(messages.VERSION, long, "")).refusal()[1]) <= fields.REASON_MAX
 
 
 @pytest.mark.parametrize(

@@ -7,17 +7,9 @@ from hypothesis import strategies as st
 from server.game.session import Session
 from server.players.input_queue import InputQueue
 from shared.bounds import bounds
+from shared.fields import INPUT_ROWS_MAX, TICK_MAX
 from shared.inputs import NEUTRAL, Input, clamp
-from shared.messages import (
-    IDLE,
-    INPUT_ROWS_MAX,
-    MARGIN_REFUSED,
-    NEUTRALISED,
-    REPEATED,
-    TICK_MAX,
-    USED,
-    Inputs,
-)
+from shared.messages import IDLE, MARGIN_REFUSED, NEUTRALISED, REPEATED, USED, Inputs
 
 LIMITS = bounds(32)
 AHEAD_MAX, REPEATS_MAX, FATES_MAX, MARGIN_ONE = LIMITS.ahead, LIMITS.repeats, LIMITS.fates, LIMITS.margin_one

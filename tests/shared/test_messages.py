@@ -10,17 +10,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from shared import messages
+from shared import fields, messages
+from shared.fields import CLIENT_LIST_MAX, CLIENT_MESSAGE_MAX, FATES_MAX, LIST_MAX, MESSAGE_MAX, TICK_MAX
 from shared.messages import (
     CLIENT_KINDS,
-    CLIENT_LIST_MAX,
-    CLIENT_MESSAGE_MAX,
-    FATES_MAX,
     KINDS,
-    LIST_MAX,
-    MESSAGE_MAX,
     SERVER_KINDS,
-    TICK_MAX,
     Bye,
     Command,
     Happened,
@@ -239,7 +234,7 @@ def test_a_list_cannot_claim_memory_that_its_bytes_do_not_fill() -> None:
     for items, refused in ((CLIENT_LIST_MAX, "fields instead of"), (CLIENT_LIST_MAX + 1, "not MessagePack")):
         with pytest.raises(ProtocolError, match=refused):
             decode_from_client(msgpack.packb([3] * items))
-    assert LIST_MAX > messages.SEGMENTS_MAX + 8
+    assert LIST_MAX > fields.SEGMENTS_MAX + 8
 
 
 def claims(size: int) -> bytes:

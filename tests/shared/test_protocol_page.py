@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from shared import bounds as bounds_module
-from shared import edits, layout, messages
+from shared import edits, fields, layout, messages, payloads
 from shared.blocks import offset_of, pack, unpack
 from shared.bounds import bounds
 from shared.messages import KINDS, Message, Snapshot, decode_from_client, decode_from_server, encode, join_snapshot
@@ -134,7 +134,7 @@ def test_the_terrain_is_what_is_said_of_it() -> None:
 
 def test_payloads() -> None:
     assert edits.unpack(example(messages.Command).payload) == (259, 255, 12, 0)
-    assert messages.unpack_value(example(messages.Happened).payload) == {"by": 7}
+    assert payloads.unpack_value(example(messages.Happened).payload) == {"by": 7}
     assert example(messages.Inputs).rows == bytes((127, 0, 0, 127, 0, 1))
 
 
@@ -149,7 +149,7 @@ def test_tables_of_numbers() -> None:
     listed = re.findall(r"^([A-Z_, ]+) = (?:1001, |range\(4001, )", source, re.MULTILINE)
     assert {name for names in listed for name in names.split(", ")} == codes.keys()
     limits = {name: int(value) for name, value, _ in table("limit", "value")}
-    assert limits == {name: getattr(messages, name) for name in limits}
+    assert limits == {name: getattr(fields, name) for name in limits}
     times = {name: float(value) for name, value, _ in table("time", "seconds")}
     assert times == {name: getattr(bounds_module, name) for name in times}
     events = {name: 1 << int(bit) for bit, name, _ in table("bit", "event")}

@@ -14,9 +14,10 @@ from hypothesis import strategies as st
 from shared import kernels
 from shared.blocks import BLOCKS, PACKED_MAX, pack, unpack
 from shared.checks import Cell
+from shared.fields import ENTITY_MAX, TICK_MAX
 from shared.inputs import Input
 from shared.layout import CELL, FALLING, FLAGS, ID, MOVE_X, STOP_Y, TEMPLATE, TOLD, TURN, VX, X
-from shared.messages import ENTITY_MAX, TICK_MAX, ProtocolError
+from shared.messages import ProtocolError
 from shared.snapshot import (
     ACTED,
     FIELDS,
