@@ -1,8 +1,8 @@
-"""The changes of a world, without checks of their arguments. Every change goes through a method of this module.
+"""The changes of a world between two steps, without checks of their arguments, and the observer that they report to.
 
 The methods of `shared.world.World` check their arguments and call these. An observer, if there is one, is notified of
-each change: a recording is nothing but the calls of its observer. A change that is part of another (an entity that a
-block pushes aside) is not reported by itself.
+each change and of each step: a recording consists of these calls. A change that is part of another one (a block pushes
+an entity aside) is not reported by itself.
 """
 
 from collections.abc import Iterable, Mapping
@@ -28,7 +28,7 @@ LISTS = (
 class Observer(Protocol):
     """The target of the reports of a world's changes. Each method is called after the change unless it says otherwise.
 
-    Only `UncheckedWorld.follow` and setting `next_id` are not reported.
+    `World.follow` and a new `next_id` are not reported.
     """
 
     def touching(self, low: Cell, high: Cell) -> None:
