@@ -128,10 +128,12 @@ class UncheckedWorld(WorldState):
             if kind == blocks.AIR:
                 face = (x * BLOCK, y * BLOCK, (x + 1) * BLOCK, (y + 1) * BLOCK, (z + 1) * BLOCK)
                 self.kernel.wake_on(self.bound, -1, *face)
-        states, placing = [self.state(entity) for entity in in_the_way], set(self.placing)
+        if not in_the_way:
+            return len(changed)
+        states, placing = self.states_of(in_the_way), set(self.placing)
         try:
             for entity in in_the_way:
-                self._store([self._placed(entity, self.position(entity), push=True)])
+                self._store(np.array([self._placed(entity, self.position(entity), push=True)], np.int64))
                 self.placing.add(entity)
         except OverlapError:
             for cell, before in changed:
@@ -172,14 +174,13 @@ class UncheckedWorld(WorldState):
 
     def _put(self, states: Iterable[tuple[int, ...]] | Int64s) -> None:
         """Writes states; ids that are not known become new entities."""
+        new = np.asarray(states if isinstance(states, np.ndarray) else list(states), np.int64).reshape(-1, STATES)
         if self.observer is not None:
-            states = _matrix(states)
-            self.observer.put(states)
-        self._store(states)
+            self.observer.put(new)
+        self._store(new)
 
-    def _store(self, states: Iterable[tuple[int, ...]] | Int64s) -> None:
-        """Writes states without a report."""
-        new = _matrix(states)
+    def _store(self, new: Int64s) -> None:
+        """Writes states ([n, 12]) without a report."""
         ids = new[:, ID].tolist()
         known = list(map(self._row_of.get, ids))
         rows = np.array([self._row(entity) for entity in ids] if None in known else known, np.int64)
@@ -318,8 +319,3 @@ class UncheckedWorld(WorldState):
         self.blocks.heads[rows[first, layout.CELL]] = first
         if moved:
             self._bind()
-
-
-def _matrix(states: Iterable[tuple[int, ...]] | Int64s) -> Int64s:
-    """Returns states as a matrix [n, 12]."""
-    return np.asarray(states if isinstance(states, np.ndarray) else list(states), np.int64).reshape(-1, STATES)
