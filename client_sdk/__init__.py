@@ -3,7 +3,7 @@
     from client_sdk import Client, Joined, Left
 
 `Client` is for a game's own loop, `AsyncClient` for asyncio, `Loopback` for a server within the program. They return
-events (`client_sdk.events`), and a `View` of `Figure`s, one per entity to draw.
+events (`client_sdk.events`), and a `View` of `EntityView`s, one per entity to draw.
 """
 
 from typing import TYPE_CHECKING, Any
@@ -27,11 +27,11 @@ from client_sdk.events import (
 from client_sdk.loopback import Loopback
 from client_sdk.stats import Stats
 from client_sdk.transports.connection import ConnectError
-from client_sdk.view import Figure, View
+from client_sdk.view import EntityView, View
 from shared.inputs import Input, make_input
 
 if TYPE_CHECKING:
-    from client_sdk.netsim.links import Path
+    from client_sdk.netsim.links import Link
 
 __all__ = [
     "Answered",
@@ -41,15 +41,15 @@ __all__ = [
     "Corrected",
     "Disconnected",
     "Diverged",
+    "EntityView",
     "Event",
     "EventsDropped",
-    "Figure",
     "Happened",
     "Input",
     "Joined",
     "Left",
+    "Link",
     "Loopback",
-    "Path",
     "Resumed",
     "Resynchronised",
     "SegmentLoaded",
@@ -58,11 +58,16 @@ __all__ = [
     "make_input",
 ]
 
+RENAMED = {"Figure": "EntityView", "Path": "Link"}
+"""Names of version 0.1, which still work in 0.2, and the new ones (docs/renamed.md)."""
+
 
 def __getattr__(name: str) -> Any:
-    """Loads the simulator of links when a program asks for `Path`, and not before."""
-    if name == "Path":
-        from client_sdk.netsim.links import Path
+    """Loads the simulator of links when a program asks for `Link`, and knows the old names of `RENAMED`."""
+    if name in RENAMED:
+        return __getattr__(RENAMED[name]) if RENAMED[name] == "Link" else globals()[RENAMED[name]]
+    if name == "Link":
+        from client_sdk.netsim.links import Link
 
-        return Path
+        return Link
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -35,7 +35,7 @@ from shared.checks import duration
 from shared.scene import Scene
 
 if TYPE_CHECKING:
-    from client_sdk.netsim.links import Path
+    from client_sdk.netsim.links import Link
 
 
 TIMEOUT_S = 5.0
@@ -92,7 +92,7 @@ class AsyncClient(BaseClient):
         patience_s: float = 30.0,
         timeout: float = TIMEOUT_S,
         tls: ssl.SSLContext | None = None,
-        link: "str | Path | None" = None,
+        link: "str | Link | None" = None,
         before_update: Callable[[Core], None] | None = None,
     ) -> "AsyncClient":
         """Connects to a server. Returns as soon as the server has answered; the client then joins by itself.
@@ -107,7 +107,7 @@ class AsyncClient(BaseClient):
                 reconnect.
             timeout: the longest time to wait for the server's answer, in seconds.
             tls: certificates to trust for wss://; None: those that the system trusts.
-            link: a simulated link: the name of a preset, or a `Path`; None: none.
+            link: a simulated link: the name of a preset, or a `Link`; None: none.
             before_update: called with the core before each update while the client plays, so that it can set the input.
 
         Raises:
@@ -283,8 +283,8 @@ class AsyncClient(BaseClient):
             self._connection.look(now)
         core.port.update(now)
         self._read_on()
-        if core.state == "away" and self._transport is None and now >= core.comeback.retry_at:
-            core.comeback.trying()
+        if core.state == "reconnecting" and self._transport is None and now >= core.reconnect.retry_at:
+            core.reconnect.trying()
             self._redialing = self._loop.create_task(self._redial())
         self._pump(now)
         self._schedule(now)

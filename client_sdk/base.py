@@ -9,7 +9,7 @@ from shared.inputs import make_input
 
 if TYPE_CHECKING:
     from client_sdk.netsim.linked import LinkedPort
-    from client_sdk.netsim.links import Path
+    from client_sdk.netsim.links import Link
 
 
 class BaseClient:
@@ -37,9 +37,9 @@ class BaseClient:
         return self.core.state == "playing"
 
     @property
-    def away(self) -> bool:
+    def reconnecting(self) -> bool:
         """Whether the connection is lost and the client tries to reconnect: after `Disconnected`, before `Resumed`."""
-        return self.core.state == "away"
+        return self.core.state == "reconnecting"
 
     @property
     def closed(self) -> bool:
@@ -69,10 +69,10 @@ class BaseClient:
         return self.core.stats.text()
 
     @property
-    def link(self) -> "Path | None":
+    def link(self) -> "Link | None":
         """The simulated link on top of the real connection, to try a bad network: `client.link = "wifi"`.
 
-        It may be set at any time: to the name of a preset of `client_sdk.netsim.links`, to a `Path`, or to None for no
+        It may be set at any time: to the name of a preset of `client_sdk.netsim.links`, to a `Link`, or to None for no
         link.
 
         Raises:
@@ -81,7 +81,7 @@ class BaseClient:
         return None if self.core.port is self.core else cast("LinkedPort", self.core.port).link
 
     @link.setter
-    def link(self, link: "str | Path | None") -> None:
+    def link(self, link: "str | Link | None") -> None:
         set_link(self.core, link)
 
     def set_input(self, x: float, y: float, *, jump: bool = False) -> None:
@@ -114,7 +114,7 @@ class BaseClient:
         self.core.set_input_delay(ticks)
 
 
-def set_link(core: Core, link: "str | Path | None") -> None:
+def set_link(core: Core, link: "str | Link | None") -> None:
     """Puts a simulated link in front of a core, or changes it. Without a link, the simulator is not even loaded.
 
     Raises:

@@ -93,14 +93,14 @@ class Wander:
     def __init__(self, random: Random) -> None:
         self._random = random
         self._until = 0
-        self._wish = NEUTRAL
+        self._input = NEUTRAL
 
     def __call__(self, world: World, me: int) -> Input:
         if world.tick >= self._until:
             self._until = world.tick + _ticks(world, 0.5 + 1.5 * self._random.random())
             pause, jump = self._random.random() < 0.2, self._random.random() < 0.2
-            self._wish = NEUTRAL if pause else _heading(self._random, jump=jump)
-        return self._wish
+            self._input = NEUTRAL if pause else _heading(self._random, jump=jump)
+        return self._input
 
 
 class RunAndJump:
@@ -109,15 +109,15 @@ class RunAndJump:
     def __init__(self, random: Random) -> None:
         self._random = random
         self._until = 0
-        self._wish = NEUTRAL
+        self._input = NEUTRAL
 
     def __call__(self, world: World, me: int) -> Input:
         vx, vy = world.state(me)[VX : VX + 2]
-        stuck = vx == 0 == vy and self._wish is not NEUTRAL
+        stuck = vx == 0 == vy and self._input is not NEUTRAL
         if world.tick >= self._until or (stuck and self._random.random() < 0.2):
             self._until = world.tick + _ticks(world, 2.0 + 4.0 * self._random.random())
-            self._wish = _heading(self._random, jump=True)
-        return self._wish
+            self._input = _heading(self._random, jump=True)
+        return self._input
 
 
 class Follow:

@@ -25,7 +25,7 @@ from shared.checks import duration, finite
 from shared.scene import Scene
 
 if TYPE_CHECKING:
-    from client_sdk.netsim.links import Path
+    from client_sdk.netsim.links import Link
 
 
 PATIENCE_S = 30.0
@@ -74,7 +74,7 @@ class Client(BaseClient):
         patience_s: float = PATIENCE_S,
         timeout: float = 5.0,
         tls: ssl.SSLContext | None = None,
-        link: "str | Path | None" = None,
+        link: "str | Link | None" = None,
     ) -> "Client":
         """Connects to a server. Returns as soon as the server has answered; `poll` and `update` then join the game.
 
@@ -88,7 +88,7 @@ class Client(BaseClient):
                 reconnect.
             timeout: the longest time that this call may block, in seconds.
             tls: certificates to trust for wss://; None: those that the system trusts.
-            link: a simulated link: the name of a preset, or a `Path`; None: none. `Client.link` changes it later.
+            link: a simulated link: the name of a preset, or a `Link`; None: none. `Client.link` changes it later.
 
         Raises:
             ValueError: an argument is not valid: no preset has the name in `link`, or UTF-8 cannot hold the name or the

@@ -11,7 +11,7 @@ from shared.messages import Command, encode
 from shared.snapshot import VERDICT
 
 
-class Orders:
+class SentCommands:
     """The commands without a result, by number."""
 
     def __init__(self) -> None:

@@ -18,10 +18,10 @@ class Controls:
         self._pressed = 0
         """Bits of the buttons that were pressed since the latest tick."""
 
-    def set(self, wish: Input) -> None:
+    def set(self, input_: Input) -> None:
         """Sets the input from now on."""
-        self._pressed |= wish.buttons & ~self.held.buttons
-        self.held = wish
+        self._pressed |= input_.buttons & ~self.held.buttons
+        self.held = input_
 
     def take(self) -> Input:
         """Returns the input of the next tick, including buttons that were pressed and released before it."""

@@ -15,14 +15,14 @@ import math
 from typing import Any, SupportsIndex
 
 from client_sdk.advice import advised
-from client_sdk.commands import Orders
+from client_sdk.commands import SentCommands
 from client_sdk.controls import Controls
 from client_sdk.events import Disconnected, Event, Joined, Left, Resumed, SegmentLoaded
-from client_sdk.input_loop import Play
+from client_sdk.input_loop import InputLoop
 from client_sdk.pending_events import GameEvents, PendingEvents
 from client_sdk.port import Port
 from client_sdk.prediction.prediction import Prediction
-from client_sdk.reconnect import Comeback
+from client_sdk.reconnect import Reconnect
 from client_sdk.replica import Replica
 from client_sdk.stats import Stats
 from client_sdk.timing.server_clock import ServerClock
@@ -81,14 +81,14 @@ class Core:
         self.close_request: tuple[int, str] | None = None
         """Close code and reason with which the transport has to close the connection now; None: it must not."""
         self.stats = Stats()
-        self.comeback = Comeback(duration(patience_s, "patience_s", endless=True))
+        self.reconnect = Reconnect(duration(patience_s, "patience_s", endless=True))
         self.controls = Controls()
         self.shared: dict[str, Any] = {}
         """The values that the rules of the game share with all clients, by name."""
         self._token = text(token, "token", fields.TOKEN_MAX, shortest=0)
         self._resume = b""
         self._open = False
-        self._orders = Orders()
+        self._commands = SentCommands()
         self._out: list[bytes] = []
         self._events = PendingEvents()
         self._game_events = GameEvents(self._events)
@@ -154,8 +154,8 @@ class Core:
 
     def lost(self, code: int, reason: str, now: float) -> None:
         """Takes the loss of the connection, or the failure of an attempt to connect."""
-        if self.state in ("playing", "away"):
-            if self._open or self.comeback.retry_at == math.inf:  # otherwise a `Bye` has already announced it
+        if self.state in ("playing", "reconnecting"):
+            if self._open or self.reconnect.retry_at == math.inf:  # otherwise a `Bye` has already announced it
                 self._cut_off(Left(code, reason, 0.0), now)
         else:
             self._end(Left(code, reason))
@@ -169,7 +169,7 @@ class Core:
                 data.
         """
         play = self._joined("command")
-        return self._order(self._orders.command(play.world.prediction.next_order, play.seen, name, data))
+        return self._order(self._commands.command(play.world.prediction.next_order, play.seen, name, data))
 
     def edit(self, x: SupportsIndex, y: SupportsIndex, z: SupportsIndex, kind: SupportsIndex) -> int:
         """Places (kind 1 to 255) or removes (0) a block with the next tick. Returns the number of the edit.
@@ -181,7 +181,7 @@ class Core:
         """
         play, edit = self._joined("edit"), edits.checked(x, y, z, kind)
         payload = edits.pack(edit)  # before the prediction: an edit that cannot be sent must not be predicted
-        number = self._orders.number()
+        number = self._commands.number()
         tick = play.world.prediction.edit(number, edit)
         return self._order(messages.Command(number, tick, play.seen, edits.NAME, payload))
 
@@ -194,17 +194,17 @@ class Core:
             self._end(Left(1000, "closed by this client"))
 
     @property
-    def wish(self) -> Input:
+    def input(self) -> Input:
         """The input that was set most recently."""
         return self.controls.held
 
-    def set_input(self, wish: Input) -> None:
+    def set_input(self, input_: Input) -> None:
         """Sets the player's input from the next tick on. A short press between two ticks counts in the next tick.
 
         Raises:
-            ValueError: `wish` is not an `Input`.
+            ValueError: `input_` is not an `Input`.
         """
-        self.controls.set(clamp(checked_input(wish, "wish")))
+        self.controls.set(clamp(checked_input(input_, "input")))
 
     def set_input_delay(self, ticks: int) -> None:
         """Sets the input delay: inputs take effect `ticks` ticks (0 to 3) later. More delay means fewer replays.
@@ -226,7 +226,7 @@ class Core:
                 self._send(message)
         if self._open and worlds.ping_due(now):
             self._send(messages.Ping(now, self.stats.corrections))
-        if self.state in ("joining", "away") and worlds.filled and worlds.filled.complete:
+        if self.state in ("joining", "reconnecting") and worlds.filled and worlds.filled.complete:
             self._begin(worlds.filled, now)
         if worlds.play and self.state != "closed":
             for message in worlds.play.update(now, self.controls, online=self.state == "playing"):
@@ -237,7 +237,7 @@ class Core:
     def next_update(self, now: float) -> float:
         """Returns the local time at which `update` has something to do; `inf`: not before a message arrives."""
         worlds = self._worlds
-        due = worlds.connection_clock.next_ping if self._open else self.comeback.retry_at
+        due = worlds.connection_clock.next_ping if self._open else self.reconnect.retry_at
         if worlds.play:
             due = min(due, worlds.play.next_tick(now))
         return max(due, now)  # inf: nothing to do until a message arrives
@@ -266,7 +266,7 @@ class Core:
     def _take(self, message: messages.Message, now: float) -> None:
         match message:
             case messages.Snapshot():
-                self._worlds.snapshot(message, self._orders, now)
+                self._worlds.snapshot(message, self._commands, now)
             case messages.Pong():
                 self._worlds.answered(message, now)
             case messages.Terrain():
@@ -283,7 +283,7 @@ class Core:
                 self.shared = message.values
             case messages.Bye():
                 left = Left(message.code, advised(message.code, message.reason), message.wait)
-                if self.state in ("playing", "away") and (message.wait >= 0 or message.code in COME_AGAIN):
+                if self.state in ("playing", "reconnecting") and (message.wait >= 0 or message.code in COME_AGAIN):
                     self._cut_off(left, now)
                 else:
                     self._end(left)
@@ -303,11 +303,11 @@ class Core:
         if self.scene is not None and world.scene.digests != self.scene.digests:
             raise ProtocolError("Welcome.scene: not the scene that the client requested")
         self.scene, self._resume = world.scene, welcome.resume
-        self.comeback.spread = welcome.entity
+        self.reconnect.spread = welcome.entity
         if worlds.play and welcome.entity == self.entity:
-            self._out += self._orders.again()
+            self._out += self._commands.again()
         elif worlds.play:
-            for answered in self._orders.give_up():
+            for answered in self._commands.give_up():
                 self._events.append(answered)
             self._game_events.restart()
         worlds.filled = world
@@ -316,10 +316,10 @@ class Core:
         """Starts the play in a complete replica, for the first time or after a reconnect."""
         play, same = self._worlds.begin(world, now)
         self.state = "playing"
-        tick, away_s = world.prediction.predicted.tick, self.comeback.away_s(now)
+        tick, away_s = world.prediction.predicted.tick, self.reconnect.away_s(now)
         self._events.append(Resumed(tick, away_s) if same else Joined(self.entity, world.scene, tick))
         self._game_events.release()
-        self.comeback.back()
+        self.reconnect.back()
         for inputs in play.unheard() if same else ():
             self._send(inputs)
 
@@ -328,13 +328,13 @@ class Core:
         self._open, self._worlds.filled = False, None
         self._out.clear()
         wait = max(left.wait_s, 0.0)
-        if not self._resume or not self.comeback.lost(now, wait):
+        if not self._resume or not self.reconnect.lost(now, wait):
             self._end(left)
             return
-        self.state = "away"
-        self._events.append(Disconnected(left.reason, self.comeback.retry_at - now))
+        self.state = "reconnecting"
+        self._events.append(Disconnected(left.reason, self.reconnect.retry_at - now))
 
-    def _joined(self, what: str) -> Play:
+    def _joined(self, what: str) -> InputLoop:
         play = self._worlds.play
         if play is None or self.state == "closed":
             raise RuntimeError(f"{what}: the client has not joined")
@@ -342,7 +342,7 @@ class Core:
 
     def _order(self, command: messages.Command) -> int:
         """Sends a command now, or over the next connection. Returns its number."""
-        message = self._orders.file(command)
+        message = self._commands.file(command)
         if self._open:
             self._out.append(message)
         return command.number

@@ -5,7 +5,8 @@
     view     returns what to draw
 
 `newest` is the newest tick that has an input. After a lost connection, the input loop goes on in a new replica
-(`world`) if the server's time is still the one that it knew. Otherwise nothing of it is valid, and a new `Play` begins.
+(`world`) if the server's time is still the one that it knew. Otherwise nothing of it is valid, and a new `InputLoop`
+begins.
 """
 
 import math
@@ -47,7 +48,7 @@ PATH, RECONNECTED = "path changed", "reconnected"
 """Causes of `Resynchronised`, explained there."""
 
 
-class Play:
+class InputLoop:
     """The input loop of one player. Call `restart` after creating it.
 
     Args:
@@ -182,7 +183,7 @@ class Play:
         Arrival margins go to the lead controller. Input statuses are counted, and a missing input sets `_late`, which
         becomes the cause of a correction.
         """
-        stats, phases, margins, fates = self._stats, self._phases, snapshot.margins, snapshot.fates
+        stats, phases, margins, statuses = self._stats, self._phases, snapshot.margins, snapshot.statuses
         one = self._bounds.margin_one
         for tick, (margin,) in enumerate(iter_unpack("<h", margins), snapshot.newest + 1 - len(margins) // 2):
             phase = phases.get(tick)
@@ -196,14 +197,14 @@ class Play:
                 self._lead.observe(tick, margin / one, phase, now)
         if self._settling is not None or self._settled:  # the server may have used inputs that were withdrawn
             self._late, self._settled = True, False
-        used = fates.count(USED)
+        used = statuses.count(USED)
         stats.inputs_used += used
-        if used == len(fates):
+        if used == len(statuses):
             return
-        neutralised = fates.count(NEUTRALISED)
-        missing = fates.count(REPEATED) + neutralised
-        if IDLE in fates:  # the very first inputs were late, and the server had no earlier one to repeat
-            ticks = enumerate(fates, snapshot.first)
+        neutralised = statuses.count(NEUTRALISED)
+        missing = statuses.count(REPEATED) + neutralised
+        if IDLE in statuses:  # the very first inputs were late, and the server had no earlier one to repeat
+            ticks = enumerate(statuses, snapshot.first)
             missing += sum(fate == IDLE and phases.get(tick) is not None for tick, fate in ticks)
         stats.inputs_substituted += missing
         stats.inputs_neutralised += neutralised
@@ -284,9 +285,9 @@ class Play:
             timeline.made(timeline.tick(now) - first, now)
             rows = b""
             for tick in range(first, to + 1):
-                wish = controls.take()
-                prediction.file(tick, wish)
-                rows += row(wish)
+                input_ = controls.take()
+                prediction.file(tick, input_)
+                rows += row(input_)
                 # Delays of a slow program are left out of the phase, because the path did not cause them.
                 self._phases.put(tick, phase - (timeline.tick(now) - tick) if timeline.own else phase)
             stats.inputs_sent += to + 1 - first

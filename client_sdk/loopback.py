@@ -18,7 +18,7 @@ from shared.checks import SceneError, shown
 from shared.scene import Scene
 
 if TYPE_CHECKING:
-    from client_sdk.netsim.links import Path
+    from client_sdk.netsim.links import Link
 
 
 LEAP_S = 2.0
@@ -60,13 +60,13 @@ class Loopback:
         self._began = -math.inf
         self._ticks = 0
 
-    def join(self, name: str = "", *, token: str = "", link: "str | Path | None" = None) -> Client:
+    def join(self, name: str = "", *, token: str = "", link: "str | Link | None" = None) -> Client:
         """Adds a player and returns its client, which joins within about half a second of polls and updates.
 
         Args:
             name: the player's name, shown to others, up to 32 characters.
             token: proves the client's identity, if the game asks for it.
-            link: a simulated link: the name of a preset, or a `Path`; None: none.
+            link: a simulated link: the name of a preset, or a `Link`; None: none.
 
         Raises:
             ValueError: no preset has the name in `link`; or UTF-8 cannot hold the name or the token.
@@ -127,10 +127,12 @@ class _Seat:
         # A joining client opens one connection only: with a `link`, a refusal arrives later, and the state is still
         # "joining" until then.
         if self._session is None and (
-            not self._opened if core.state == "joining" else core.state == "away" and now >= core.comeback.retry_at
+            not self._opened
+            if core.state == "joining"
+            else core.state == "reconnecting" and now >= core.reconnect.retry_at
         ):
             self._opened = True
-            core.comeback.trying()
+            core.reconnect.trying()
             self._wire = _Wire(core)
             self._session = self._game.open(self._wire, now)
             core.port.open(now)

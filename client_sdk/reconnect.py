@@ -12,7 +12,7 @@ GOLDEN = 0.6180339887
 """The golden ratio's fraction, which spreads the waits evenly."""
 
 
-class Comeback:
+class Reconnect:
     """The reconnect attempts of one client.
 
     Args:

@@ -11,7 +11,7 @@ from client_sdk.controls import Controls
 from client_sdk.prediction.confirmed import Confirmed
 from client_sdk.prediction.prediction import Prediction
 from client_sdk.timing.server_clock import ServerClock
-from client_sdk.view import Picture
+from client_sdk.view import ViewBuilder
 from shared.blocks import unpack
 from shared.checks import Cell
 from shared.kernels import Kernel
@@ -51,7 +51,7 @@ class Replica:
         self.scene = check_scene(welcome.scene)
         self.known = Confirmed(self.scene, welcome.entity, compiled=compiled)
         self.prediction = Prediction(self.known, controls, neighbours=neighbours)
-        self.picture = Picture(self.scene, self.prediction)
+        self.picture = ViewBuilder(self.scene, self.prediction)
         self.clock = clock
         if clock.rate == 0 or abs(clock.tick(now) - welcome.tick) > CLOCK_S * self.scene.tick_rate:
             self.clock = ServerClock()

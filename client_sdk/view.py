@@ -23,7 +23,7 @@ from shared.units import BLOCK, SPEED
 
 
 @dataclass(frozen=True)
-class Figure:
+class EntityView:
     """One entity to draw: its number, position in blocks, velocity in blocks/s, and the name of its template.
 
     `attributes` are the named values that the rules of the game gave to the entity, for example "name".
@@ -46,12 +46,12 @@ class View:
     """
 
     tick: float
-    me: Figure | None
-    others: list[Figure]
+    me: EntityView | None
+    others: list[EntityView]
     seen: float = 0.0
 
     @property
-    def figures(self) -> list[Figure]:
+    def figures(self) -> list[EntityView]:
         """All entities of the view, the own one last."""
         return self.others if self.me is None else [*self.others, self.me]
 
@@ -62,7 +62,7 @@ NONE_SAID: Mapping[str, Any] = MappingProxyType({})
 """Attributes of an entity that has none."""
 
 
-class Picture:
+class ViewBuilder:
     """Makes views from predicted, interpolated and smoothed positions."""
 
     def __init__(self, scene: Scene, prediction: Prediction) -> None:
@@ -110,7 +110,7 @@ class Picture:
             others.append(ahead or self._figure(state, place))
         return View(tick, self._ahead(prediction.entity, tick, now), others, self.interpolation.shown(server_tick))
 
-    def _ahead(self, entity: int, tick: float, now: float) -> Figure | None:
+    def _ahead(self, entity: int, tick: float, now: float) -> EntityView | None:
         """Returns a predicted entity to draw, one tick before `tick` and with smoothing; None if it is not predicted.
 
         One tick back, the position lies between two predicted states.
@@ -124,9 +124,9 @@ class Picture:
         place = old + (new - old) * share + (smoothing.offset(now) if smoothing else 0.0)
         return self._figure(after, place.tolist())
 
-    def _figure(self, state: Sequence[int], place: list[float]) -> Figure:
+    def _figure(self, state: Sequence[int], place: list[float]) -> EntityView:
         """Returns the entity view of a state, drawn at `place` (in blocks)."""
         x, y, z = place
         vx, vy, vz = (part / SPEED for part in state[VX : VX + 3])
         said = self._prediction.attributes.get(state[ID], NONE_SAID)
-        return Figure(state[ID], self._templates[state[TEMPLATE]], (x, y, z), (vx, vy, vz), said)
+        return EntityView(state[ID], self._templates[state[TEMPLATE]], (x, y, z), (vx, vy, vz), said)

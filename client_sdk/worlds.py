@@ -7,9 +7,9 @@ after a reconnect  the messages fill a second replica; the input loop uses the o
 
 from collections import deque
 
-from client_sdk.commands import Orders
+from client_sdk.commands import SentCommands
 from client_sdk.controls import Controls
-from client_sdk.input_loop import RECONNECTED, Play
+from client_sdk.input_loop import RECONNECTED, InputLoop
 from client_sdk.pending_events import PendingEvents
 from client_sdk.replica import Replica
 from client_sdk.stats import Stats
@@ -34,7 +34,7 @@ class Worlds:
     ) -> None:
         self.filled: Replica | None = None
         """The replica that receives the messages of the current connection; None before its welcome."""
-        self.play: Play | None = None
+        self.play: InputLoop | None = None
         """The input loop; None before the client has joined."""
         self.plain_for_now = False
         """Whether the plain kernel is used until the chosen one is ready (`speed_up`)."""
@@ -112,7 +112,7 @@ class Worlds:
         if self.play:
             self.play.answered(pong.sent)
 
-    def snapshot(self, snapshot: Snapshot, orders: Orders, now: float) -> None:
+    def snapshot(self, snapshot: Snapshot, orders: SentCommands, now: float) -> None:
         """Takes a snapshot: what became of inputs, the results of commands, and the changes of the world.
 
         Args:
@@ -135,7 +135,7 @@ class Worlds:
         world.apply(snapshot)
         self._stepped(world.clock.seen(snapshot.tick, now), now)
 
-    def begin(self, world: Replica, now: float) -> tuple[Play, bool]:
+    def begin(self, world: Replica, now: float) -> tuple[InputLoop, bool]:
         """Starts the input loop in a complete replica, for the first time or after a reconnect.
 
         Returns:
@@ -144,7 +144,7 @@ class Worlds:
         old = self.play
         same = old is not None and world.take_over(old.world)
         if old is None or old.world.clock is not world.clock:
-            play = self.play = Play(world, self._stats, self._events, now)
+            play = self.play = InputLoop(world, self._stats, self._events, now)
         else:
             play = old
             play.world = world

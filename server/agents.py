@@ -21,7 +21,7 @@ from server.config.limits import Limits
 from server.extras import install
 from server.game import Game
 from server.game.session import Session
-from server.game_api.api import Stage
+from server.game_api.api import GameApi
 from server.journal.recorded_world import RecordedWorld
 from server.players.input_queue import InputQueue
 from server.rules import Rules, prepared
@@ -56,7 +56,7 @@ NO_BLOCK = 255
 
 Array = npt.NDArray[Any]
 Observation = dict[str, Array]
-Reward = Callable[[Stage, int], float]
+Reward = Callable[[GameApi, int], float]
 
 
 class Arena(ParallelEnv):  # type: ignore[misc]  # it has no type information
@@ -134,9 +134,9 @@ class Arena(ParallelEnv):  # type: ignore[misc]  # it has no type information
         return self._game.world
 
     @property
-    def stage(self) -> Stage:
+    def stage(self) -> GameApi:
         """The game API of the running game."""
-        return self._game.stage
+        return self._game.api
 
     def entity(self, agent: str) -> int:
         """Returns the number of an agent's entity."""
@@ -168,14 +168,14 @@ class Arena(ParallelEnv):  # type: ignore[misc]  # it has no type information
         self._seats = {agent: Session(_Nobody(), 0.0) for agent in self.agents}
         self._wheels: dict[str, InputQueue] = {}
         for agent, seat in self._seats.items():
-            with game.stage.turn:
+            with game.api.turn:
                 player = game.roster.enter(seat, agent)
             if player is None:
                 raise ValueError(f"{len(self.agents)} agents: no room to spawn {agent} in {self.scene.name}")
             self._wheels[agent] = player.inputs
             player.inputs.wheel = NEUTRAL
         self._number, self._end = 0, game.world.tick + self._ticks
-        self._scores = {agent: self._reward(game.stage, self.entity(agent)) for agent in self.agents}
+        self._scores = {agent: self._reward(game.api, self.entity(agent)) for agent in self.agents}
         return self._look(), {agent: {"verdicts": []} for agent in self.agents}
 
     def command(self, agent: str, name: str, data: Any = None) -> int:
@@ -198,7 +198,7 @@ class Arena(ParallelEnv):  # type: ignore[misc]  # it has no type information
         assert player is not None
         self._number += 1
         tick = self.world.tick
-        self._game.orders.file(player, Command(self._number, tick + 1, float(tick), name, payload))
+        self._game.commands.file(player, Command(self._number, tick + 1, float(tick), name, payload))
         return self._number
 
     def step(
@@ -220,7 +220,7 @@ class Arena(ParallelEnv):  # type: ignore[misc]  # it has no type information
             self._wheels[agent].wheel = NEUTRAL if given is None else clamp(Input(*map(int, given)))
         for _ in range(self._repeat):
             self._game.tick(0.0, 0.0)
-        truncated, stage = self.world.tick >= self._end, self._game.stage
+        truncated, stage = self.world.tick >= self._end, self._game.api
         rewards, over, infos = {}, {}, {}
         for agent in self.agents:
             player = self._seats[agent].player
@@ -291,7 +291,7 @@ class _Nobody:
 
 
 def _attribute(name: str) -> Reward:
-    def value(stage: Stage, entity: int) -> float:
+    def value(stage: GameApi, entity: int) -> float:
         found = stage.get(entity, name, 0.0)
         return float(found) if isinstance(found, int | float) else 0.0
 

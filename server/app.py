@@ -22,7 +22,7 @@ from server.config.settings import Settings, parse
 from server.game import Game
 from server.journal.recorded_world import RecordedWorld
 from server.net.addresses import bracketed, reachable
-from server.net.admission import Door
+from server.net.admission import Admission
 from server.net.gateway import Gateway
 from server.observability.histogram import Histogram
 from server.observability.live import Live
@@ -138,7 +138,7 @@ class Server:
         self.store = store
         self.faults = game.faults
         live = Live(game, self.stats, self._durations).pages() if settings.page else {}
-        self.door = Door(
+        self.door = Admission(
             settings.limits,
             Pages(
                 {"/readyz": ready_page(self.unready)},

@@ -11,7 +11,7 @@ The server calls all hooks within a tick, before the step, in this order: `on_st
 raises, the exception is logged and counted, and the game goes on. A hook is a plain function and must not wait. Code
 that waits runs in a task or a thread of its own and hands its result back with `game.soon`.
 
-Hooks read and change the game through `self.game`, a `server.game_api.api.Stage`. Decisions about the world must use
+Hooks read and change the game through `self.game`, a `server.game_api.api.GameApi`. Decisions about the world must use
 nothing else: `self.game.random` gives the same numbers when a game is computed again, but a clock or the order of a set
 does not.
 """
@@ -29,7 +29,7 @@ from shared.checks import SceneError, shown
 from shared.scene import Scene
 
 if TYPE_CHECKING:
-    from server.game_api.api import Stage
+    from server.game_api.api import GameApi
 
 
 class RulesError(ValueError):
@@ -45,7 +45,7 @@ class Rules:
     scene = ""
     """The scene to play if the operator names none: a name or the path of a file. Empty: the server's default."""
 
-    game: "Stage"
+    game: "GameApi"
     """The game API of the running game. Not available in `__init__` and `prepare`."""
 
     if not TYPE_CHECKING:  # with a visible __getattr__ a type checker would accept every misspelt attribute

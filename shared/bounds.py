@@ -14,7 +14,7 @@ REPEATS_S = 0.3125
 """The latest input stands in for missing ones for at most this long, in seconds."""
 HISTORY_S = 2.0
 """The server keeps changes for this long, and a client follows motion that long without a snapshot, in seconds."""
-FATES_S = 8.0
+STATUSES_S = 8.0
 """The server keeps input statuses and margins that it could not send for this long, in seconds."""
 UNCONFIRMED_S = 4.0
 """A client predicts at most this far beyond the newest snapshot, in seconds."""
@@ -39,7 +39,7 @@ class Bounds(NamedTuple):
     ahead: int
     repeats: int
     history: int
-    fates: int
+    statuses: int
     unconfirmed: int
     update: int
     predicted: int
@@ -69,7 +69,7 @@ def bounds(rate: int) -> Bounds:
         ahead=in_ticks(AHEAD_S, rate, 8),
         repeats=in_ticks(REPEATS_S, rate, 2),
         history=in_ticks(HISTORY_S, rate, 8),
-        fates=in_ticks(FATES_S, rate, 64),
+        statuses=in_ticks(STATUSES_S, rate, 64),
         unconfirmed=in_ticks(UNCONFIRMED_S, rate, 16),
         update=in_ticks(UPDATE_S, rate, 8),
         predicted=in_ticks(PREDICTED_S, rate, 32),

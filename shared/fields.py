@@ -9,7 +9,7 @@ from collections.abc import Callable
 from typing import Any
 
 from shared.blocks import PACKED_MAX
-from shared.bounds import FATES_S, TICK_RATE_MAX, in_ticks
+from shared.bounds import STATUSES_S, TICK_RATE_MAX, in_ticks
 
 MESSAGE_MAX = 256 * 1024
 """Longest message of a server, in bytes."""
@@ -25,7 +25,7 @@ SCENE_FIELDS_MAX = 32
 """Limit of the scene's fields in `Hello.scene`."""
 REASON_MAX = 500
 """Longest reason in a `Bye`, in characters."""
-FATES_MAX = in_ticks(FATES_S, TICK_RATE_MAX, 1)
+STATUSES_MAX = in_ticks(STATUSES_S, TICK_RATE_MAX, 1)
 """Limit of the margins, and of the input statuses, in one snapshot."""
 DROPS_MAX = 4096
 """Limit of the dropped segments in one snapshot."""
@@ -83,7 +83,7 @@ rows = _bytes(INPUT_ROWS_MAX * INPUT_ROW_BYTES, INPUT_ROW_BYTES)
 """Check of packed inputs."""
 payload, chunk = _bytes(PAYLOAD_MAX), _bytes(PACKED_MAX)
 """Checks: payload, piece of a packed segment."""
-margins, fates = _bytes(FATES_MAX * 2, 2), _bytes(FATES_MAX)
+margins, statuses = _bytes(STATUSES_MAX * 2, 2), _bytes(STATUSES_MAX)
 """Checks: packed arrival margins and input statuses."""
 verdicts, drops = _bytes(VERDICTS_MAX * 5, 5), _bytes(DROPS_MAX * 12, 12)
 """Checks: packed verdicts and dropped segments."""

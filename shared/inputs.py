@@ -12,7 +12,7 @@ MOVE_MAX = 127
 """Length of a direction at full speed."""
 BUTTONS_MAX = 255
 """Greatest value of the buttons: 8 bits."""
-WISH_MAX = 1 << 31
+MOVE_PART_MAX = 1 << 31
 """Greatest part of a direction that is accepted; `clamp` and the kernel shorten the direction to length 127."""
 FAR = 1e9
 """Greatest part of a direction that `make_input` accepts, where full speed is 1."""
@@ -60,40 +60,40 @@ def _way(part: object, at: str) -> float:
     return number
 
 
-def checked_input(wish: object, at: str) -> Input:
+def checked_input(input_: object, at: str) -> Input:
     """Returns an input with Python's own whole numbers. A direction longer than 127 is allowed; `clamp` shortens it.
 
     Args:
-        wish: the value to check.
+        input_: the value to check.
         at: name of the argument, for the error.
 
     Raises:
-        SceneError: `wish` is not an input.
+        SceneError: `input_` is not an input.
     """
-    if not isinstance(wish, tuple) or len(wish) != len(Input._fields):
-        raise SceneError(f"{at} = {shown(wish)}: must be an `Input`")
-    x, y, buttons = wish
+    if not isinstance(input_, tuple) or len(input_) != len(Input._fields):
+        raise SceneError(f"{at} = {shown(input_)}: must be an `Input`")
+    x, y, buttons = input_
     return Input(
-        whole(x, f"{at}.move_x", -WISH_MAX, WISH_MAX),
-        whole(y, f"{at}.move_y", -WISH_MAX, WISH_MAX),
+        whole(x, f"{at}.move_x", -MOVE_PART_MAX, MOVE_PART_MAX),
+        whole(y, f"{at}.move_y", -MOVE_PART_MAX, MOVE_PART_MAX),
         int(buttons) if isinstance(buttons, bool) else whole(buttons, f"{at}.buttons", 0, BUTTONS_MAX),
     )
 
 
-def row(wish: Input) -> bytes:
+def row(input_: Input) -> bytes:
     """Returns an input packed for `Inputs.rows`: 3 bytes."""
-    x, y, buttons = wish
+    x, y, buttons = input_
     return bytes((x & 0xFF, y & 0xFF, buttons & 0xFF))
 
 
-def clamp(wish: Input) -> Input:
+def clamp(input_: Input) -> Input:
     """Returns the input with its direction shortened to length 127, in whole numbers. Both sides use this rule."""
-    x, y = wish.move_x, wish.move_y
+    x, y = input_.move_x, input_.move_y
     square = x * x + y * y
     if square <= MOVE_MAX * MOVE_MAX:
-        return wish
+        return input_
     # |part| = floor(127 |part| / length): the longest vector of whole numbers in this direction.
-    return wish._replace(move_x=_shortened(x, square), move_y=_shortened(y, square))
+    return input_._replace(move_x=_shortened(x, square), move_y=_shortened(y, square))
 
 
 def _shortened(part: int, square: int) -> int:

@@ -5,7 +5,7 @@ packed little-endian records in a MessagePack `bin`. docs/protocol.md explains e
 
     client -> server                                     server -> client
       1 Hello    version scene name token resume           17 Welcome   version tick entity scene resume
-      2 Inputs   first acked rows                          18 Snapshot  tick newest margins first fates verdicts
+      2 Inputs   first acked rows                          18 Snapshot  tick newest margins first statuses verdicts
       3 Ping     sent corrections                                       drops segment*
       4 Bye      code reason wait                          19 Terrain   x y z offset total chunk
       5 Command  number tick seen name payload             20 Pong      sent tick
@@ -16,7 +16,7 @@ packed little-endian records in a MessagePack `bin`. docs/protocol.md explains e
 
     Inputs.rows    n * [i8 move_x, i8 move_y, u8 buttons], for the ticks first, first + 1, ...
     Snapshot       the state at the end of `tick`. margins (n * i16, in 1/8192 s): arrival margins of the client's
-                   inputs for the ticks up to `newest`. fates (n * u8): input statuses of the ticks from `first` on.
+                   inputs for the ticks up to `newest`. statuses (n * u8): input statuses of the ticks from `first` on.
                    verdicts (n * [u32 number, u8 verdict]): results of commands. drops (n * [i32 x, y, z]): segments
                    that the client no longer sees. Then one field per segment in which anything changed
                    (`shared.snapshot`).
@@ -46,13 +46,13 @@ from shared import fields
 from shared.fields import (
     CLIENT_LIST_MAX,
     CLIENT_MESSAGE_MAX,
-    FATES_MAX,
     FIRST_MAX,
     INPUT_ROW_BYTES,
     INPUT_ROWS_MAX,
     LIST_MAX,
     MESSAGE_MAX,
     SEGMENTS_MAX,
+    STATUSES_MAX,
     TABLE_MAX,
     TICK_MAX,
     shown,
@@ -177,7 +177,7 @@ class Snapshot(NamedTuple):
     newest: int
     margins: bytes
     first: int
-    fates: bytes
+    statuses: bytes
     verdicts: bytes
     drops: bytes
     segments: tuple[list[Any], ...]
@@ -248,7 +248,7 @@ KINDS: dict[int, tuple[type[Any], tuple[fields.Check, ...]]] = {
     17: (Welcome, (fields.version, fields.tick, fields.entity, fields.table, fields.resume)),
     18: (
         Snapshot,
-        (fields.tick, fields.tick, fields.margins, fields.tick, fields.fates, fields.verdicts, fields.drops),
+        (fields.tick, fields.tick, fields.margins, fields.tick, fields.statuses, fields.verdicts, fields.drops),
     ),
     19: (Terrain, (fields.segment, fields.segment, fields.segment, fields.offset, fields.total, fields.chunk)),
     20: (Pong, (fields.number, fields.number)),
@@ -353,21 +353,21 @@ def decode_from_server(data: bytes) -> Message:
     """
     if data[:1] == _SNAPSHOT_HEAD and data[3:4] == _SNAPSHOT_KIND and len(data) <= MESSAGE_MAX:
         try:
-            _, tick, newest, margins, first, fates, verdicts, drops, *segments = msgpack.unpackb(
+            _, tick, newest, margins, first, statuses, verdicts, drops, *segments = msgpack.unpackb(
                 data, strict_map_key=True, max_array_len=LIST_MAX, max_map_len=TABLE_MAX
             )
         except Exception:
             return decode(data, SERVER_KINDS, MESSAGE_MAX)
         if (
             type(tick) is type(newest) is type(first) is int
-            and type(margins) is type(fates) is bytes
+            and type(margins) is type(statuses) is bytes
             and verdicts == drops == b""
             and -1 <= tick <= TICK_MAX
             and -1 <= newest <= TICK_MAX
             and -1 <= first <= TICK_MAX
             and len(margins) in (0, 2, 4)
-            and len(fates) <= FATES_MAX
+            and len(statuses) <= STATUSES_MAX
             and len(segments) <= SEGMENTS_MAX
         ):
-            return Snapshot(tick, newest, margins, first, fates, verdicts, drops, tuple(segments))
+            return Snapshot(tick, newest, margins, first, statuses, verdicts, drops, tuple(segments))
     return decode(data, SERVER_KINDS, MESSAGE_MAX)

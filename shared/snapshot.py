@@ -107,7 +107,7 @@ STATE_HIGH = np.array(
 """Greatest values of a state on the wire."""
 
 
-class SegmentPart(NamedTuple):
+class DecodedDelta(NamedTuple):
     """A decoded part of a snapshot.
 
     `entities` is the number of the part's states, `gone` has ids, and `edits` has `EDIT` records. The other fields are
@@ -143,7 +143,7 @@ def encode_rows(rows: Int64s, acted: Collection[int] = (), placed: Collection[in
     return packed.tobytes()
 
 
-class Share(NamedTuple):
+class SegmentDelta(NamedTuple):
     """The changes of one segment in a tick: its segment delta.
 
     `ids` are the entities that something happened to, `whole` those of them that are sent as rows, and `packed` has the
@@ -156,7 +156,7 @@ class Share(NamedTuple):
     packed: tuple[bytes, bytes, bytes]
 
 
-class News:
+class TickEncoder:
     """The tick encoder: packs the changes of all entities in a tick by segment. Its buffers are reused in every tick.
 
     Args:
@@ -168,7 +168,7 @@ class News:
         self._world, self._check_ticks = world, check_ticks
         self._allocate(len(world.arrays.changed))
 
-    def pack(self, acted: Collection[int], placed: Collection[int] = ()) -> tuple[list[Share], set[Cell]]:
+    def pack(self, acted: Collection[int], placed: Collection[int] = ()) -> tuple[list[SegmentDelta], set[Cell]]:
         """Packs the entities that the latest step changed.
 
         Args:
@@ -183,7 +183,7 @@ class News:
             self._allocate(len(w.changed))
         mine = self._ids, self._parts, self._due, self._packed
         n_parts = self._world.kernel.news(w.entities, w.changed, w.lengths, tick, self._check_ticks, *mine)
-        shares: list[Share] = []
+        shares: list[SegmentDelta] = []
         start = at = 0
         parts = self._parts[:n_parts].tolist()
         for i in range(0, n_parts, 8):
@@ -196,7 +196,7 @@ class News:
                     self._packed[tails + row * ROW_BYTES + FLAGS_AT] |= ACTED
             packed = self._packed[at:stop].tobytes()
             fields = packed[: heads - at], packed[heads - at : tails - at], packed[tails - at :]
-            shares.append(Share((x, y, z), ids, ids[whole - start :], fields))
+            shares.append(SegmentDelta((x, y, z), ids, ids[whole - start :], fields))
             start, at = end, stop
         due = self._due[1 : 1 + self._due[0]].tolist()
         return shares, {(due[i], due[i + 1], due[i + 2]) for i in range(0, len(due), 3)}
@@ -272,7 +272,7 @@ def checksum(world: World, segment: Cell) -> int:
 
 def decode_parts(
     segments: Sequence[Any], templates: int, kernel: Kernel | None = None
-) -> tuple[list[SegmentPart], Int64s, Int64s]:
+) -> tuple[list[DecodedDelta], Int64s, Int64s]:
     """Checks and unpacks `Snapshot.segments`.
 
     Args:
@@ -313,7 +313,7 @@ def _decode_turns(heads: bytes, tails: bytes, kernel: Kernel) -> Int64s:
     return turns
 
 
-def _decode_part(part: Any, corners: list[int], news: tuple[list[bytes], ...]) -> SegmentPart:
+def _decode_part(part: Any, corners: list[int], news: tuple[list[bytes], ...]) -> DecodedDelta:
     """Checks and returns one part.
 
     Appends its low corner (grid steps) and its number of rows to `corners`, and its heads, tails and rows to `news`.
@@ -346,7 +346,7 @@ def _decode_part(part: Any, corners: list[int], news: tuple[list[bytes], ...]) -
     said = _decode_attributes(attributes) if attributes != [] else []
     entities = len(rows) // ROW_BYTES
     corners += (x * SIDE, y * SIDE, z * SIDE, entities)
-    return SegmentPart((x, y, z), ago, entities, left, edited, check, said)
+    return DecodedDelta((x, y, z), ago, entities, left, edited, check, said)
 
 
 def _decode_attributes(attributes: Any) -> list[tuple[int, dict[str, Any]]]:

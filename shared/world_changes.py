@@ -13,7 +13,7 @@ import numpy as np
 from shared import blocks, layout
 from shared.checks import Cell, SceneError, shown
 from shared.free_places import OverlapError, box_at, free_place, overlapping
-from shared.inputs import BUTTONS_MAX, WISH_MAX, Input, checked_input
+from shared.inputs import BUTTONS_MAX, MOVE_PART_MAX, Input, checked_input
 from shared.layout import FALLING, FLAGS, ID, PREV, TEMPLATE, Int64s, X
 from shared.states import STATES
 from shared.units import BLOCK, SEGMENT
@@ -244,7 +244,7 @@ class UncheckedWorld(WorldState):
     def _told_of(self, inputs: Mapping[int, Input]) -> list[int]:
         """Returns inputs as the kernel takes them: row, move_x, move_y and buttons for each."""
         told: list[int] = []
-        rows, most = self._row_of, WISH_MAX
+        rows, most = self._row_of, MOVE_PART_MAX
         try:
             for entity, (x, y, buttons) in inputs.items():
                 if not (
@@ -256,8 +256,8 @@ class UncheckedWorld(WorldState):
                 told += (rows[entity], x, y, buttons)
         except (KeyError, TypeError, ValueError):  # one of them is wrong, or has numbers of numpy
             told = []
-            for entity, wish in inputs.items():
-                told += (self._row_at(entity), *checked_input(wish, f"inputs[{entity}]"))
+            for entity, input_ in inputs.items():
+                told += (self._row_at(entity), *checked_input(input_, f"inputs[{entity}]"))
         return told
 
     def _rebase(self, tick: int) -> None:

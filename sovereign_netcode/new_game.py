@@ -36,7 +36,7 @@ class {title}(Rules):
         self.game.share("points_to_win", 10)
 
     def on_join(self, player: Player) -> None:
-        # All clients that see an entity receive its attributes, as `Figure.attributes`. "name" is set already.
+        # All clients that see an entity receive its attributes, as `EntityView.attributes`. "name" is set already.
         self.game.set(player.entity, "points", 0)
 
     def on_contact(self, a: int, b: int) -> None:
@@ -90,7 +90,7 @@ def test_two_bots_play() -> None:
     ann, bob = match.join(bot(seek), Path(0.05)), match.join(bot(seek), Path(0.05))  # 50 ms each way
     match.run(20)
 
-    game = match.game.stage  # the object that the rules have as `self.game`
+    game = match.game.api  # the object that the rules have as `self.game`
     assert game.get(ann.core.entity, "points") == game.get(bob.core.entity, "points") > 0
     for player in (ann, bob):
         assert player.core.state == "playing"
@@ -102,7 +102,7 @@ def test_ten_points_make_fast_and_are_announced() -> None:
     match = Match(load_scene({title}.scene), seed=1, rules={title}())
     ann = match.join(bot(seek))
     match.run(2)
-    game, entity = match.game.stage, ann.core.entity
+    game, entity = match.game.api, ann.core.entity
     game.set(entity, "points", 9)
     x, y, z = game.position(entity)
     other = game.spawn("player", (x + 2, y, z))  # Ann hops to it
@@ -116,7 +116,7 @@ def test_a_boost_goes_up() -> None:
     match = Match(load_scene({title}.scene), seed=1, rules={title}())
     ann = match.join(bot(seek))
     match.run(3)
-    game, entity = match.game.stage, ann.core.entity
+    game, entity = match.game.api, ann.core.entity
     before = game.position(entity)[2]
     ann.core.command("boost")
     match.run(0.5)

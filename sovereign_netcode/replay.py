@@ -179,9 +179,9 @@ def rows(scene: Scene, entity: int) -> Iterator[tuple[str, ...]]:
         name = world.scene.templates[state[TEMPLATE]].name
         star = "*" if state[ID] in scene.inputs else " "
         jump = " jump" if state[BUTTONS] & JUMP else ""
-        wish = f"{star}{state[MOVE_X]} {state[MOVE_Y]}{jump}"
+        input_ = f"{star}{state[MOVE_X]} {state[MOVE_Y]}{jump}"
         touches = ", ".join(contacts(world, state[ID]))
-        yield tick, f"{state[ID]} {name}", place, speed, falls, wish, touches
+        yield tick, f"{state[ID]} {name}", place, speed, falls, input_, touches
         tick = ""
 
 

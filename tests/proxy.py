@@ -1,7 +1,7 @@
 """A TCP proxy on loopback that is as bad as a path of `client_sdk.netsim.links`, in real time.
 
 Theory of operation. Each direction of each connection is a line: what it reads is a packet, which takes its time on
-the line (`rate`), then flies (`delay`, jitter, the weather), in order. While the line is busy nothing is read: what
+the line (`rate`), then flies (`delay`, jitter, the link_events), in order. While the line is busy nothing is read: what
 waits for the line waits in the kernels' buffers. This side of them is made as small as it gets, so that all but
 `HIDDEN_BYTES` stands at the sender, where SIOCOUTQ counts it, as on a real path; only that what is read counts as
 acknowledged at once, and not a round trip later. A lost packet, which no proxy can lose, comes late instead: after
@@ -15,7 +15,7 @@ import struct
 import time
 from types import TracebackType
 
-from client_sdk.netsim.links import HEADER_BYTES, TIMER_S, Path, Weather
+from client_sdk.netsim.links import HEADER_BYTES, TIMER_S, Link, LinkEvents
 
 PACKET_BYTES = 536
 """The least that every path carries."""
@@ -26,7 +26,7 @@ HIDDEN_BYTES = 2 * 1152
 FLIGHT_PACKETS_MAX = 256
 """More are not read, however long the delay."""
 STEP_S = 0.005
-"""The weather is looked at so often while it lets nothing through."""
+"""The link_events is looked at so often while it lets nothing through."""
 
 
 class Proxy:
@@ -38,7 +38,7 @@ class Proxy:
         seed: everything random comes from it.
     """
 
-    def __init__(self, target: tuple[str, int], path: Path, seed: int = 1) -> None:
+    def __init__(self, target: tuple[str, int], path: Link, seed: int = 1) -> None:
         self.path = path
         self._target = target
         self._rng = random.Random(seed)
@@ -97,7 +97,7 @@ class Proxy:
 
     async def _join(self, client: socket.socket) -> None:
         """One connection, until both directions have ended or one has broken."""
-        weather = Weather(self.path, self._rng.randrange(1 << 30))
+        link_events = LinkEvents(self.path, self._rng.randrange(1 << 30))
         with client, _small() as server:
             client.setblocking(False)
             in_order = False
@@ -106,7 +106,7 @@ class Proxy:
                 async with asyncio.TaskGroup() as group:
                     for source, sink in ((client, server), (server, client)):
                         source.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-                        line = _Line(self, weather, self._rng.randrange(1 << 30), source, sink)
+                        line = _Line(self, link_events, self._rng.randrange(1 << 30), source, sink)
                         group.create_task(line.read())
                         group.create_task(line.write())
                 in_order = True
@@ -124,8 +124,10 @@ class Proxy:
 class _Line:
     """One direction of one connection."""
 
-    def __init__(self, proxy: Proxy, weather: Weather, seed: int, source: socket.socket, sink: socket.socket) -> None:
-        self._proxy, self._weather, self._path = proxy, weather, weather.path
+    def __init__(
+        self, proxy: Proxy, link_events: LinkEvents, seed: int, source: socket.socket, sink: socket.socket
+    ) -> None:
+        self._proxy, self._link_events, self._path = proxy, link_events, link_events.path
         self._source, self._sink = source, sink
         self._rng = random.Random(seed)
         self._flight: asyncio.Queue[tuple[float, bytes]] = asyncio.Queue(FLIGHT_PACKETS_MAX)
@@ -146,7 +148,7 @@ class _Line:
     async def _send(self, packet: bytes) -> None:
         now = self._proxy.now
         bits = 8 * (len(packet) + HEADER_BYTES)
-        self._free = max(now, self._free) + bits / self._weather.rate(now)
+        self._free = max(now, self._free) + bits / self._link_events.rate(now)
         self._last = max(self._last, self._arrival(self._free))
         await self._flight.put((self._last, packet))
 
@@ -165,13 +167,13 @@ class _Line:
     def _arrival(self, gone: float) -> float:
         """When a packet that left the line at `gone` has flown, as often as it takes."""
         path, sent = self._path, gone
-        while self._weather.out(sent):
+        while self._link_events.out(sent):
             sent += STEP_S
         lost = sent > gone
         while lost or self._rng.random() < path.loss:
             sent += 1.25 * path.rtt_s + TIMER_S
             lost = False
-        return sent + path.delay_s + self._rng.random() * path.jitter_s + self._weather.extra(gone)
+        return sent + path.delay_s + self._rng.random() * path.jitter_s + self._link_events.extra(gone)
 
 
 def _small() -> socket.socket:

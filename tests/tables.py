@@ -43,7 +43,7 @@ class FakeLink:
     @waiting.setter
     def waiting(self, n: int) -> None:
         self._waiting = n
-        self.session.stream.pacing.look()
+        self.session.stream.flow.look()
 
     def outstanding(self) -> int | None:
         return self._waiting

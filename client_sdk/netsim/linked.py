@@ -14,11 +14,11 @@ the lab.
 import math
 
 from client_sdk.core import Core
-from client_sdk.netsim.links import Agenda, Path, Weather, Wire, named
+from client_sdk.netsim.links import EventQueue, Link, LinkEvents, TcpStream, named
 
 LOST = b""
 """Message that stands for the loss of the connection; a real message is never empty."""
-CLEAR = Path()
+CLEAR = Link()
 """Link without delay, loss or limits."""
 SLOW_READ_BYTES = 1152
 """Number of bytes that a transport reads at once while a slow link is set."""
@@ -37,13 +37,13 @@ class LinkedPort:
     def __init__(self, core: Core, seed: int = 1) -> None:
         self.core = core
         self._seed = seed
-        self._link: Path | None = None
+        self._link: Link | None = None
         self._line: _Line | None = None
         self._now = 0.0
         self._opened = core.connected
 
     @property
-    def link(self) -> Path | None:
+    def link(self) -> Link | None:
         """The simulated link on top of the real connection; None: no link. May also be set to the name of a preset.
 
         Raises:
@@ -52,7 +52,7 @@ class LinkedPort:
         return self._link
 
     @link.setter
-    def link(self, link: str | Path | None) -> None:
+    def link(self, link: str | Link | None) -> None:
         self._link = named(link)
         if self._line is not None:  # messages on the old link arrive before those on the new one
             self._line.follow(self._link or CLEAR, self._seed)
@@ -156,11 +156,11 @@ class LinkedPort:
 class _Line:
     """Both directions of a link, with their own time, which is 0 when the line is created."""
 
-    def __init__(self, path: Path, seed: int, now: float, port: LinkedPort) -> None:
-        self.agenda = Agenda(0.0)
-        self.weather = Weather(path, seed)
-        self.up = Wire(self.agenda, self.weather, seed + 1, port._gone)
-        self.down = Wire(self.agenda, self.weather, seed + 2, port._arrived)
+    def __init__(self, path: Link, seed: int, now: float, port: LinkedPort) -> None:
+        self.event_queue = EventQueue(0.0)
+        self.link_events = LinkEvents(path, seed)
+        self.up = TcpStream(self.event_queue, self.link_events, seed + 1, port._gone)
+        self.down = TcpStream(self.event_queue, self.link_events, seed + 2, port._arrived)
         self.ready: list[bytes] = []
         """Messages of the core that have come through and can be sent."""
         self.losses: list[tuple[int, str]] = []
@@ -170,14 +170,14 @@ class _Line:
     @property
     def due(self) -> float:
         """The local time at which the line has to be advanced, in seconds."""
-        return self._began + self.agenda.due
+        return self._began + self.event_queue.due
 
     def advance(self, now: float) -> None:
         """Delivers the messages that have arrived by `now`."""
-        self.agenda.advance(now - self._began)
+        self.event_queue.advance(now - self._began)
 
-    def follow(self, path: Path, seed: int) -> None:
+    def follow(self, path: Link, seed: int) -> None:
         """Changes the line to another link; messages that are under way stay in front."""
-        self.weather = Weather(path, seed)
-        self.up.follow(self.weather)
-        self.down.follow(self.weather)
+        self.link_events = LinkEvents(path, seed)
+        self.up.follow(self.link_events)
+        self.down.follow(self.link_events)

@@ -9,8 +9,8 @@ round trip and 200 ms, doubled each time. The packet is sent again, may be lost 
 behind it waits. Not modelled, because a game's thin stream hardly ever meets them: the congestion window, delayed
 acknowledgements, tail loss probes.
 
-`Weather` has the link events that concern both directions of a connection at the same time. They are drawn from a seed
-as time goes on.
+`LinkEvents` has the link events that concern both directions of a connection at the same time. They are drawn from a
+seed as time goes on.
 """
 
 import heapq
@@ -47,7 +47,7 @@ class Scheduler(Protocol):
 
 
 @dataclass(frozen=True)
-class Path:
+class Link:
     """The properties of a simulated link, equal for both directions. Times in seconds.
 
     Args:
@@ -85,9 +85,9 @@ class Path:
         return 2 * self.delay_s + self.jitter_s
 
 
-def path(rtt_ms: float, jitter_ms: float, loss: float = 0.0) -> Path:
+def path(rtt_ms: float, jitter_ms: float, loss: float = 0.0) -> Link:
     """Returns a link whose round trip is `rtt_ms` +- `jitter_ms` (milliseconds)."""
-    return Path((rtt_ms - jitter_ms) / 2000, jitter_ms / 1000, loss)
+    return Link((rtt_ms - jitter_ms) / 2000, jitter_ms / 1000, loss)
 
 
 PRESETS = {
@@ -103,8 +103,8 @@ PRESETS = {
 """Simulated links by name."""
 
 
-def named(link: str | Path | None) -> Path | None:
-    """Returns the preset of that name. Returns a `Path`, or None (no link), unchanged.
+def named(link: str | Link | None) -> Link | None:
+    """Returns the preset of that name. Returns a `Link`, or None (no link), unchanged.
 
     Raises:
         ValueError: no preset has that name.
@@ -113,12 +113,12 @@ def named(link: str | Path | None) -> Path | None:
         if link not in PRESETS:
             raise ValueError(f"link = {shown(link)}: must be one of {', '.join(PRESETS)}, a Path, or None")
         return PRESETS[link]
-    if link is not None and not isinstance(link, Path):
+    if link is not None and not isinstance(link, Link):
         raise ValueError(f"link = {shown(link)}: must be one of {', '.join(PRESETS)}, a Path, or None")
     return link
 
 
-class Agenda:
+class EventQueue:
     """An event queue: a scheduler whose calls are made, in order of time, when `advance` reaches their times."""
 
     def __init__(self, now: float) -> None:
@@ -143,7 +143,7 @@ class Agenda:
         self.now = max(self.now, now)
 
 
-class Weather:
+class LinkEvents:
     """The link events of a path, which concern both directions: spikes, dips and outages.
 
     Args:
@@ -151,7 +151,7 @@ class Weather:
         seed: all chance of the link events comes from it.
     """
 
-    def __init__(self, path: Path, seed: int) -> None:
+    def __init__(self, path: Link, seed: int) -> None:
         self.path = path
         self.spikes: list[tuple[float, float, float]] = []
         """Spikes drawn until now: begin and end (seconds), extra delay (seconds)."""
@@ -207,18 +207,18 @@ class _Loss:
         self.timeout_s = timeout_s
 
 
-class Wire:
+class TcpStream:
     """One direction of a simulated TCP connection.
 
     Args:
         time: the simulated time, which calls the deliveries.
-        weather: the link and its events; the other direction uses the same object.
+        link_events: the link and its events; the other direction uses the same object.
         seed: all chance of this direction comes from it.
         deliver: called with each message that arrives, in order.
     """
 
-    def __init__(self, time: Scheduler, weather: Weather, seed: int, deliver: Callable[[bytes], None]) -> None:
-        self._time, self._weather, self._path, self._deliver = time, weather, weather.path, deliver
+    def __init__(self, time: Scheduler, link_events: LinkEvents, seed: int, deliver: Callable[[bytes], None]) -> None:
+        self._time, self._link_events, self._path, self._deliver = time, link_events, link_events.path, deliver
         self._random = random.Random(seed).random
         self._flying: deque[_Packet] = deque()  # on the way, in order of transmission and of arrival
         self._missing: list[_Loss] = []  # lost, and not yet sent again
@@ -262,9 +262,9 @@ class Wire:
         packets = [*self._flying, *(loss.packet for loss in self._missing), *self._early.values()]
         return [message for _, _, message in sorted(packets) if message is not None]
 
-    def follow(self, weather: Weather) -> None:
+    def follow(self, link_events: LinkEvents) -> None:
         """Changes to another link; packets that are under way stay in front."""
-        self._weather, self._path = weather, weather.path
+        self._link_events, self._path = link_events, link_events.path
 
     def outstanding(self) -> int:
         """Returns the bytes that were sent and are not acknowledged yet."""
@@ -274,18 +274,18 @@ class Wire:
 
     def _transmit(self, packet: _Packet, lost: _Loss | None = None) -> None:
         """Transmits a packet, for the first time or again after the loss `lost`."""
-        path, weather, now, free = self._path, self._weather, self._time.now, self._free
+        path, link_events, now, free = self._path, self._link_events, self._time.now, self._free
         size = packet[1] + HEADER_BYTES
         self.sent_bytes += size
-        rate = path.rate if path.dip is None else weather.rate(now)
+        rate = path.rate if path.dip is None else link_events.rate(now)
         gone = self._free = max(now, free) + 8 * size / rate
-        if self._random() < path.loss or (path.outage is not None and weather.out(gone)):
+        if self._random() < path.loss or (path.outage is not None and link_events.out(gone)):
             timeout_s = 2 * lost.timeout_s if lost else TIMEOUT_S + path.rtt_s
             loss = _Loss(packet, now, timeout_s)
             self._missing.append(loss)
             self._time.at(now + (gone - now + timeout_s), lambda: self._timeout(loss))
             return
-        extra = 0.0 if path.spike is None else weather.extra(gone)
+        extra = 0.0 if path.spike is None else link_events.extra(gone)
         comes = gone + path.delay_s + self._random() * path.jitter_s + extra
         if comes < self._last:
             comes = self._last

@@ -15,7 +15,7 @@ from shared.layout import FALLING, FLAGS, ID, Int64s, X
 from shared.messages import ProtocolError, Snapshot
 from shared.ring import Ring
 from shared.scene import Scene
-from shared.snapshot import ACTED, KEYFRAME, PLACED, SegmentPart, checksum, decode_parts
+from shared.snapshot import ACTED, KEYFRAME, PLACED, DecodedDelta, checksum, decode_parts
 from shared.units import SEGMENT, TO_SEGMENT
 from shared.world import World
 
@@ -123,7 +123,7 @@ class Confirmed:
         self.placed.put(tick, frozenset(ids[flags & PLACED != 0].tolist()))
         flags &= FALLING
 
-    def _edit(self, part: SegmentPart) -> None:
+    def _edit(self, part: DecodedDelta) -> None:
         """Writes the changed blocks of a segment."""
         changes = part.edits["block"].tolist(), part.edits["kind"].tolist()
         if part.segment in self.world.blocks:
@@ -144,7 +144,7 @@ class Confirmed:
         ways = np.abs(blocks - np.array(self.world.position(self.entity)))
         return bool((ways.max(axis=1) < NEAR_BLOCKS).any())
 
-    def _take_away(self, parts: list[SegmentPart], drops: set[Cell], here: set[int]) -> None:
+    def _take_away(self, parts: list[DecodedDelta], drops: set[Cell], here: set[int]) -> None:
         """Removes entities that have left the client's view.
 
         Args:

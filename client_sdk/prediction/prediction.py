@@ -110,11 +110,11 @@ class Prediction:
 
         For a tick without an input, the row is the substitute that the server would use.
         """
-        return b"".join(row(self._wish(at)) for at in range(tick + 1, to + 1))
+        return b"".join(row(self._input(at)) for at in range(tick + 1, to + 1))
 
-    def file(self, tick: int, wish: Input) -> None:
+    def file(self, tick: int, input_: Input) -> None:
         """Files the own input for a future tick."""
-        self._inputs.put(tick, wish)
+        self._inputs.put(tick, input_)
 
     def step(self) -> None:
         """Predicts one tick."""
@@ -124,15 +124,15 @@ class Prediction:
             # An earlier edit without a verdict is not in the confirmed world: the first tick of a replay applies it.
             if due == tick or (due < tick and tick == self.confirmed.tick + 1):
                 edits.apply(world, self.entity, edit)
-        world.step({self.entity: self._wish(tick)} if self.entity in world else None)
+        world.step({self.entity: self._input(tick)} if self.entity in world else None)
         self._states.put(tick, world.states())
 
-    def _wish(self, tick: int) -> Input:
+    def _input(self, tick: int) -> Input:
         """Returns the own input of a tick, or the substitute that the server uses if none was sent."""
         missing = 0
         while self._bounds.stands_in(missing):
-            if (wish := self._inputs.get(tick - missing)) is not None:
-                return wish
+            if (input_ := self._inputs.get(tick - missing)) is not None:
+                return input_
             missing += 1
         return NEUTRAL
 
@@ -238,7 +238,7 @@ class Prediction:
         mine = states[states[:, ID] == entity]
         return tuple(mine[0].tolist()) if len(mine) else None
 
-    def rehearse(self) -> None:
+    def sync_test(self) -> None:
         """Runs the sync test: replays everything since the confirmed world. Changes nothing unless state is hidden."""
         self._replay(self.predicted.tick)
 

@@ -55,10 +55,10 @@ class PollingTransport:
     def poll(self, now: float) -> None:
         """Reads what has arrived, writes what waits, and reconnects if it is time to; never blocks."""
         core = self._connection.core
-        if self._socket is None and core.state == "away":
+        if self._socket is None and core.state == "reconnecting":
             if self._dialing is not None:
                 self._dial_on(self._dialing, now)
-            elif now >= core.comeback.retry_at:
+            elif now >= core.reconnect.retry_at:
                 self._dial(now)
         if self._socket is None:
             return
@@ -94,7 +94,7 @@ class PollingTransport:
     def _dial(self, now: float) -> None:
         """Begins to reconnect, to the IP address of the first connection."""
         self._connection = Connection(self._connection.url, self._connection.core)
-        self._connection.core.comeback.trying()
+        self._connection.core.reconnect.trying()
         self._dial_until = now + self._timeout
         try:
             self._dialing = socket.socket(self._family, socket.SOCK_STREAM)

@@ -35,8 +35,8 @@ from server.net.websocket import Connection
 from server.observability.errors import Faults
 from server.observability.histogram import Histogram
 from server.replication.change_log import ChangeLog
-from server.replication.client_stream import Link
-from server.replication.sender import Delivery
+from server.replication.client_stream import Transport
+from server.replication.sender import Sender
 from server.rewind import Rewind
 from server.rules import Rules
 from server.runtime import event_loop, log
@@ -60,12 +60,12 @@ class Echo:
         self.world = World(self.scene)  # for the server's log, which names its kernel
         self.size = size
         self.faults = Faults()
-        self.links: dict[int, tuple[Link, bool]] = {}
+        self.links: dict[int, tuple[Transport, bool]] = {}
         self.ticks = 0
         self._made = 0
         self._deadline = 0.0
 
-    def open(self, link: Link, now: float) -> int:
+    def open(self, link: Transport, now: float) -> int:
         self._made += 1
         self.links[self._made] = (link, False)
         return self._made
@@ -111,7 +111,7 @@ DOORS: list[tuple[FunctionType, str]] = [
         (ChangeLog.record, "encode"),
         (ChangeLog.encode, "encode"),
         (Rewind.record, "rewind"),
-        (Delivery.serve, "choose"),
+        (Sender.serve, "choose"),
         (Session.send, "send"),
         (Connection.outstanding, "send"),
         (Game.tick, "rest of the tick"),
@@ -235,7 +235,7 @@ def in_view(game: Game) -> float:
     """Returns the average number of entities in the segments that a client sees."""
     cells = game.world.states()[:, X : X + 3] >> TO_SEGMENT
     inhabitants = collections.Counter(map(tuple, cells.tolist()))
-    views = [sum(inhabitants[segment] for segment in session.stream.sight.sees) for session in game.sessions]
+    views = [sum(inhabitants[segment] for segment in session.stream.view.sees) for session in game.sessions]
     return sum(views) / max(len(views), 1)
 
 

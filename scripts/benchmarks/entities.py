@@ -56,9 +56,7 @@ class Large:
     def _turn(self, walkers: list[int]) -> None:
         rng = self.rng
         for entity in walkers:
-            self.game.stage.steered[entity] = make_input(
-                rng.uniform(-1, 1), rng.uniform(-1, 1), jump=rng.random() < 0.1
-            )
+            self.game.api.steered[entity] = make_input(rng.uniform(-1, 1), rng.uniform(-1, 1), jump=rng.random() < 0.1)
 
     def join(self, clients: int) -> None:
         for number in range(clients):

@@ -171,7 +171,7 @@ def calls(rounds: int) -> Samples:
     world.load_terrain(above)
     one = crowd(nine, 1, compiled=True)
     twin = world.copy()
-    wish, wish_one = wishes(world, 1), wishes(one, 1)
+    input_, wish_one = wishes(world, 1), wishes(one, 1)
 
     def repeat(times: int, call: Callable[[], object]) -> Callable[[], float]:
         def task() -> float:
@@ -182,14 +182,14 @@ def calls(rounds: int) -> Samples:
         return task
 
     def restore() -> None:
-        world.step(wish)
+        world.step(input_)
         twin.restore(world)
 
     plain.step(wishes(plain, 1))
     work = {
         "step, 1 player and its input": repeat(100, lambda: one.step(wish_one)),
         "step, 50 players": repeat(100, world.step),
-        "step, 50 players and their inputs": repeat(100, lambda: world.step(wish)),
+        "step, 50 players and their inputs": repeat(100, lambda: world.step(input_)),
         "the same, and restore of a copy": repeat(100, restore),
         "copy, 50 players in 27 segments": repeat(5, world.copy),
         "one turn without Numba": lambda: _run(plain, 1),

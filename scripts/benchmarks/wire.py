@@ -84,7 +84,7 @@ class Scenery:
         if self.session.entity and not self.moved:
             self._populate()
         for entity, policy in self.moved.items():
-            game.stage.steered[entity] = self._homewards(entity, policy(game.world, entity))
+            game.api.steered[entity] = self._homewards(entity, policy(game.world, entity))
         began = time.process_time()
         game.tick(now, now)
         ended = time.process_time()
@@ -99,7 +99,7 @@ class Scenery:
 
     def seen(self, rows: Int64s) -> Int64s:
         """Returns the rows that lie in the segments which the client sees."""
-        sees: set[Cell] = self.session.stream.sight.sees
+        sees: set[Cell] = self.session.stream.view.sees
         cells = (rows[:, X : X + 3] >> TO_SEGMENT).tolist()
         seen: Int64s = rows[np.array([tuple(cell) in sees for cell in cells], bool)]
         return seen
@@ -115,13 +115,13 @@ class Scenery:
             except OverlapError:
                 continue
 
-    def _homewards(self, entity: int, wish: Input) -> Input:
+    def _homewards(self, entity: int, input_: Input) -> Input:
         """Returns the input, with each axis reversed along which it leads out of the view."""
         x, y = (
             -part if abs(at - middle) > REACH and (at - middle) * part > 0 else part
-            for part, at, middle in zip(wish[:2], self.game.world.position(entity), self.centre, strict=False)
+            for part, at, middle in zip(input_[:2], self.game.world.position(entity), self.centre, strict=False)
         )
-        return Input(x, y, wish.buttons)
+        return Input(x, y, input_.buttons)
 
 
 def run(motion: str, entities: int, ticks: int, seed: int, *, compiled: bool | None = None) -> dict[str, Any]:

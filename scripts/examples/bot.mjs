@@ -86,7 +86,7 @@ function turn(entity, events, tail) { // returns the entity after a tick with th
   return { tick: tick + 1, template, falls, at: to, v: v.map((speed, k) => events & STOP[k] ? 0 : speed), move };
 }
 
-function snapshot(tick, newest, early, first, fates, verdicts, drops, ...parts) {
+function snapshot(tick, newest, early, first, statuses, verdicts, drops, ...parts) {
   const told = new Map(), left = new Set(); // told: entities with a row; left: "segment", or "segment:entity"
   for (const drop of records(12, drops)) left.add(ints(drop, 0, 4, 8).join());
   for (const [x, y, z, ago, heads, tails, rows, gone] of parts) {
@@ -111,7 +111,7 @@ function snapshot(tick, newest, early, first, fates, verdicts, drops, ...parts) 
   for (const [, , , , , , , , , , attributes = []] of parts)
     for (let i = 0; i < attributes.length; i += 2) said.set(attributes[i], attributes[i + 1]);
   acked = tick;
-  used += fates.filter(fate => fate === USED).length;
+  used += statuses.filter(fate => fate === USED).length;
   margins.push(...[...records(2, early)].map(margin => margin.readInt16LE()).filter(margin => margin !== REFUSED));
   margins = margins.slice(-2 * scene.tick_rate);
   if (margins.length) lead += Math.max(-0.02, Math.min(0.5 - Math.min(...margins) * scene.tick_rate / 8192, 0.1)); // half a tick to spare

@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterable
 from itertools import count
 from typing import Any
 
-from client_sdk.netsim.links import PRESETS, Weather, Wire
+from client_sdk.netsim.links import PRESETS, LinkEvents, TcpStream
 from client_sdk.timing.lead import LeadController, PricedLead
 from client_sdk.timing.server_clock import ServerClock
 from client_sdk.timing.timeline import Timeline
@@ -45,7 +45,7 @@ class Trial:
         rng = random.Random(seed)
         self.now = 0.0
         self.lead = lead
-        self.weather = Weather(PRESETS[preset], rng.getrandbits(32))
+        self.link_events = LinkEvents(PRESETS[preset], rng.getrandbits(32))
         self.leads: dict[int, float] = {}
         """Lead of each tick's input over the server's true time when it was made, in ticks."""
         self.margins: dict[int, float] = {}
@@ -57,8 +57,8 @@ class Trial:
         self._clock_start = rng.uniform(0, 1e5)
         self._queue: list[tuple[float, int, Callable[[], None]]] = []
         self._number = count()
-        self._up = Wire(self, self.weather, rng.getrandbits(32), self._at_server)
-        self._down = Wire(self, self.weather, rng.getrandbits(32), self._at_client)
+        self._up = TcpStream(self, self.link_events, rng.getrandbits(32), self._at_server)
+        self._down = TcpStream(self, self.link_events, rng.getrandbits(32), self._at_client)
         self._going_up: deque[tuple[int, float]] = deque()  # first tick or -1, sent
         self._going_down: deque[tuple[int, Any]] = deque()  # tick or -1, margins or the ping's answer
         self._told: list[tuple[int, float]] = []
@@ -158,10 +158,12 @@ class Trial:
 
     def fair(self, tick: int) -> bool:
         """Returns whether a tick's input was made outside of spikes and the start of a dip."""
-        made, weather = self.made[tick], self.weather
-        if 0 <= weather.dipped(made) < AFTER_DIP_S:
+        made, link_events = self.made[tick], self.link_events
+        if 0 <= link_events.dipped(made) < AFTER_DIP_S:
             return False
-        return not any(begin - 2 * weather.path.rtt_s <= made < end + AFTER_SPIKE_S for begin, end, _ in weather.spikes)
+        return not any(
+            begin - 2 * link_events.path.rtt_s <= made < end + AFTER_SPIKE_S for begin, end, _ in link_events.spikes
+        )
 
     def figures(self, ticks: Iterable[int]) -> tuple[float, float, float, float]:
         """Returns the late share of these inputs, and in ticks the mean and p99 of added latency, and the oracle's."""
@@ -174,7 +176,7 @@ class Trial:
             return 0.0, 0.0, 0.0, 0.0
         leads.sort()
         needs.sort()
-        half = self.weather.path.rtt_s / 2 * RATE
+        half = self.link_events.path.rtt_s / 2 * RATE
         oracle = needs[max(len(needs) - 1 - late, 0)]
         mean, p99 = sum(leads) / len(leads), leads[int(0.99 * len(leads))]
         return late / len(leads), mean - half, p99 - half, oracle - half

@@ -162,7 +162,7 @@ class FuzzedGame:
         for player in game.players.values():
             assert len(player.commands) <= limits.commands_waiting_max
             assert len(player.inputs._waiting) <= bound.ahead
-            assert max(len(player.inputs.margins), len(player.inputs.fates)) <= bound.fates
+            assert max(len(player.inputs.margins), len(player.inputs.statuses)) <= bound.statuses
             assert len(player.verdicts) <= 32 * limits.messages_per_tick * (1 + limits.stalled_s)
             assert len(player.tokens) <= 2
             assert len(player.outbox) <= limits.outbox_max

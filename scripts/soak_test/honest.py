@@ -186,7 +186,7 @@ class Honest:
             self.got += 1
             self.due += tick - self._tick
         self._tick = tick
-        self.used += snapshot.fates.count(messages.USED)
+        self.used += snapshot.statuses.count(messages.USED)
         self.progress.see(asyncio.get_running_loop().time(), self.used)
         if self._copy is not None and (wrong := self._copy.apply(snapshot)):
             self.unexplained.append(wrong)

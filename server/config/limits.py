@@ -5,7 +5,7 @@ A client that exceeds a limit is refused or closed with a code and a reason; its
 
 from dataclasses import dataclass, fields
 
-from server.config.options import Kind, setting
+from server.config.options import Option, setting
 from shared.bounds import in_ticks
 from shared.checks import boolean, duration, whole
 from shared.fields import CLIENT_MESSAGE_MAX, INPUT_ROWS_MAX, NAME_MAX
@@ -31,44 +31,48 @@ def catch_up_ticks(rate: int) -> int:
 class Limits:
     """The limits per server and per client.
 
-    Fields with a `Kind` are settings: an operator sets them by flag, environment variable, or in the section `limits`
-    of the file. `Limits(...)` accepts any non-negative value; the range of a `Kind` holds for settings only.
+    Fields with a `Option` are settings: an operator sets them by flag, environment variable, or in the section `limits`
+    of the file. `Limits(...)` accepts any non-negative value; the range of a `Option` holds for settings only.
     """
 
     connections_max: int = setting(
         4096,
-        Kind(int, "maximum connections, with or without a player; beyond it only pages are served", "N", 1, 1_000_000),
+        Option(
+            int, "maximum connections, with or without a player; beyond it only pages are served", "N", 1, 1_000_000
+        ),
     )
     connections_per_address: int = setting(
-        64, Kind(int, "maximum connections from one address (IPv6: from one /64 network)", "N", 1, 1_000_000)
+        64, Option(int, "maximum connections from one address (IPv6: from one /64 network)", "N", 1, 1_000_000)
     )
     joins_per_s: float = setting(
-        200.0, Kind(float, "maximum WebSockets opened per second; a burst may be those of 2 s", "N", 0.1, 100_000)
+        200.0, Option(float, "maximum WebSockets opened per second; a burst may be those of 2 s", "N", 0.1, 100_000)
     )
     loopback_exempt: bool = setting(
-        True, Kind(bool, "do not limit connections from this machine per address and per second")
+        True, Option(bool, "do not limit connections from this machine per address and per second")
     )
-    clients_max: int = setting(2000, Kind(int, "maximum players at once", "N", 1, 1_000_000))
+    clients_max: int = setting(2000, Option(int, "maximum players at once", "N", 1, 1_000_000))
     handshake_s: float = setting(
-        5.0, Kind(float, "seconds in which a new connection must send its HTTP request", "S", 0.1, HOUR_S)
+        5.0, Option(float, "seconds in which a new connection must send its HTTP request", "S", 0.1, HOUR_S)
     )
-    hello_s: float = setting(5.0, Kind(float, "seconds in which a new WebSocket must send its hello", "S", 0.1, HOUR_S))
+    hello_s: float = setting(
+        5.0, Option(float, "seconds in which a new WebSocket must send its hello", "S", 0.1, HOUR_S)
+    )
     silence_s: float = setting(
-        15.0, Kind(float, "seconds without a message after which a player's connection is closed", "S", 0.1, HOUR_S)
+        15.0, Option(float, "seconds without a message after which a player's connection is closed", "S", 0.1, HOUR_S)
     )
     stalled_s: float = setting(
-        10.0, Kind(float, "seconds without room for a snapshot after which a connection is closed", "S", 0.1, HOUR_S)
+        10.0, Option(float, "seconds without room for a snapshot after which a connection is closed", "S", 0.1, HOUR_S)
     )
     resume_s: float = setting(
-        15.0, Kind(float, "seconds in which a player with a lost connection can reconnect", "S", 0.0, HOUR_S)
+        15.0, Option(float, "seconds in which a player with a lost connection can reconnect", "S", 0.0, HOUR_S)
     )
-    rewind_s: float = setting(0.5, Kind(float, "seconds that lag compensation can look back", "S", 0.05, 1.0))
+    rewind_s: float = setting(0.5, Option(float, "seconds that lag compensation can look back", "S", 0.05, 1.0))
     message_bytes_max: int = setting(
-        CLIENT_MESSAGE_MAX, Kind(int, "maximum bytes of a client's message", "BYTES", 512, CLIENT_MESSAGE_MAX)
+        CLIENT_MESSAGE_MAX, Option(int, "maximum bytes of a client's message", "BYTES", 512, CLIENT_MESSAGE_MAX)
     )
     messages_per_tick: float = setting(
         8.0,
-        Kind(
+        Option(
             float,
             "maximum messages of a client per tick; a burst may be those of 1 s (at least 32 ticks)",
             "N",
@@ -77,15 +81,15 @@ class Limits:
         ),
     )
     input_rows_max: int = setting(
-        INPUT_ROWS_MAX, Kind(int, "maximum inputs in one message; this SDK sends up to 16", "N", 16, INPUT_ROWS_MAX)
+        INPUT_ROWS_MAX, Option(int, "maximum inputs in one message; this SDK sends up to 16", "N", 16, INPUT_ROWS_MAX)
     )
     edits_per_s: float = setting(
-        10.0, Kind(float, "maximum edits of a player per second; a burst may be those of 2 s", "N", 0.5, 10_000)
+        10.0, Option(float, "maximum edits of a player per second; a burst may be those of 2 s", "N", 0.5, 10_000)
     )
     commands_waiting_max: int = setting(
-        64, Kind(int, "maximum commands of a player that wait for their tick", "N", 1, 10_000)
+        64, Option(int, "maximum commands of a player that wait for their tick", "N", 1, 10_000)
     )
-    name_max: int = setting(NAME_MAX, Kind(int, "maximum characters of a player's name", "N", 1, NAME_MAX))
+    name_max: int = setting(NAME_MAX, Option(int, "maximum characters of a player's name", "N", 1, NAME_MAX))
     joins_per_tick: int = 8
     """Players that may join in one tick. Others wait for the next tick, because a spawn costs 1 to 2 ms."""
     outbox_max: int = 1024

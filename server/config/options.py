@@ -20,7 +20,7 @@ class SettingsError(ValueError):
     """A setting that cannot be used. The message names the setting, the value and its origin."""
 
 
-class Kind(NamedTuple):
+class Option(NamedTuple):
     """An option: the type, range and help text of one setting."""
 
     type: type[Any]
@@ -70,17 +70,17 @@ def nearest(name: str, known: Iterable[str], prefix: str = "") -> str:
     return f" (did you mean {prefix}{found[0]}?)" if found else ""
 
 
-def setting(default: Any, kind: Kind) -> Any:
+def setting(default: Any, kind: Option) -> Any:
     """Returns a dataclass field that an operator can set."""
     return field(default=default, metadata={"kind": kind})
 
 
-def kinds_of(owner: Any) -> dict[str, Kind]:
+def kinds_of(owner: Any) -> dict[str, Option]:
     """Returns the options of those fields of a dataclass that are settings, by name."""
     return {f.name: f.metadata["kind"] for f in fields(owner) if "kind" in f.metadata}
 
 
-def checked(name: str, kind: Kind, value: object, origin: str) -> Any:
+def checked(name: str, kind: Option, value: object, origin: str) -> Any:
     """Checks the value of one setting and returns it with the option's type.
 
     Args:

@@ -16,7 +16,7 @@ from typing import Any
 
 from server.config.hosts import ANY, is_loopback
 from server.config.limits import Limits
-from server.config.options import Kind, Parser, SettingsError, checked, kinds_of, nearest, setting, to_toml
+from server.config.options import Option, Parser, SettingsError, checked, kinds_of, nearest, setting, to_toml
 from shared import kernels
 from shared.bounds import TICK_RATE_MAX
 from shared.checks import SceneError
@@ -58,32 +58,36 @@ class Settings:
     `origins` has the origin of each setting that is not a default, by name: a flag, a variable or a file.
     """
 
-    host: str = setting("127.0.0.1", Kind(str, "address to listen on; 0.0.0.0 or :: for every interface", "ADDRESS"))
-    port: int = setting(8765, Kind(int, "TCP port; 0: the system chooses a free one", "PORT", 0, 65535))
-    scene: str = setting("hills", Kind(str, "one of --list-scenes, or a scene file; a game may name its own", "SCENE"))
+    host: str = setting("127.0.0.1", Option(str, "address to listen on; 0.0.0.0 or :: for every interface", "ADDRESS"))
+    port: int = setting(8765, Option(int, "TCP port; 0: the system chooses a free one", "PORT", 0, 65535))
+    scene: str = setting(
+        "hills", Option(str, "one of --list-scenes, or a scene file; a game may name its own", "SCENE")
+    )
     reach: float | None = setting(
         None,
-        Kind(float, "distance up to which a player can edit blocks (default: the scene's own)", "BLOCKS", 0, 1024),
+        Option(float, "distance up to which a player can edit blocks (default: the scene's own)", "BLOCKS", 0, 1024),
     )
     tick_rate: int | None = setting(
-        None, Kind(int, "ticks per second (default: the scene's own)", "HZ", 1, TICK_RATE_MAX)
+        None, Option(int, "ticks per second (default: the scene's own)", "HZ", 1, TICK_RATE_MAX)
     )
     auth: str = setting(
         "none",
-        Kind(str, "who may play: none (anyone), token (see `token --help`), or your own function MODULE:NAME", "AUTH"),
+        Option(
+            str, "who may play: none (anyone), token (see `token --help`), or your own function MODULE:NAME", "AUTH"
+        ),
     )
     auth_key_file: str | None = setting(
-        None, Kind(str, f"file with the key of the tokens; alternatively the key itself in {KEY_VARIABLE}", "FILE")
+        None, Option(str, f"file with the key of the tokens; alternatively the key itself in {KEY_VARIABLE}", "FILE")
     )
-    tls_cert: str | None = setting(None, Kind(str, "file with the certificate (chain) for wss://, PEM", "FILE"))
-    tls_key: str | None = setting(None, Kind(str, "file with the certificate's key, PEM", "FILE"))
+    tls_cert: str | None = setting(None, Option(str, "file with the certificate (chain) for wss://, PEM", "FILE"))
+    tls_key: str | None = setting(None, Option(str, "file with the certificate's key, PEM", "FILE"))
     figures: str = setting(
-        "private", Kind(str, "addresses that may read /stats, /metrics and the live page", choices=ADDRESSES)
+        "private", Option(str, "addresses that may read /stats, /metrics and the live page", choices=ADDRESSES)
     )
-    page: bool = setting(True, Kind(bool, "serve the live page at /: the world and its players in a browser"))
+    page: bool = setting(True, Option(bool, "serve the live page at /: the world and its players in a browser"))
     allowed_origins: tuple[str, ...] = setting(
         (),
-        Kind(
+        Option(
             tuple,
             "origins of web pages that may connect, besides those at the server's own IP address; * for all",
             "ORIGIN,...",
@@ -91,7 +95,7 @@ class Settings:
     )
     allowed_hosts: tuple[str, ...] = setting(
         (),
-        Kind(
+        Option(
             tuple,
             "host names under which pages (/stats, /healthz, ...) are served, besides IP addresses, localhost and the "
             "name in host; * for all",
@@ -99,28 +103,28 @@ class Settings:
         ),
     )
     restart_s: float = setting(
-        2.0, Kind(float, "seconds after which clients should reconnect when the server stops", "S", 0, 3600)
+        2.0, Option(float, "seconds after which clients should reconnect when the server stops", "S", 0, 3600)
     )
-    log_level: str = setting("info", Kind(str, "lowest level of the log lines on stderr", choices=LOG_LEVELS))
-    log_format: str = setting("pretty", Kind(str, "format of the log", choices=LOG_FORMATS))
-    game: str | None = setting(None, Kind(str, "class with the rules of a game (default: none)", "MODULE:CLASS"))
-    seed: int = setting(0, Kind(int, "seed of the random numbers of the rules", "N", 0, (1 << 63) - 1))
-    record: str | None = setting(None, Kind(str, "record every change of the world into this new file", "FILE"))
+    log_level: str = setting("info", Option(str, "lowest level of the log lines on stderr", choices=LOG_LEVELS))
+    log_format: str = setting("pretty", Option(str, "format of the log", choices=LOG_FORMATS))
+    game: str | None = setting(None, Option(str, "class with the rules of a game (default: none)", "MODULE:CLASS"))
+    seed: int = setting(0, Option(int, "seed of the random numbers of the rules", "N", 0, (1 << 63) - 1))
+    record: str | None = setting(None, Option(str, "record every change of the world into this new file", "FILE"))
     kernel: str = setting(
         kernels.AUTO,
-        Kind(
+        Option(
             str,
             "code that computes the physics; all give the same bits; auto: the first that is available",
             choices=kernels.CHOICES,
         ),
     )
-    data: str | None = setting(None, Kind(str, "directory to save the world in, and to restore it from", "DIR"))
+    data: str | None = setting(None, Option(str, "directory to save the world in, and to restore it from", "DIR"))
     durability: str = setting(
         "power",
-        Kind(str, "what a saved edit survives: the end of the process, or a power cut", choices=("process", "power")),
+        Option(str, "what a saved edit survives: the end of the process, or a power cut", choices=("process", "power")),
     )
     checkpoint_s: float = setting(
-        60.0, Kind(float, "seconds between two checkpoints of the saved world", "S", 0.1, 3600)
+        60.0, Option(float, "seconds between two checkpoints of the saved world", "S", 0.1, 3600)
     )
     limits: Limits = field(default_factory=Limits)
     origins: Mapping[str, str] = field(default_factory=dict, compare=False)
@@ -147,9 +151,9 @@ GROUPS = {
     "operation": ("log_level", "log_format", "figures", "page", "restart_s"),
 }
 """Groups of settings as `--help` shows them, the ones for beginners first. Settings in no group are shown as limits."""
-SECTIONS: dict[str, dict[str, Kind]] = {"": kinds_of(Settings), "limits": kinds_of(Limits)}
+SECTIONS: dict[str, dict[str, Option]] = {"": kinds_of(Settings), "limits": kinds_of(Limits)}
 """Options by the table of the TOML file that has them, and by name. A name is in one table only."""
-KINDS: dict[str, Kind] = {name: kind for names in SECTIONS.values() for name, kind in names.items()}
+KINDS: dict[str, Option] = {name: kind for names in SECTIONS.values() for name, kind in names.items()}
 """Options of all settings by name."""
 VARIABLES = [*(ENV_PREFIX + name.upper() for name in KINDS), CONFIG_VARIABLE, KEY_VARIABLE]
 """Environment variables that are read. Another variable that begins with `ENV_PREFIX` is an error."""

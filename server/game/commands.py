@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from typing import Any
 
 from server.config.limits import Limits
-from server.game_api.api import Stage
+from server.game_api.api import GameApi
 from server.journal.recorded_world import RecordedWorld, Saves
 from server.observability.errors import Faults
 from server.players import persisted_state
@@ -15,7 +15,7 @@ from shared.bounds import bounds
 from shared.messages import Command
 
 
-class Orders:
+class Commands:
     """The commands of all players of one game.
 
     Args:
@@ -27,9 +27,9 @@ class Orders:
     """
 
     def __init__(
-        self, world: RecordedWorld, stage: Stage, limits: Limits, faults: Faults, saves: Saves | None = None
+        self, world: RecordedWorld, stage: GameApi, limits: Limits, faults: Faults, saves: Saves | None = None
     ) -> None:
-        self._world, self._stage, self._limits, self._faults, self._saves = world, stage, limits, faults, saves
+        self._world, self._api, self._limits, self._faults, self._saves = world, stage, limits, faults, saves
         self._ahead = bounds(world.scene.tick_rate).ahead
         self._unanswered: deque[tuple[int, Player, int, int]] = deque()
         """Verdicts that are not durable yet: tick, player, number, verdict."""
@@ -60,7 +60,7 @@ class Orders:
         """Carries out the due commands of all players, in the order in which the players joined."""
         tick = self._world.tick + 1
         rate = self._limits.edits_per_s
-        for player in tuple(self._stage.players.values()):
+        for player in tuple(self._api.players.values()):
             if player.edits_left != 2 * rate:
                 player.edits_left = min(player.edits_left + rate / self._world.scene.tick_rate, 2 * rate)
             while player.commands and player.commands[0].tick <= tick:
@@ -88,18 +88,18 @@ class Orders:
     def notes(self) -> Iterator[list[Any]]:
         """Yields the verdicts that are not durable yet, as notes for a checkpoint."""
         for _, player, number, verdict in self._unanswered:
-            if player.entity in self._stage.players:
+            if player.entity in self._api.players:
                 yield [persisted_state.ANSWERED, player.entity, number, verdict]
 
     def _verdict(self, player: Player, command: Command) -> int:
         if command.name != edits.NAME:
-            return self._stage.hooks.command(player, command)
+            return self._api.hooks.command(player, command)
         edit = edits.unpack(command.payload)
         if edit is None:
             return messages.INVALID
         if player.edits_left < 1:
             return messages.TOO_MANY
         player.edits_left -= 1
-        if not self._stage.hooks.may_edit(player, edit):
+        if not self._api.hooks.may_edit(player, edit):
             return messages.FORBIDDEN
         return edits.apply(self._world, player.entity, edit)

@@ -9,7 +9,7 @@ from server.game.roster import Roster
 from server.game.session import Session
 from server.observability.counters import Counters
 from server.observability.errors import Faults
-from server.replication.client_stream import Link
+from server.replication.client_stream import Transport
 from shared import fields, messages
 from shared.messages import Bye, encode
 
@@ -27,7 +27,7 @@ class Connections:
         self._roster, self._counters, self._faults = roster, counters, faults
         self.sessions: list[Session] = []
 
-    def open(self, link: Link, now: float) -> Session:
+    def open(self, link: Transport, now: float) -> Session:
         """Adds a new connection and returns its session."""
         session = Session(link, now)
         self.sessions.append(session)

@@ -12,19 +12,19 @@ from typing import Any
 
 from server.config.limits import Limits
 from server.game.clocks import Clocks
-from server.game.commands import Orders
+from server.game.commands import Commands
 from server.game.connections import Connections
 from server.game.joining import Joining
 from server.game.roster import Roster
 from server.game.session import Session
-from server.game_api.api import Stage
+from server.game_api.api import GameApi
 from server.journal.recorded_world import RecordedWorld, Saves
 from server.observability.counters import Counters
 from server.observability.errors import Faults
 from server.players import persisted_state
 from server.players.player import Player
-from server.replication.client_stream import Link
-from server.replication.sender import Delivery
+from server.replication.client_stream import Transport
+from server.replication.sender import Sender
 from server.rewind import Rewind
 from server.rules import Rules, checked_function
 from shared import messages
@@ -99,13 +99,13 @@ class Game:
         kept = None
         if saves is not None and self.world.tick > 0:
             kept = persisted_state.restored([*(saves.kept or ()), *(value for _, value in saves.notes)])
-        self.stage = Stage(self.world, self.rewind, self.counters, rules or Rules(), kept=kept, seed=seed)
+        self.api = GameApi(self.world, self.rewind, self.counters, rules or Rules(), kept=kept, seed=seed)
         self.faults = Faults()
-        self.log = self.stage.log
+        self.log = self.api.log
         self.log.faults = self.faults
-        self.delivery = Delivery(self.world, self.log, self.limits, self.counters)
-        self.roster = Roster(self.world, self.stage, self.limits, self.counters)
-        self.orders = Orders(self.world, self.stage, self.limits, self.faults, saves)
+        self.sender = Sender(self.world, self.log, self.limits, self.counters)
+        self.roster = Roster(self.world, self.api, self.limits, self.counters)
+        self.commands = Commands(self.world, self.api, self.limits, self.faults, saves)
         self.connections = Connections(self.roster, self.counters, self.faults)
         self.clocks = Clocks(scene.tick_rate, self.limits, self.connections, self.roster)
         self.joining = Joining(
@@ -115,7 +115,7 @@ class Game:
             self.faults,
             self.connections,
             self.roster,
-            self.orders,
+            self.commands,
             authenticate,
         )
 
@@ -127,11 +127,11 @@ class Game:
     @property
     def players(self) -> dict[int, Player]:
         """Players by entity, in the order in which they joined; do not change the dictionary."""
-        return self.stage.kept.players
+        return self.api.kept.players
 
     # -- external events: queued ---------------------------------------------------------------------------
 
-    def open(self, link: Link, now: float) -> Session:
+    def open(self, link: Transport, now: float) -> Session:
         """Adds a new connection and returns its session. Its client has to send a Hello within `Limits.hello_s`."""
         return self.connections.open(link, now)
 
@@ -158,7 +158,7 @@ class Game:
                 self.connections.kick(session, messages.MALFORMED, reason)
                 return
             session.inputs.file(message, self.world.tick, self.clocks.ticks_left(now))
-            self.delivery.acked(session.stream, message.acked, now)
+            self.sender.acked(session.stream, message.acked, now)
         elif isinstance(message, Ping):
             tick = self.world.tick + 1 - self.clocks.ticks_left(now)
             session.send(encode(Pong(message.sent, tick)))
@@ -169,12 +169,12 @@ class Game:
             self.joining.hello(session, message, now)
         elif isinstance(message, Command) and session.entity:
             assert session.player is not None
-            self.orders.file(session.player, message)
+            self.commands.file(session.player, message)
         elif isinstance(message, Resync) and session.entity:
             if now - session.resynced_at >= RESYNC_S:
                 session.resynced_at = now
                 self.counters.resyncs += 1
-                self.delivery.forget(session.stream)
+                self.sender.forget(session.stream)
         elif isinstance(message, Restart) and session.entity:
             session.inputs.restart(message.tick)
         elif isinstance(message, Bye):
@@ -198,7 +198,7 @@ class Game:
 
     def keep(self) -> list[list[Any]]:
         """Returns the persisted state and the unanswered commands as notes, for a checkpoint."""
-        return [*persisted_state.whole(self.stage.kept), *self.orders.notes()]
+        return [*persisted_state.whole(self.api.kept), *self.commands.notes()]
 
     # -- the tick: the only place where the world changes --------------------------------------------------
 
@@ -211,21 +211,21 @@ class Game:
             now: the current time in seconds.
         """
         self.clocks.begin(deadline, now)
-        with self.stage.turn:
-            self.stage.hooks.start()
+        with self.api.turn:
+            self.api.hooks.start()
             self.roster.leave(now)
             self.joining.join()
             self.roster.revive()
-            self.orders.carry_out()
-            self.stage.hooks.act()
+            self.commands.carry_out()
+            self.api.hooks.act()
         inputs = self._take_inputs()
         self.world.step(inputs)
-        self.stage.hooks.stepped()
+        self.api.hooks.stepped()
         self.log.record()
         self.rewind.record()
         self.roster.fell_out()
-        self.orders.answer()
-        self.stage.outgoing.deliver(self.players, self.world.tick, self.limits.outbox_max)
+        self.commands.answer()
+        self.api.outgoing.deliver(self.players, self.world.tick, self.limits.outbox_max)
         self.clocks.refill()
         self._send(now)
         self.clocks.check(now)
@@ -233,8 +233,8 @@ class Game:
     def _take_inputs(self) -> dict[int, Input]:
         tick = self.world.tick + 1
         inputs = {entity: player.inputs.take(tick) for entity, player in self.players.items()}
-        inputs.update(self.stage.steered)
-        self.stage.steered.clear()
+        inputs.update(self.api.steered)
+        self.api.steered.clear()
         return inputs
 
     def _send(self, now: float) -> None:
@@ -242,10 +242,10 @@ class Game:
         for session in tuple(self.sessions):
             if session.entity and not session.closed:
                 try:
-                    self.stage.shared_values.show(session.stream)
+                    self.api.shared_values.show(session.stream)
                     if session.greeting is None or self.joining.greet(session, *session.greeting):
                         assert session.player is not None
-                        self.delivery.serve(session.stream, session.player, now)
+                        self.sender.serve(session.stream, session.player, now)
                     else:  # the welcome waits for the disk, which is not a stall of the client
                         session.stream.sent_at = now
                 except Exception:

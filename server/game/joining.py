@@ -4,7 +4,7 @@ from collections.abc import Callable
 
 from server.auth.identity import checked_subject
 from server.config.limits import Limits
-from server.game.commands import Orders
+from server.game.commands import Commands
 from server.game.connections import Connections
 from server.game.roster import Roster
 from server.game.session import Session
@@ -37,11 +37,11 @@ class Joining:
         faults: Faults,
         connections: Connections,
         roster: Roster,
-        orders: Orders,
+        orders: Commands,
         authenticate: Callable[[str], str] | None,
     ) -> None:
         self._world, self._limits, self._counters, self._faults = world, limits, counters, faults
-        self._connections, self._roster, self._orders = connections, roster, orders
+        self._connections, self._roster, self._commands = connections, roster, orders
         self._rules = world.scene.to_table()
         self.authenticate = authenticate
 
@@ -64,7 +64,7 @@ class Joining:
             return
         if not self._authenticated(session, hello.token):
             return
-        session.stream.pacing.answered(now - session.opened, 0, now)  # a round trip with nothing on the way
+        session.stream.flow.answered(now - session.opened, 0, now)  # a round trip with nothing on the way
         session.hello = hello._replace(token="")
 
     def join(self) -> None:
@@ -87,7 +87,7 @@ class Joining:
         Returns:
             Whether the welcome has been sent.
         """
-        if self._orders.durable_tick < tick and not self._orders.trouble:
+        if self._commands.durable_tick < tick and not self._commands.trouble:
             return False
         session.send(welcome)
         session.greeting = None

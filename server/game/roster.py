@@ -12,7 +12,7 @@ import secrets
 from server.config.limits import Limits
 from server.game.session import Session
 from server.game.spawning import Spawns
-from server.game_api.api import Stage
+from server.game_api.api import GameApi
 from server.journal.recorded_world import RecordedWorld
 from server.observability.counters import Counters
 from server.players import persisted_state
@@ -35,18 +35,18 @@ class Roster:
         counters: where joins and leaves are counted.
     """
 
-    def __init__(self, world: RecordedWorld, stage: Stage, limits: Limits, counters: Counters) -> None:
-        self._world, self._stage, self._limits, self._counters = world, stage, limits, counters
+    def __init__(self, world: RecordedWorld, stage: GameApi, limits: Limits, counters: Counters) -> None:
+        self._world, self._api, self._limits, self._counters = world, stage, limits, counters
         self._bounds = bounds(world.scene.tick_rate)
         self._spawns = Spawns(world)
         self._fallen: list[int] = []
-        for player in self._stage.players.values():  # players of a restored game
+        for player in self._api.players.values():  # players of a restored game
             player.inputs = InputQueue(self._bounds)
 
     @property
     def connected(self) -> int:
         """Number of players with a connection, including connections whose loss has not been noticed yet."""
-        return sum(player.session is not None for player in self._stage.players.values())
+        return sum(player.session is not None for player in self._api.players.values())
 
     def enter(self, session: Session, name: str) -> Player | None:
         """Adds a new player at a spawn point. Call it before the step of a tick.
@@ -62,13 +62,13 @@ class Roster:
         entity = self._spawns.spawn()
         if entity is None:
             return None
-        player = self._stage.players[entity] = Player(entity, name, session.subject, self._bounds)
+        player = self._api.players[entity] = Player(entity, name, session.subject, self._bounds)
         player.edits_left = 0.0  # otherwise each leave and new join would give another burst
         player.announced = False
         self._counters.joined += 1
         try:
             session.seat(player)
-            self._stage.hooks.joined(player)
+            self._api.hooks.joined(player)
         except Exception:
             self.expel(player)
             raise
@@ -97,7 +97,7 @@ class Roster:
             subject: the subject of the client.
         """
         wanted = _digest(token)
-        for player in self._stage.players.values() if token else ():
+        for player in self._api.players.values() if token else ():
             if player.session is not None and player.session.stream.acked >= 0:
                 player.heard()
             if wanted in player.tokens and player.subject == subject:
@@ -124,13 +124,13 @@ class Roster:
 
     def excuse(self, seconds: float, now: float) -> None:
         """Extends the time to reconnect of all players by a pause of the server, in which nobody could reconnect."""
-        for player in self._stage.players.values():
+        for player in self._api.players.values():
             if player.session is None:
                 player.away_until = min(player.away_until + seconds, now + self._limits.resume_s)
 
     def leave(self, now: float) -> None:
         """Removes the players whose time to reconnect is over."""
-        away = [player for player in self._stage.players.values() if player.session is None]
+        away = [player for player in self._api.players.values() if player.session is None]
         for player in away:
             if player.away_until == math.inf:  # the player of a restored game
                 player.away_until = now + self._limits.resume_s
@@ -144,23 +144,23 @@ class Roster:
     def revive(self) -> None:
         """Puts the entities that fell out in the last tick at spawn points, unless the rules deal with them."""
         for entity in self._fallen:
-            if entity in self._world and not self._stage.hooks.fell_out(entity):
+            if entity in self._world and not self._api.hooks.fell_out(entity):
                 self._spawns.put_back(entity)
         self._fallen.clear()
 
     def _make_room(self) -> None:
         """Removes players without a connection if the game is full; first the one with the least time left."""
-        excess = len(self._stage.players) + 1 - self._limits.clients_max
+        excess = len(self._api.players) + 1 - self._limits.clients_max
         if excess > 0:
-            away = [player for player in self._stage.players.values() if player.session is None]
+            away = [player for player in self._api.players.values() if player.session is None]
             self._let_go(sorted(away, key=lambda player: player.away_until)[:excess])
 
     def _let_go(self, leaving: list[Player]) -> None:
         for player in leaving:
-            del self._stage.players[player.entity]
+            del self._api.players[player.entity]
             self._counters.left += 1
             self._counters.add(player.inputs)
-            self._stage.hooks.left(player)
+            self._api.hooks.left(player)
 
 
 def _digest(token: bytes) -> bytes:

@@ -4,7 +4,7 @@ import math
 
 from server.players.input_queue import InputQueue
 from server.players.player import SETTLED_MAX, Player
-from server.replication.client_stream import ClientStream, Link
+from server.replication.client_stream import ClientStream, Transport
 from shared.messages import Hello
 
 
@@ -16,7 +16,7 @@ class Session:
         now: the time in seconds at which it opened.
     """
 
-    def __init__(self, link: Link, now: float) -> None:
+    def __init__(self, link: Transport, now: float) -> None:
         self.link = link
         self.stream = ClientStream(link, now)
         self.player: Player | None = None

@@ -16,7 +16,7 @@ from server.game_api.shared_values import SharedValues
 from server.game_api.turn import Turn
 from server.journal.recorded_world import RecordedWorld
 from server.observability.counters import Counters
-from server.players.persisted_state import LEFT, Kept
+from server.players.persisted_state import LEFT, PersistedState
 from server.players.player import Player
 from server.replication.change_log import ChangeLog
 from server.rewind import Rewind
@@ -29,7 +29,7 @@ from shared.layout import TEMPLATE
 from shared.scene import Scene
 
 
-class Stage:
+class GameApi:
     """The game API of one running game. Positions are in blocks, velocities in blocks/s.
 
     A method raises `MissingError` (a `KeyError`) if there is no entity with the given number, and `SceneError`, which
@@ -54,12 +54,12 @@ class Stage:
         counters: Counters,
         rules: Rules,
         *,
-        kept: Kept | None = None,
+        kept: PersistedState | None = None,
         seed: int = 0,
     ) -> None:
         check_rules(rules)
         self.turn = Turn()
-        self.kept = kept or Kept({}, {}, {})
+        self.kept = kept or PersistedState({}, {}, {})
         self.steered: dict[int, Input] = {}
         self.log = ChangeLog(world, self.kept.attributes)
         self.shared_values = SharedValues(world, self.kept.shared)

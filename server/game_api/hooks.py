@@ -22,7 +22,7 @@ from shared.messages import Command, ProtocolError
 from shared.payloads import unpack_value
 
 if TYPE_CHECKING:
-    from server.game_api.api import Stage
+    from server.game_api.api import GameApi
 
 SOON_MAX = 10_000
 """Maximum number of functions that wait for the next tick."""
@@ -44,11 +44,11 @@ class Hooks:
     """
 
     def __init__(
-        self, stage: "Stage", world: RecordedWorld, rules: Rules, counters: Counters, *, goes_on: bool
+        self, stage: "GameApi", world: RecordedWorld, rules: Rules, counters: Counters, *, goes_on: bool
     ) -> None:
         self.seen = 0.0
         """View tick of the latest command: server time in ticks at which its sender drew the other entities."""
-        self._stage, self._world, self._rules, self._counters = stage, world, rules, counters
+        self._api, self._world, self._rules, self._counters = stage, world, rules, counters
         self._soon: deque[tuple[Callable[..., object], tuple[Any, ...]]] = deque()
         self._contacts = Contacts(world, goes_on=goes_on)
         self._reports_contacts = _overrides(rules, "on_contact")
@@ -71,12 +71,12 @@ class Hooks:
         if player.announced:
             self._call(self._rules.on_leave, player)
         if player.entity in self._world:
-            self._stage.discard(player.entity)
+            self._api.discard(player.entity)
 
     def joined(self, player: Player) -> None:
         """Sets the name of a new player as an attribute, and calls `on_join`."""
         if player.name:
-            self._stage.set(player.entity, "name", player.name)
+            self._api.set(player.entity, "name", player.name)
         player.announced = True
         self._call(self._rules.on_join, player)
 

@@ -31,7 +31,7 @@ class Outgoing:
 
         Args:
             tick: the present tick.
-            name, data, to: as for `Stage.send`.
+            name, data, to: as for `GameApi.send`.
 
         Raises:
             SceneError: the name or the data are too long, the data are no MessagePack value, or `to` is wrong.

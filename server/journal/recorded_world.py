@@ -69,7 +69,7 @@ class Saves(Protocol):
         ...
 
 
-class Pen:
+class Observer:
     """The notes on one world: the calls since the last tick, and the inputs that differ from the last ones.
 
     Args:
@@ -103,10 +103,10 @@ class Pen:
         calls, self.calls = self.calls, []
         held = self._held
         news: list[int] = []
-        for entity, wish in inputs.items():
-            if held.get(entity) != wish:
-                held[entity] = wish
-                news += map(int, (entity, *wish))
+        for entity, input_ in inputs.items():
+            if held.get(entity) != input_:
+                held[entity] = input_
+                news += map(int, (entity, *input_))
         first, self._first = self._first, False
         parts: list[Any] = [news, calls, None if first else mark(world)]
         due = world.tick % HASH_TICKS == 0 and len(world) <= self._hashed_max
@@ -119,7 +119,7 @@ class Pens:
     """The observer of a recorded world (`shared.world_changes.Observer`): it notes each change with all pens."""
 
     def __init__(self) -> None:
-        self.all: tuple[Pen, ...] = ()
+        self.all: tuple[Observer, ...] = ()
 
     def note(self, call: Call) -> None:
         """Adds a call to the calls before the coming tick."""
@@ -179,11 +179,11 @@ class RecordedWorld(World):
         super().__init__(scene, compiled=compiled)
         self.observer = self._pens = Pens()
 
-    def attach(self, pen: Pen) -> None:
+    def attach(self, pen: Observer) -> None:
         """Adds a pen. It is notified of every change from now on."""
         self._pens.all = (*self._pens.all, pen)
 
-    def detach(self, pen: Pen) -> None:
+    def detach(self, pen: Observer) -> None:
         """Removes a pen. Does nothing if it is not attached."""
         self._pens.all = tuple(each for each in self._pens.all if each is not pen)
 
@@ -224,7 +224,7 @@ class RecordedWorld(World):
             self._pens.note([NOTE, msgpack.packb(value)])
 
 
-class _FilePen(Pen):
+class _FilePen(Observer):
     """A pen that writes a recording."""
 
     def __init__(self, file: Sink, world: RecordedWorld, failed: Callable[[OSError], None]) -> None:

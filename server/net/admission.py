@@ -49,7 +49,7 @@ class Request(NamedTuple):
     upgrade: bool
 
 
-class Door:
+class Admission:
     """The admission control of one server: counts connections, and answers requests.
 
     Args:

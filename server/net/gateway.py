@@ -5,7 +5,7 @@ import ssl
 from typing import Any, Protocol
 
 from server.net.addresses import listeners
-from server.net.admission import Door
+from server.net.admission import Admission
 from server.net.tls_accept import Handshakes
 from server.net.websocket import Connection
 from server.observability.errors import Faults
@@ -36,9 +36,9 @@ class Gateway:
         faults: where exceptions of the game are reported.
     """
 
-    def __init__(self, game: Events, door: Door | None = None, faults: Faults | None = None) -> None:
+    def __init__(self, game: Events, door: Admission | None = None, faults: Faults | None = None) -> None:
         self.game = game
-        self.door = door or Door()
+        self.door = door or Admission()
         self.faults = faults or Faults()
         self.connections: set[Connection] = set()
         self._servers: list[asyncio.Server | Handshakes] = []

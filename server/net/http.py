@@ -10,11 +10,11 @@ from websockets.http11 import Request as HttpRequest
 from websockets.http11 import Response
 from websockets.server import ServerProtocol
 
-from server.net.admission import Door, Request
+from server.net.admission import Admission, Request
 from server.observability.pages import Page
 
 
-def answer_request(protocol: ServerProtocol, data: bytes, door: Door, address: str) -> bytes:
+def answer_request(protocol: ServerProtocol, data: bytes, door: Admission, address: str) -> bytes:
     """Passes data to websockets until the request is complete, and answers it.
 
     The request is passed on line by line, because websockets would parse the bytes after it before it is answered.
@@ -45,7 +45,7 @@ def answer_request(protocol: ServerProtocol, data: bytes, door: Door, address: s
     return data[start:]
 
 
-def _answer(protocol: ServerProtocol, request: HttpRequest, door: Door, address: str) -> None:
+def _answer(protocol: ServerProtocol, request: HttpRequest, door: Admission, address: str) -> None:
     headers = request.headers
     upgrade = any("websocket" in value.lower() for value in headers.get_all("Upgrade"))
     origins, hosts = headers.get_all("Origin"), headers.get_all("Host")

@@ -15,7 +15,7 @@ AGAIN_S = 1.0
 """Seconds until the next attempt after nothing could be accepted, for example because no file descriptor was free."""
 
 
-class Guest(asyncio.Protocol):
+class AcceptedSocket(asyncio.Protocol):
     """The protocol of one accepted socket. It gets its transport when the handshake is over."""
 
     @abstractmethod
@@ -36,7 +36,7 @@ class Handshakes:
         limit_s: maximum time of one handshake, in seconds.
     """
 
-    def __init__(self, guest: Callable[[], Guest], context: ssl.SSLContext, limit_s: float) -> None:
+    def __init__(self, guest: Callable[[], AcceptedSocket], context: ssl.SSLContext, limit_s: float) -> None:
         self._guest, self._context, self._limit_s = guest, context, limit_s
         self._loop = asyncio.get_running_loop()
         self._tasks: set[asyncio.Task[None]] = set()
@@ -78,7 +78,7 @@ class Handshakes:
                 sock.close()
             await asyncio.sleep(0)  # `sock_accept` does not yield if a connection waits, so let other tasks run
 
-    async def _shake(self, sock: socket.socket, guest: Guest) -> None:
+    async def _shake(self, sock: socket.socket, guest: AcceptedSocket) -> None:
         if self._closed:
             sock.close()
             guest.leave()

@@ -24,7 +24,7 @@ from websockets.protocol import CONNECTING, OPEN
 from websockets.server import ServerProtocol
 
 from server.net.http import answer_request
-from server.net.tls_accept import Guest
+from server.net.tls_accept import AcceptedSocket
 from shared.fields import CLIENT_MESSAGE_MAX
 
 try:
@@ -64,7 +64,7 @@ def _frame_head(size: int) -> bytes:
     return b"\x82\x7f" + size.to_bytes(8, "big")
 
 
-class Connection(Guest):
+class Connection(AcceptedSocket):
     """One accepted socket, which the game uses as a `server.replication.client_stream.Link`."""
 
     def __init__(self, gateway: "Gateway", loop: asyncio.AbstractEventLoop) -> None:

@@ -45,7 +45,7 @@ from typing import Any
 
 import msgpack
 
-from server.journal.recorded_world import Pen
+from server.journal.recorded_world import Observer
 from server.observability.errors import Faults
 from server.observability.histogram import Histogram
 from server.persistence.checkpoint import Checkpoint, Copy, Saved
@@ -78,7 +78,7 @@ CLOSE_S = 2.5
 logger = logging.getLogger(__name__)
 
 
-class Store(Pen):
+class Store(Observer):
     """A directory with a saved world.
 
     Args:

@@ -26,7 +26,7 @@ assert sys.byteorder == "little", "margins lie in memory as they go over the wir
 
 
 @lru_cache(4096)
-def _wish(row: bytes) -> Input:
+def _input(row: bytes) -> Input:
     """Decodes and clamps an input. The cache helps because a key is held for many ticks, so most rows repeat."""
     return clamp(Input(*INPUT_ROW.unpack(row)))
 
@@ -48,9 +48,9 @@ class InputQueue:
         self.first = self.newest = -1
         self.margins = array("h")
         """Arrival margins that are not sent yet, in the units of the wire; the last one is that of `newest`. At most
-        `bounds.fates` of them."""
-        self.fates = bytearray()
-        """Input statuses of the ticks that are not sent yet, as on the wire. At most `bounds.fates` of them."""
+        `bounds.statuses` of them."""
+        self.statuses = bytearray()
+        """Input statuses of the ticks that are not sent yet, as on the wire. At most `bounds.statuses` of them."""
         self.late = self.refused = self.used = self.substituted = 0
         self.wheel: Input | None = None
         """Input of an in-process player. If it is set, it is used in every tick and queued inputs are ignored."""
@@ -75,8 +75,8 @@ class InputQueue:
                 self.newest = at
                 self.margins.append(self._filed(at, rows[start : start + INPUT_ROW_BYTES], tick, ahead))
             at += 1
-        if len(self.margins) > self._bounds.fates:
-            del self.margins[: -self._bounds.fates]
+        if len(self.margins) > self._bounds.statuses:
+            del self.margins[: -self._bounds.statuses]
 
     def restart(self, at: int) -> None:
         """Removes the unused inputs for tick `at` and later, because the client is going to send them again."""
@@ -100,10 +100,10 @@ class InputQueue:
         self._accepted = at
         margin = math.floor((at - tick - 1 + ahead) * self._margin_one)
         if at > tick:
-            self._waiting[at] = _wish(row)
+            self._waiting[at] = _input(row)
         else:
             self.late += 1
-            self._held, self._missing = _wish(row), 0
+            self._held, self._missing = _input(row), 0
             margin = min(margin, -1)
         return margin if abs(margin) < -MARGIN_REFUSED else max(MARGIN_REFUSED + 1, min(margin, -MARGIN_REFUSED - 1))
 
@@ -115,16 +115,16 @@ class InputQueue:
         if self.first < 0:
             self.first = at
         else:
-            self.margins.extend([MARGIN_REFUSED] * min(at - self.newest - 1, self._bounds.fates))
+            self.margins.extend([MARGIN_REFUSED] * min(at - self.newest - 1, self._bounds.statuses))
 
     def take(self, tick: int) -> Input:
         """Takes the input for the tick that is about to be computed, or a substitute, and notes the input status."""
         if self.wheel is not None:
             self.used += 1
             return self.wheel
-        wish = self._waiting.pop(tick, None)
-        if wish is not None:
-            fate, self._missing, self._held = USED, 0, wish
+        input_ = self._waiting.pop(tick, None)
+        if input_ is not None:
+            fate, self._missing, self._held = USED, 0, input_
             self.used += 1
         elif self.first < 0 or tick < self.first:
             fate = IDLE
@@ -132,14 +132,14 @@ class InputQueue:
             self._missing += 1
             self.substituted += 1
             fate = REPEATED if self._bounds.stands_in(self._missing) else NEUTRALISED
-        self.fates.append(fate)
-        if len(self.fates) > self._bounds.fates:
-            del self.fates[0]
+        self.statuses.append(fate)
+        if len(self.statuses) > self._bounds.statuses:
+            del self.statuses[0]
         return NEUTRAL if fate == NEUTRALISED else self._held
 
     def told(self) -> tuple[bytes, bytes]:
         """Takes the margins and statuses for the next snapshot, as on the wire. They count as sent."""
-        margins, fates = self.margins.tobytes(), bytes(self.fates)
+        margins, statuses = self.margins.tobytes(), bytes(self.statuses)
         del self.margins[:]
-        self.fates.clear()
-        return margins, fates
+        self.statuses.clear()
+        return margins, statuses

@@ -21,7 +21,7 @@ from server.players.player import Player
 PLAYER, ANSWERED, SETTLED, LEFT, SAID, SHARED = "player", "answered", "settled", "left", "said", "shared"
 
 
-class Kept(NamedTuple):
+class PersistedState(NamedTuple):
     """The persisted state: players and attributes by entity, and shared values by name."""
 
     players: dict[int, Player]
@@ -34,7 +34,7 @@ def note_of(player: Player) -> list[Any]:
     return [PLAYER, player.entity, player.name, player.subject, player.tokens]
 
 
-def whole(kept: Kept) -> list[list[Any]]:
+def whole(kept: PersistedState) -> list[list[Any]]:
     """Returns the whole state as the notes that lead to it."""
     notes = [note_of(player) for player in kept.players.values()]
     notes += [[SETTLED, entity, player.settled] for entity, player in kept.players.items() if player.settled]
@@ -42,13 +42,13 @@ def whole(kept: Kept) -> list[list[Any]]:
     return [*notes, [SHARED, kept.shared]]
 
 
-def restored(notes: Iterable[list[Any]]) -> Kept:
+def restored(notes: Iterable[list[Any]]) -> PersistedState:
     """Returns the state that notes, in order, lead to.
 
     Raises:
         ValueError: there is no such kind of note.
     """
-    kept = Kept({}, {}, {})
+    kept = PersistedState({}, {}, {})
     shared: Mapping[str, Any] = {}
     for kind, *parts in notes:
         match kind, parts:

@@ -20,7 +20,7 @@ from shared.bounds import bounds, in_ticks
 from shared.checks import Cell
 from shared.layout import ID, X
 from shared.ring import Ring
-from shared.snapshot import KEYFRAME, News, checksum, encode_part, encode_rows, join_part
+from shared.snapshot import KEYFRAME, TickEncoder, checksum, encode_part, encode_rows, join_part
 from shared.units import TO_SEGMENT
 from shared.world import World
 
@@ -54,7 +54,7 @@ class _Tick:
         return self.gone.keys() | self.edited.keys() | self.said.keys()
 
 
-class Parts(dict[Cell, bytes]):
+class DeltaCache(dict[Cell, bytes]):
     """The segment deltas since one tick. Each is encoded when it is first used.
 
     Args:
@@ -120,12 +120,12 @@ class ChangeLog:
         self._home: dict[int, Cell] = {
             entity: (x, y, z) for entity, (x, y, z) in zip(states[:, ID].tolist(), homes, strict=True)
         }
-        self._parts: dict[int, Parts] = {}
+        self._parts: dict[int, DeltaCache] = {}
         self._packed: dict[Cell, tuple[int, bytes]] = {}
         self._packs_left = PACKS_PER_TICK
         self._due: set[Cell] = set()
         """Segments whose checksums are to be sent in this tick."""
-        self._news = News(world, in_ticks(CHECK_S, world.scene.tick_rate, 1))
+        self._news = TickEncoder(world, in_ticks(CHECK_S, world.scene.tick_rate, 1))
         self._latest: dict[Cell, tuple[bytes, bytes, bytes]] | None = None
         """Entity changes of the newest tick, packed, by segment; None after a removal."""
         self._placed_at = -self.history
@@ -183,7 +183,7 @@ class ChangeLog:
         self._parts.clear()
         self._packs_left = PACKS_PER_TICK
 
-    def since(self, since: int) -> Parts:
+    def since(self, since: int) -> DeltaCache:
         """Returns the delta of each segment since a tick; an empty delta means no changes.
 
         Args:
@@ -197,7 +197,7 @@ class ChangeLog:
             ticks = [tick for at in range(first, newest + 1) if (tick := self._ticks.get(at)) is not None]
             more = set().union(*(tick.more() for tick in ticks))
             changed = more.union(self._due, *(tick.changed for tick in ticks))
-            parts = self._parts[since] = Parts(self, since, ticks, changed, more)
+            parts = self._parts[since] = DeltaCache(self, since, ticks, changed, more)
         return parts
 
     def encode(self, segment: Cell, since: int) -> bytes:
@@ -235,7 +235,7 @@ class ChangeLog:
         ticks = map(self._ticks.get, range(newest - self.history + 1, newest + 1))
         return set().union(*(tick.placed for tick in ticks if tick is not None))
 
-    def _changes(self, segment: Cell, since: int, known: Parts) -> bytes:
+    def _changes(self, segment: Cell, since: int, known: DeltaCache) -> bytes:
         due = segment in self._due and segment in self._world.blocks
         check = checksum(self._world, segment) if due else 0
         ticks = known.ticks

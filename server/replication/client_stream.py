@@ -3,12 +3,12 @@
 from collections import deque
 from typing import Protocol
 
-from server.replication.client_view import Sight
-from server.replication.flow_control import Pacing
+from server.replication.client_view import ClientView
+from server.replication.flow_control import FlowControl
 from shared.checks import Cell
 
 
-class Link(Protocol):
+class Transport(Protocol):
     """The part of a transport that a session uses."""
 
     def send(self, message: bytes) -> None:
@@ -30,10 +30,10 @@ class ClientStream:
         now: time in seconds at which the connection was opened.
     """
 
-    def __init__(self, link: Link, now: float) -> None:
+    def __init__(self, link: Transport, now: float) -> None:
         self.link = link
-        self.pacing = Pacing(link.outstanding)
-        self.sight = Sight()
+        self.flow = FlowControl(link.outstanding)
+        self.view = ClientView()
         self.sent_at = now
         """Time in seconds of the latest snapshot, or of the latest reason not to count the time since."""
         self.tick = -1
@@ -57,5 +57,5 @@ class ClientStream:
 
     def send(self, message: bytes) -> None:
         """Hands a message to the link."""
-        self.pacing.sent_bytes += len(message)
+        self.flow.sent_bytes += len(message)
         self.link.send(message)

@@ -13,7 +13,7 @@ from shared.checks import Cell
 from shared.snapshot import KEYFRAME
 
 
-class Sight:
+class ClientView:
     """The segments that one client sees, with the tick of each that was sent last."""
 
     def __init__(self) -> None:

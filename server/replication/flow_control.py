@@ -57,7 +57,7 @@ NARROW_BYTES = 96
 """Bytes that a snapshot on a narrow connection may always have."""
 
 
-class Pacing:
+class FlowControl:
     """The flow control of the connection to one client.
 
     Args:

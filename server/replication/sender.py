@@ -34,7 +34,7 @@ SNAPSHOT_BYTES = fields.MESSAGE_MAX // 2
 more."""
 
 
-class Delivery:
+class Sender:
     """The sender of snapshots, game events and terrain to all clients.
 
     Args:
@@ -48,11 +48,11 @@ class Delivery:
         self._world, self._log, self._limits, self._counters = world, log, limits, counters
         self._tick_s = 1 / world.scene.tick_rate
         self._around: dict[Cell, tuple[Cell, ...]] = {}
-        """Segments around a segment, by the latter. Clients share the tuples, which `Parts.together` relies on."""
+        """Segments around a segment, by the latter. Clients share the tuples, which `DeltaCache.together` relies on."""
 
     def serve(self, stream: ClientStream, player: Player, now: float) -> None:
         """Sends a client the snapshot of the latest recorded tick, and what follows it, if its connection has room."""
-        pacing, near, centre = stream.pacing, stream.sight.near, self._log.segment(player.entity)
+        pacing, near, centre = stream.flow, stream.view.near, self._log.segment(player.entity)
         if not near or near[0] != centre:
             self._look_around(stream, centre)
         window = pacing.window(stream.snapshot_bytes, self._tick_s, now)
@@ -75,21 +75,21 @@ class Delivery:
         """Handles the acknowledgement of a client: it has applied the snapshot of a tick."""
         if stream.acked < tick <= stream.tick:
             stream.acked = tick
-            stream.pacing.acked(tick)
+            stream.flow.acked(tick)
             if stream.probe is not None and tick >= stream.probe[0]:
                 probe, sent_at, size = stream.probe
                 stream.probe = None
                 if tick == probe:
-                    stream.pacing.answered(now - sent_at, size, now)
+                    stream.flow.answered(now - sent_at, size, now)
 
     def forget(self, stream: ClientStream) -> None:
         """Starts over with a client: its next snapshots have keyframes, and all terrain is sent again."""
-        stream.sight.forget()
-        self._renew_terrain(stream, stream.sight.sees)
+        stream.view.forget()
+        self._renew_terrain(stream, stream.view.sees)
 
     def _look_around(self, stream: ClientStream, centre: Cell) -> None:
         """Updates the client view after the entity has come into another segment."""
-        sight = stream.sight
+        sight = stream.view
         exists = self._world.blocks.__contains__
         near = interest.around(centre, self._limits.see_radius, exists)
         if self._around.get(centre) != near:
@@ -109,11 +109,11 @@ class Delivery:
 
     def _nearest(self, stream: ClientStream, segments: Iterable[Cell]) -> deque[Cell]:
         """Returns segments in the order in which their blocks are sent: the nearest first."""
-        own = stream.sight.near[0] if stream.sight.near else (0, 0, 0)
+        own = stream.view.near[0] if stream.view.near else (0, 0, 0)
         return deque(sorted(segments, key=lambda segment: interest.distance(segment, own)))
 
     def _send_snapshot(self, stream: ClientStream, player: Player, room: int) -> None:
-        tick, inputs, sight = self._world.tick, player.inputs, stream.sight
+        tick, inputs, sight = self._world.tick, player.inputs, stream.view
         if sight.lost_track(tick, self._log.history):
             self._renew_terrain(stream, sight.lose(tick, self._log.history))
         drops = np.array(sight.drops, "<i4").tobytes() if sight.drops else b""
@@ -122,11 +122,11 @@ class Delivery:
         if player.verdicts:
             verdicts = np.array(player.verdicts[: fields.VERDICTS_MAX], VERDICT).tobytes()
             del player.verdicts[: fields.VERDICTS_MAX]
-        margins, fates = inputs.told()
-        header = (tick, inputs.newest, margins, tick - len(fates) + 1, fates, verdicts, drops)
+        margins, statuses = inputs.told()
+        header = (tick, inputs.newest, margins, tick - len(statuses) + 1, statuses, verdicts, drops)
         message = messages.join_snapshot(header, n, parts)
         stream.send(message)
-        stream.pacing.sent(tick)
+        stream.flow.sent(tick)
         if tick - stream.tick > 1 and stream.tick >= 0:
             kept = tick - GAPS_S / self._tick_s
             stream.gaps = (*(gap for gap in stream.gaps if gap[1] > kept), (stream.tick, tick))
@@ -149,13 +149,13 @@ class Delivery:
         if stream.shared_due:
             stream.send(stream.shared_due)
             stream.shared_due = b""
-        outbox, pacing = player.outbox, stream.pacing
+        outbox, pacing = player.outbox, stream.flow
         if not outbox.due:
             return
         room, terrain = window - pacing.outstanding, stream.terrain_now or stream.terrain_due
         if stream.acked < 0 and (terrain or room <= 0):
             return
-        for message in outbox.take(stream.sight.known, max(room // 2, EVENT_BYTES) if terrain else pacing.room(window)):
+        for message in outbox.take(stream.view.known, max(room // 2, EVENT_BYTES) if terrain else pacing.room(window)):
             stream.send(message)
 
     def _send_terrain(self, stream: ClientStream, room: int) -> None:
@@ -167,7 +167,7 @@ class Delivery:
         room = min(room, self._limits.terrain_bytes_per_tick)
         while room > 0 and (stream.terrain_now or stream.terrain_due):
             if stream.terrain_now is None:
-                segment = next((segment for segment in stream.terrain_due if stream.sight.begun(segment)), None)
+                segment = next((segment for segment in stream.terrain_due if stream.view.begun(segment)), None)
                 blocks = None if segment is None else self._log.packed(segment)
                 if segment is None or blocks is None:
                     return

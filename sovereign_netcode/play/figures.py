@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import pygame
 
-from client_sdk.view import Figure
+from client_sdk.view import EntityView
 from shared.checks import Vec
 from sovereign_netcode.play.iso import HALF, QUARTER, RISE, Colour, Ground, Point, mixed, project
 
@@ -100,7 +100,7 @@ def disc(width: int, colour: Colour, alpha: int, ring: int = 0) -> pygame.Surfac
 class Actor:
     """A figure and the way in which it is drawn."""
 
-    def __init__(self, figure: Figure, tone: Colour, *, it: bool, own: bool, safe: bool) -> None:
+    def __init__(self, figure: EntityView, tone: Colour, *, it: bool, own: bool, safe: bool) -> None:
         self.figure, self.it, self.own, self.safe = figure, it, own, safe
         self.tone = IT if it else tone
 

@@ -80,8 +80,8 @@ class Script:
         if window.core.entity not in prediction.predicted:
             return 0.0, 0.0, False
         self._player.learn(prediction.attributes)
-        wish = self._player(prediction.predicted, window.core.entity)
-        return wish.move_x / MOVE_MAX, wish.move_y / MOVE_MAX, bool(wish.buttons & JUMP)
+        input_ = self._player(prediction.predicted, window.core.entity)
+        return input_.move_x / MOVE_MAX, input_.move_y / MOVE_MAX, bool(input_.buttons & JUMP)
 
     def _take_picture(self, window: Window, view: View, now: float) -> None:
         """Takes the picture soon after a tag, with many figures in sight and in motion, or after `PATIENCE_S`."""

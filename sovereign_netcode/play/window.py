@@ -9,8 +9,8 @@ import pygame
 
 from client_sdk.client import Client
 from client_sdk.events import Answered, Disconnected, Diverged, Event, Happened, Left, Resumed
-from client_sdk.netsim.links import Path
-from client_sdk.view import Figure, View
+from client_sdk.netsim.links import Link
+from client_sdk.view import EntityView, View
 from shared.checks import Cell, Vec
 from sovereign_netcode.play.figures import INK, OWN, TONES, WHITE, Actor, draw_ghost, label, screen
 from sovereign_netcode.play.hud import Hud
@@ -89,7 +89,7 @@ class Window:
     def lag(self, seconds: float) -> None:
         """Sets the latency that the simulated link adds to the round trip."""
         self.lag_s = seconds
-        self.client.link = Path(seconds / 2) if seconds else None
+        self.client.link = Link(seconds / 2) if seconds else None
 
     def save(self, path: str) -> None:
         """Saves the window's content to an image file."""
@@ -217,7 +217,7 @@ class Window:
             self._tones[entity] = counts.index(min(counts))
         return TONES[self._tones[entity]]
 
-    def _look(self, figure: Figure) -> int:
+    def _look(self, figure: EntityView) -> int:
         """Returns the direction in which a figure last moved, in eighths of a turn on the screen."""
         vx, vy, _ = figure.velocity
         if vx or vy:

@@ -5,7 +5,7 @@
 Nothing sleeps, and the result does not depend on the machine. A seed reproduces a match message by message.
 """
 
-from client_sdk.netsim.links import PRESETS, Path
+from client_sdk.netsim.links import PRESETS, Link
 from sovereign_netcode.playtest.match import Match, Player, Policy, bot, wander
 
-__all__ = ["PRESETS", "Match", "Path", "Player", "Policy", "bot", "wander"]
+__all__ = ["PRESETS", "Link", "Match", "Player", "Policy", "bot", "wander"]

@@ -14,8 +14,8 @@ from itertools import count
 from client_sdk import bots
 from client_sdk.core import Core
 from client_sdk.events import Event
-from client_sdk.netsim.links import Path as Path
-from client_sdk.netsim.links import Weather, Wire
+from client_sdk.netsim.links import Link as Link
+from client_sdk.netsim.links import LinkEvents, TcpStream
 from server.config.limits import Limits
 from server.game import Game
 from server.game.session import Session
@@ -29,7 +29,7 @@ Policy = Callable[[Core, random.Random], Input]
 class Player:
     """One client: its core, its clock, its policy and its two wires. It also serves as the server's `Link`."""
 
-    def __init__(self, match: "Match", core: Core, path: Path, policy: Policy, seed: int) -> None:
+    def __init__(self, match: "Match", core: Core, path: Link, policy: Policy, seed: int) -> None:
         self.match, self.core, self.policy = match, core, policy
         self.rng = random.Random(seed)
         self.drift = self.rng.uniform(-200e-6, 200e-6)
@@ -37,7 +37,7 @@ class Player:
         self.events: list[Event] = []
         self.closed: tuple[int, str] | None = None
         self.session: Session | None = None
-        self.weather = Weather(path, seed + 3)
+        self.link_events = LinkEvents(path, seed + 3)
         self._seed = seed
         self._connect_wires()
         self._acted = -1
@@ -52,8 +52,8 @@ class Player:
         return self.clock_start + self.match.now * (1 + self.drift)
 
     def _connect_wires(self) -> None:
-        self.up = Wire(self.match, self.weather, self._seed + 1, self._at_server)
-        self.down = Wire(self.match, self.weather, self._seed + 2, self._at_client)
+        self.up = TcpStream(self.match, self.link_events, self._seed + 1, self._at_server)
+        self.down = TcpStream(self.match, self.link_events, self._seed + 2, self._at_client)
         self._seed += 10
 
     def connect(self) -> None:
@@ -128,8 +128,8 @@ class Player:
             core.set_input(self.policy(core, self.rng))
         now = self.local
         core.port.update(now)
-        if self.session is None and core.state == "away" and now >= core.comeback.retry_at:
-            core.comeback.trying()
+        if self.session is None and core.state == "reconnecting" and now >= core.reconnect.retry_at:
+            core.reconnect.trying()
             self.connect()
             return
         self._flush()
@@ -173,7 +173,7 @@ class Match:
         self.on_tick: list[Callable[[], None]] = []
         self.at(0.0, self._tick)
 
-    def join(self, policy: Policy, path: Path | None = None, core: Core | None = None) -> Player:
+    def join(self, policy: Policy, path: Link | None = None, core: Core | None = None) -> Player:
         """Adds a player. Its client connects at once.
 
         Args:
@@ -182,7 +182,7 @@ class Match:
             core: its client; None: a new one.
         """
         seed = self.seed * 1_000_003 + len(self.players) * 7919
-        player = Player(self, core or Core(f"player {len(self.players)}"), path or Path(), policy, seed)
+        player = Player(self, core or Core(f"player {len(self.players)}"), path or Link(), policy, seed)
         self.players.append(player)
         self.at(self.now, player.connect)
         return player
@@ -236,7 +236,7 @@ def bot(policy: bots.Policy) -> Policy:
 
     def plays(core: Core, rng: random.Random) -> Input:
         drive(core)
-        return core.wish
+        return core.input
 
     return plays
 
@@ -248,4 +248,4 @@ def wander(core: Core, rng: random.Random) -> Input:
             [(127, 0), (-127, 0), (0, 127), (0, -127), (90, 90), (-90, 90), (90, -90), (-90, -90), (0, 0)]
         )
         return Input(*angle, int(rng.random() < 0.5))
-    return core.wish
+    return core.input

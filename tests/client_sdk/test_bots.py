@@ -11,7 +11,7 @@ from client_sdk.core import Core
 from shared.inputs import MOVE_MAX, NEUTRAL, Input
 from shared.scene import Scene, load_scene
 from shared.world import World
-from tests.match import Match, bot
+from sovereign_netcode.playtest import Match, bot
 
 FLAT = load_scene("flat")
 
@@ -42,8 +42,8 @@ def test_the_seed_decides(name: str) -> None:
 @pytest.mark.parametrize("name", POLICIES)
 @pytest.mark.parametrize("scene", ["arena", "hills", "topdown"])
 def test_every_policy_plays_every_scene(name: str, scene: str) -> None:
-    for wish in wishes(name, 7, 200, load_scene(scene)):
-        assert wish.move_x**2 + wish.move_y**2 <= MOVE_MAX**2
+    for input_ in wishes(name, 7, 200, load_scene(scene)):
+        assert input_.move_x**2 + input_.move_y**2 <= MOVE_MAX**2
 
 
 def test_stand_stands() -> None:
@@ -62,7 +62,7 @@ def test_wander_gets_about() -> None:
 
 
 def test_run_and_jump_leaves_the_ground() -> None:
-    assert sum(wish.buttons for wish in wishes("run-and-jump", 1)) > 300
+    assert sum(input_.buttons for input_ in wishes("run-and-jump", 1)) > 300
 
 
 def test_follow_catches_up_and_stays_close() -> None:

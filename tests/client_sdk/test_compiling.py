@@ -9,7 +9,7 @@ from client_sdk.core import Core
 from shared import kernels
 from shared.kernels import NUMBA, PLAIN, PREBUILT, Kernel
 from shared.scene import load_scene
-from tests.match import Match, Path, wander
+from sovereign_netcode.playtest import Link, Match, wander
 
 pytestmark = pytest.mark.skipif(not kernels.available(), reason="there is no compiled kernel")
 
@@ -42,7 +42,7 @@ def test_a_client_joins_and_plays_uncompiled_and_then_goes_on_compiled(slow: Slo
     match = Match(load_scene("flat"), seed=3)
     waited = slow.waited  # the server's world may
     core = Core("Ann", patience_s=10.0)
-    player = match.join(wander, Path(0.05), core)
+    player = match.join(wander, Link(0.05), core)
     match.run(5)
     prediction = core.prediction
     assert prediction is not None
@@ -52,7 +52,7 @@ def test_a_client_joins_and_plays_uncompiled_and_then_goes_on_compiled(slow: Slo
     if away:
         player.disconnect()
         match.run(0.2)
-        assert core.state == "away"
+        assert core.state == "reconnecting"
     assert slow.waited == waited
     slow.compiled = True
     match.run(5)

@@ -10,8 +10,8 @@ JUMP, OTHER = Input(5, 7, 1), Input(0, 0, 2)
 
 def filled(*wishes: Input) -> Controls:
     controls = Controls()
-    for wish in wishes:
-        controls.set(wish)
+    for input_ in wishes:
+        controls.set(input_)
     return controls
 
 
@@ -35,8 +35,8 @@ def test_what_is_held_counts_until_it_is_released() -> None:
 def test_a_release_and_a_press_between_two_ticks_are_a_press() -> None:
     controls = filled(JUMP)
     controls.take()
-    for wish in (NEUTRAL, JUMP, NEUTRAL):
-        controls.set(wish)
+    for input_ in (NEUTRAL, JUMP, NEUTRAL):
+        controls.set(input_)
     assert [controls.take().buttons for _ in range(2)] == [1, 0]
 
 

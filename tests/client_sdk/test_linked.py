@@ -15,20 +15,20 @@ from client_sdk.client import Client
 from client_sdk.core import READ_BYTES, Core
 from client_sdk.events import Happened, Joined, Left
 from client_sdk.netsim.linked import SLOW_READ_BYTES, LinkedPort
-from client_sdk.netsim.links import PRESETS, Path
+from client_sdk.netsim.links import PRESETS, Link
 from shared import messages, payloads
 from shared.messages import Bye, Hello, Inputs, Ping, decode_from_client, encode
 from shared.scene import load_scene
+from sovereign_netcode.playtest import Match, wander
 from tests.client_sdk.servers import ROOT, real_server
 from tests.lengths import long
-from tests.match import Match, wander
 
-FAR = Path(0.125)
+FAR = Link(0.125)
 SOON = 2**-20
 """A moment, exact in binary like the other times here."""
 
 
-def linked(link: str | Path | None, now: float = 16.0) -> LinkedPort:
+def linked(link: str | Link | None, now: float = 16.0) -> LinkedPort:
     port = LinkedPort(Core("Ann"))
     port.link = link
     port.open(now)
@@ -78,7 +78,7 @@ def test_a_message_takes_its_time_from_when_it_comes() -> None:
 def test_what_is_under_way_stays_in_front_when_the_link_changes() -> None:
     port = linked(FAR)
     port.receive(told(1), 16.0)
-    port.link = Path(0.0625)
+    port.link = Link(0.0625)
     port.receive(told(2), 16.0)
     port.link = None
     port.receive(told(3), 16.0)
@@ -111,7 +111,7 @@ def test_the_end_is_heard_behind_what_came_before_it() -> None:
 def test_what_was_on_a_lost_line_is_gone() -> None:
     match = Match(load_scene("flat"), 1)
     core = Core(patience_s=10)
-    player = match.join(wander, Path(), core)
+    player = match.join(wander, Link(), core)
     match.run_until(lambda: core.state == "playing", 10)
     set_link(core, FAR)
     match.run(1)
@@ -120,7 +120,7 @@ def test_what_was_on_a_lost_line_is_gone() -> None:
     core.port.lost(1006, "gone", now)
     assert core.state == "playing", "it does not know yet"
     core.port.update(now + 1)
-    assert core.state == "away"
+    assert core.state == "reconnecting"
     core.port.open(now + 1)
     assert core.port.outgoing() == []
     core.port.update(now + 1.125 - SOON)
@@ -176,7 +176,7 @@ def test_a_match_over_it_is_as_one_over_a_real_path(link: str) -> None:
     match = Match(load_scene("hills"), 3)
     core = Core()
     set_link(core, link)
-    match.join(wander, Path(), core)
+    match.join(wander, Link(), core)
     match.run(60)
     assert core.state == "playing"
     assert core.clock.rtt_s >= 2 * PRESETS[link].delay_s
@@ -204,7 +204,7 @@ def test_over_real_sockets() -> None:
             time.sleep(0.005)
 
     async def scene() -> None:
-        async with await AsyncClient.connect(url, link=Path(0.06)) as client:
+        async with await AsyncClient.connect(url, link=Link(0.06)) as client:
             async for event in client:
                 if isinstance(event, Joined):
                     break
@@ -213,7 +213,7 @@ def test_over_real_sockets() -> None:
             assert client.link is None
 
     with real_server("--scene", "flat") as url:
-        with Client.connect(url, link=Path(0.06)) as client:
+        with Client.connect(url, link=Link(0.06)) as client:
             until(client, lambda: client.playing)
             assert client.core.clock.rtt_s >= 0.12
             client.link = "thin"

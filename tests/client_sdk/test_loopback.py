@@ -175,7 +175,7 @@ def test_a_game_that_begins_anew_is_waited_for() -> None:
     entity = client.entity
     program.game.shut_down("new rules", 2.0)
     program.run(1)
-    assert client.away
+    assert client.reconnecting
     program.run(4)
     assert client.playing
     assert client.entity == entity

@@ -53,14 +53,14 @@ class Pair:
 
     def ahead(self, *wishes: Input) -> None:
         """The client predicts these."""
-        for wish in wishes:
-            self.client.file(self.client.predicted.tick + 1, wish)
+        for input_ in wishes:
+            self.client.file(self.client.predicted.tick + 1, input_)
             self.client.step()
 
     def act(self, *wishes: Input, others: Input = NEUTRAL) -> None:
         """The server plays these."""
-        for wish in wishes:
-            self.server.step({e: wish if e == ME else others for e in self.server.entities["id"].tolist()})
+        for input_ in wishes:
+            self.server.step({e: input_ if e == ME else others for e in self.server.entities["id"].tolist()})
 
     def tell(self, since: int = 0, segments: Iterable[Cell] = (HERE, BESIDE), **fields: Any) -> str:
         """The client applies all that is there, of these segments."""
@@ -120,7 +120,7 @@ def test_a_rehearsal_changes_nothing() -> None:
     pair = Pair((17, 16, 1))
     pair.ahead(*[EAST] * 9)
     before = pair.client.predicted.state_hash()
-    pair.client.rehearse()
+    pair.client.sync_test()
     assert pair.client.predicted.state_hash() == before
 
 
@@ -286,7 +286,7 @@ def test_an_edit_is_there_at_once_and_again_after_a_replay() -> None:
     pair.client.edit(1, Edit(17, 16, 1, 4))
     pair.ahead(*[EAST] * 12)
     assert pair.client.predicted.position(ME)[0] == 17 - 5 / 8
-    pair.client.rehearse()
+    pair.client.sync_test()
     assert pair.client.predicted.position(ME)[0] == 17 - 5 / 8
     assert pair.client.confirmed.blocks.get(17, 16, 1) == 0
 

@@ -6,13 +6,13 @@ from client_sdk.base import set_link
 from client_sdk.core import Core
 from client_sdk.events import Corrected
 from client_sdk.loopback import Loopback
-from client_sdk.netsim.links import Path
+from client_sdk.netsim.links import Link
 from client_sdk.stats import Stats
 from server.game import Game
 from shared import kernels
 from shared.scene import load_scene
+from sovereign_netcode.playtest import Match, wander
 from tests.lengths import long
-from tests.match import Match, wander
 
 
 def test_rates_are_those_of_the_last_second() -> None:
@@ -102,11 +102,11 @@ def test_the_round_trip_is_that_of_the_last_seconds(before_s: float, after_s: fl
     """17 ms, and 17 ms for 15 s after the latency was set to 610: that was the least of the last 15 s."""
     match = Match(load_scene("flat"), 1)
     core = Core()
-    set_link(core, Path(before_s))
-    match.join(wander, Path(0.0085), core).frame_s = 0.004
+    set_link(core, Link(before_s))
+    match.join(wander, Link(0.0085), core).frame_s = 0.004
     match.run(20)
     assert core.stats.rtt_s == pytest.approx(0.017 + 2 * before_s, abs=0.005)
-    set_link(core, Path(after_s))
+    set_link(core, Link(after_s))
     match.run(3.5 + 2 * after_s)
     assert core.stats.rtt_s == pytest.approx(0.017 + 2 * after_s, abs=0.005)
     assert dict(core.stats.figures())["round trip"] == f"{core.stats.rtt_s * 1000:.0f} ms"
@@ -115,10 +115,10 @@ def test_the_round_trip_is_that_of_the_last_seconds(before_s: float, after_s: fl
 def test_what_a_player_sees_of_a_bad_moment_is_over_soon_after_it() -> None:
     match = Match(load_scene("flat"), 1)
     core = Core()
-    match.join(wander, Path(0.02), core)
+    match.join(wander, Link(0.02), core)
     match.run(20)
     assert dict(core.stats.figures())["late inputs"] == "0.00 %"
-    set_link(core, Path(0.2))  # the inputs on the way come 200 ms later
+    set_link(core, Link(0.2))  # the inputs on the way come 200 ms later
     match.run(1)
     assert float(dict(core.stats.figures())["late inputs"].removesuffix(" %")) > 0
     match.run(15)
@@ -129,7 +129,7 @@ def test_what_a_player_sees_of_a_bad_moment_is_over_soon_after_it() -> None:
 def test_figures_are_those_of_the_path() -> None:
     match = Match(load_scene("flat"), 1)
     core = Core()
-    match.join(wander, Path(0.05), core)
+    match.join(wander, Link(0.05), core)
     match.run(10)
     stats, before = core.stats, core.stats.bytes_up
     match.run(5)

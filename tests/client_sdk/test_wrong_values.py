@@ -10,7 +10,7 @@ import pytest
 
 from client_sdk import AsyncClient, Client, Loopback
 from client_sdk.core import Core
-from client_sdk.netsim.links import Path
+from client_sdk.netsim.links import Link
 from client_sdk.transports.connection import ConnectError
 from server.game import Game
 from shared.inputs import Input
@@ -49,7 +49,7 @@ CASES: list[tuple[str, str, Act, list[Any]]] = [
     ("set_input x", "x = ", lambda c, bad: c.set_input(bad, 0), [NAN, math.inf, 1e300, "1", None, [1], 1j]),
     ("set_input y", "y = ", lambda c, bad: c.set_input(0, bad), [NAN, -math.inf, "1", None, np.array([1, 2])]),
     ("set_input jump", "jump = ", lambda c, bad: c.set_input(0, 0, jump=bad), ["no", None, 0.5, []]),
-    ("wish", "wish", lambda c, bad: c.core.set_input(bad), [
+    ("input", "input", lambda c, bad: c.core.set_input(bad), [
         None, 5, (1, 0), [1, 0, 0], Input(1.5, 0, 0), Input(0, NAN, 0), Input(0, 0, 256), Input(0, "1", 0),  # type: ignore[arg-type]
     ]),
     ("delay", "ticks = ", lambda c, bad: c.set_input_delay(bad), [*WHOLE, -1, 4]),
@@ -72,20 +72,20 @@ def test_a_wrong_value_is_named_and_nothing_is_done(playing: Playing, said: str,
     assert core.prediction is not None
     for bad in wrong:
         before = (
-            core.wish,
+            core.input,
             core.controls.delay,
             client.link,
             core.prediction.predicted.state_hash(),
-            core._orders._number,
+            core._commands._number,
         )
         with pytest.raises((ValueError, TypeError), match=f"^{said}"):
             act(client, bad)
         after = (
-            core.wish,
+            core.input,
             core.controls.delay,
             client.link,
             core.prediction.predicted.state_hash(),
-            core._orders._number,
+            core._commands._number,
         )
         assert after == before
     playing.play(10)
@@ -96,11 +96,11 @@ def test_a_wrong_value_is_named_and_nothing_is_done(playing: Playing, said: str,
 def test_numbers_of_numpy_do_what_pythons_do(playing: Playing) -> None:
     client: Any = playing.client
     client.set_input(np.float32(1), np.int64(0), jump=np.True_)
-    assert client.core.wish == Input(127, 0, 1)
+    assert client.core.input == Input(127, 0, 1)
     parts: list[Any] = [np.int16(5), np.int64(6), np.uint8(1)]
     client.core.set_input(Input(*parts))
-    assert client.core.wish == Input(5, 6, 1)
-    assert [type(part) for part in client.core.wish] == [int] * 3
+    assert client.core.input == Input(5, 6, 1)
+    assert [type(part) for part in client.core.input] == [int] * 3
     client.set_input_delay(np.int64(0))
     client.core.set_input(Input())
     playing.play(10)
@@ -150,8 +150,8 @@ def test_a_loopback_without_a_game_is_refused(game: Any) -> None:
 )  # fmt: skip
 def test_a_path_that_cannot_be_is_refused(given: dict[str, Any], said: str) -> None:
     with pytest.raises(ValueError, match=f"^{said} = "):
-        Path(**given)
-    assert Path(rate=math.inf) == Path()
+        Link(**given)
+    assert Link(rate=math.inf) == Link()
 
 
 def test_a_patience_without_end_is_one() -> None:

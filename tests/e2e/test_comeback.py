@@ -52,7 +52,7 @@ def test_a_client_in_a_games_loop_survives_its_server(tmp_path: Path) -> None:
         assert player.plays(seconds=2) > MOVING_BLOCKS  # on disk by then
         process.kill()
         player.plays(until=lambda: happened(player, Disconnected))
-        assert client.away
+        assert client.reconnecting
         assert client.view().me is not None, "there is something to draw all the time"
     with server(tmp_path, port_of(url)):
         player.plays(until=lambda: happened(player, Resumed))

@@ -98,7 +98,7 @@ class Editor:
         self.own, self.waiting = [], {}
 
     def hear(self, snapshot: Snapshot) -> None:
-        self.used += snapshot.fates.count(messages.USED)
+        self.used += snapshot.statuses.count(messages.USED)
         self.places |= {state[X] for state in self.states(snapshot) if state[ID] == self.entity}
         if not self.own:
             (state,) = [state for state in self.states(snapshot) if state[ID] == self.entity]

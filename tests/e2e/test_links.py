@@ -18,13 +18,13 @@ from client_sdk.async_client import AsyncClient
 from client_sdk.bots import Bot, Policy, Wander
 from client_sdk.core import Core
 from client_sdk.events import Diverged, Event, Left
-from client_sdk.netsim.links import HEADER_BYTES, PRESETS, Path, path
+from client_sdk.netsim.links import HEADER_BYTES, PRESETS, Link, path
 from client_sdk.stats import Stats
 from shared.inputs import Input
 from shared.scene import load_scene
 from shared.world import World
+from sovereign_netcode.playtest import Match
 from tests.client_sdk.servers import real_server
-from tests.match import Match
 from tests.proxy import HIDDEN_BYTES, PACKET_BYTES, Proxy
 
 pytestmark = [pytest.mark.e2e, pytest.mark.alone]
@@ -40,10 +40,10 @@ class Hold:
     """Walks in one direction, whatever happens: nobody meets anybody."""
 
     def __init__(self, turn: int) -> None:
-        self._wish = Input(*((90, 0), (0, 90), (-90, 0), (0, -90))[turn % 4], 0)
+        self._input = Input(*((90, 0), (0, 90), (-90, 0), (0, -90))[turn % 4], 0)
 
     def __call__(self, world: World, me: int) -> Input:
-        return self._wish
+        return self._input
 
 
 class Fidget:
@@ -57,23 +57,23 @@ class Fidget:
 
 
 @dataclass(frozen=True)
-class Link:
-    path: Path
+class Case:
+    path: Link
     seconds: float
     policy: Callable[[int], Policy]
 
 
 DIP_S, DIP_RATE = (4.0, 9.0), 25e3
 LINKS = {
-    "typical": Link(PRESETS["typical"], 9.0, lambda turn: Wander(random.Random(turn))),
+    "typical": Case(PRESETS["typical"], 9.0, lambda turn: Wander(random.Random(turn))),
     # Too narrow for a snapshot in every tick.
-    "dip": Link(
+    "dip": Case(
         replace(path(50, 2), rate=2e6, dip=(DIP_S[1], DIP_S[1] - DIP_S[0], DIP_RATE)),
         11.0,
         Fidget,
     ),
     # From 3.8 to 4.0 s, from 5.8, and from 7.8: with what follows, just shorter than missing inputs are repeated.
-    "outage": Link(replace(path(50, 2), outage=(2.0, 0.2)), 9.0, Hold),
+    "outage": Case(replace(path(50, 2), outage=(2.0, 0.2)), 9.0, Hold),
 }
 
 
@@ -140,14 +140,14 @@ class Figures:
         )
 
 
-def simulated(link: Link) -> Figures:
+def simulated(link: Case) -> Figures:
     match = Match(load_scene("flat"), 5)
     seen = [Seen(Bot(link.policy(turn)), now=lambda: match.now) for turn in range(CLIENTS)]
 
     def policy(each: Seen) -> Callable[[Core, random.Random], Input]:
         def look(core: Core, _: random.Random) -> Input:
             each(core)
-            return core.wish
+            return core.input
 
         return look
 
@@ -162,7 +162,7 @@ def simulated(link: Link) -> Figures:
     return Figures(seen, link.seconds)
 
 
-async def measured(link: Link, url: str) -> Figures:
+async def measured(link: Case, url: str) -> Figures:
     host, _, port = url.removeprefix("ws://").rpartition(":")
     async with Proxy((host, int(port)), link.path) as proxy:
         seen = [Seen(Bot(link.policy(turn)), now=lambda: proxy.now) for turn in range(CLIENTS)]

@@ -8,7 +8,7 @@ from contextlib import asynccontextmanager, suppress
 
 import pytest
 
-from client_sdk.netsim.links import Path
+from client_sdk.netsim.links import Link
 from tests.proxy import Proxy
 
 pytestmark = pytest.mark.e2e
@@ -17,7 +17,7 @@ Ends = tuple[asyncio.StreamReader, asyncio.StreamWriter]
 
 
 @asynccontextmanager
-async def connected(path: Path) -> AsyncIterator[tuple[Proxy, Ends, Ends]]:
+async def connected(path: Link) -> AsyncIterator[tuple[Proxy, Ends, Ends]]:
     """A proxy and the two ends of a connection through it: the client's and the server's."""
     ends: asyncio.Queue[Ends] = asyncio.Queue()
     server = await asyncio.start_server(lambda *end: ends.put_nowait(end), "127.0.0.1", 0)
@@ -33,7 +33,7 @@ async def connected(path: Path) -> AsyncIterator[tuple[Proxy, Ends, Ends]]:
 
 async def test_bytes_arrive_in_order_and_no_earlier_than_they_can() -> None:
     sent = bytes(range(256)) * 100
-    async with connected(Path(0.05, 0.03, 0.05)) as (_, (_, writer), (reader, _)):
+    async with connected(Link(0.05, 0.03, 0.05)) as (_, (_, writer), (reader, _)):
         began = time.monotonic()
         for at in range(0, len(sent), 1000):
             writer.write(sent[at : at + 1000])
@@ -45,7 +45,7 @@ async def test_bytes_arrive_in_order_and_no_earlier_than_they_can() -> None:
 
 async def test_both_ways_and_both_ends() -> None:
     sent = bytes(range(256)) * 50
-    async with connected(Path(0.01, 0.01)) as (_, (reader, writer), (far_reader, far_writer)):
+    async with connected(Link(0.01, 0.01)) as (_, (reader, writer), (far_reader, far_writer)):
         writer.write(sent)
         writer.write_eof()
         assert await far_reader.read(-1) == sent
@@ -55,7 +55,7 @@ async def test_both_ways_and_both_ends() -> None:
 
 
 async def test_a_narrow_line_takes_its_time_and_holds_the_sender_up() -> None:
-    async with connected(Path(0.0, rate=160e3)) as (_, (_, writer), (reader, _)):
+    async with connected(Link(0.0, rate=160e3)) as (_, (_, writer), (reader, _)):
         began = time.monotonic()
         writer.transport.get_extra_info("socket").setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 4096)
         writer.write(bytes(20_000))
@@ -67,7 +67,7 @@ async def test_a_narrow_line_takes_its_time_and_holds_the_sender_up() -> None:
 
 
 async def test_a_stall_holds_everything_until_it_is_over() -> None:
-    async with connected(Path()) as (proxy, (reader, writer), (_, far_writer)):
+    async with connected(Link()) as (proxy, (reader, writer), (_, far_writer)):
         proxy.stall()
         writer.write(b"a")
         far_writer.write(b"b")
@@ -78,7 +78,7 @@ async def test_a_stall_holds_everything_until_it_is_over() -> None:
 
 
 async def test_an_outage_of_the_path_is_over_in_time() -> None:
-    async with connected(Path(outage=(0.6, 0.3))) as (proxy, (_, writer), (reader, _)):
+    async with connected(Link(outage=(0.6, 0.3))) as (proxy, (_, writer), (reader, _)):
         await asyncio.sleep(0.35 - proxy.now)
         writer.write(b"a")
         assert await reader.read(1) == b"a"
@@ -86,7 +86,7 @@ async def test_an_outage_of_the_path_is_over_in_time() -> None:
 
 
 async def test_a_cut_is_noticed_at_both_ends() -> None:
-    async with connected(Path(0.01)) as (proxy, (reader, writer), (far_reader, _)):
+    async with connected(Link(0.01)) as (proxy, (reader, writer), (far_reader, _)):
         writer.write(b"a")
         assert await far_reader.read(1) == b"a"
         await proxy.cut()

@@ -2,8 +2,8 @@
 
 from sovereign_netcode.client_sdk.bots import Policy
 from sovereign_netcode.examples.freeze import Freeze
+from sovereign_netcode.playtest import Link as Line
 from sovereign_netcode.playtest import Match, Player, bot
-from sovereign_netcode.playtest import Path as Line
 from sovereign_netcode.shared.inputs import NEUTRAL, Input, make_input
 from sovereign_netcode.shared.scene import load_scene
 from sovereign_netcode.shared.world import World
@@ -38,14 +38,14 @@ def test_who_is_touched_freezes_and_is_thawed_by_a_friend() -> None:
     match = Match(load_scene(Freeze.scene), seed=3, rules=Freeze())
     ann, bob = match.join(bot(to(2)), TYPICAL), match.join(bot(heading(-1, 0)), TYPICAL)
     match.run(1)
-    game = match.game.stage
+    game = match.game.api
     assert game.template(ann.core.entity) == "freezer"
     match.run_until(lambda: game.template(bob.core.entity) == "frozen", 20)
     match.run(2)
     place = game.position(bob.core.entity)
     match.run(2)
     assert game.position(bob.core.entity) == place
-    assert bob.core.wish.move_x == -127, "it would if it could"
+    assert bob.core.input.move_x == -127, "it would if it could"
 
     ann.policy = bot(heading(-1, 0))
     match.run(3)

@@ -10,17 +10,17 @@ import pytest
 from sovereign_netcode.client_sdk.events import Diverged, Happened, Left
 from sovereign_netcode.examples.tag import Tag
 from sovereign_netcode.examples.tag_brain import TagPlayer
-from sovereign_netcode.playtest import Match, Path, Player, bot
+from sovereign_netcode.playtest import Link, Match, Player, bot
 from sovereign_netcode.server.journal.records import NOTE, Recording
 from sovereign_netcode.server.players.persisted_state import restored
 from sovereign_netcode.shared.scene import load_scene
 from tests.lengths import long
 
-TYPICAL = Path(0.05, 0.01, 0.01)
+TYPICAL = Link(0.05, 0.01, 0.01)
 CAUSES = {"late input", "other entity", "server act", "unknown edit", "missing terrain"}
 
 
-def played(count: int, seconds: float, seed: int, path: Path) -> tuple[Match, list[Player], io.BytesIO]:
+def played(count: int, seconds: float, seed: int, path: Link) -> tuple[Match, list[Player], io.BytesIO]:
     """A recorded game of so many bots."""
     match = Match(load_scene(Tag.scene), seed, rules=Tag())
     recording = io.BytesIO()
@@ -33,7 +33,7 @@ def played(count: int, seconds: float, seed: int, path: Path) -> tuple[Match, li
 
 
 def said(match: Match) -> dict[int, Any]:
-    return {entity: match.game.stage.kept.attributes.get(entity) for entity in match.game.stage.entities()}
+    return {entity: match.game.api.kept.attributes.get(entity) for entity in match.game.api.entities()}
 
 
 @pytest.mark.parametrize(("count", "seconds"), [(6, 15), *long((20, 605))], ids=["short", "long"])
@@ -51,7 +51,7 @@ def test_bots_play_tag_and_a_recording_gives_the_same_scores(count: int, seconds
     assert len(tagged) >= seconds / 30, "they catch each other"
     for one, two in pairwise(tagged):
         assert one.data["who"] == two.data["by"], "who has been tagged is it"
-        if two.tick - one.tick < game.stage.ticks(Tag.safe_s):
+        if two.tick - one.tick < game.api.ticks(Tag.safe_s):
             assert two.data["who"] != one.data["by"], "not back at once"
 
     recording = Recording(file)
@@ -61,6 +61,6 @@ def test_bots_play_tag_and_a_recording_gives_the_same_scores(count: int, seconds
     assert recording.world.state_hash() == game.world.state_hash()
     kept = restored(notes)
     assert {entity: kept.attributes.get(entity) for entity in said(match)} == said(match)
-    assert kept.shared == dict(game.stage.shared)
+    assert kept.shared == dict(game.api.shared)
     scores = [attributes["score"] for attributes in said(match).values()]
     assert max(scores) > 0

@@ -15,9 +15,9 @@ from shared import exports, kernels
 from shared.kernels import Kernel
 from shared.layout import X
 from shared.scene import load_scene
+from sovereign_netcode.playtest import Match, wander
 from tests.kernels import chains
 from tests.kernels.tape import Tape
-from tests.match import Match, wander
 from tests.worlds import build, floor
 
 ROOT = Path(__file__).parent.parent.parent

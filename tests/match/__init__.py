@@ -1,5 +1,6 @@
-"""The former name of `sovereign_netcode.playtest`."""
+"""The former name of `sovereign_netcode.playtest`: reports of faults from outside the project import it."""
 
-from sovereign_netcode.playtest.match import Match, Path, Player, Policy, bot, wander
+from sovereign_netcode.playtest.match import Link as Path
+from sovereign_netcode.playtest.match import Match, Player, Policy, bot, wander
 
 __all__ = ["Match", "Path", "Player", "Policy", "bot", "wander"]

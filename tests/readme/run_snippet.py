@@ -47,12 +47,12 @@ class Company(Rules):
 
 
 def in_this_process(
-    wish: tuple[float, float], done: Callable[[View], None], tap: Callable[[], object] | None = None
+    input_: tuple[float, float], done: Callable[[View], None], tap: Callable[[], object] | None = None
 ) -> None:
     """Makes `Client` one of a game within this process.
 
     Args:
-        wish: the direction that the program is to set.
+        input_: the direction that the program is to set.
         done: called once the player has walked, with what the program has drawn last.
         tap: presses and releases the space bar between two frames; the program has to set a jump for it, once.
     """
@@ -80,7 +80,7 @@ def in_this_process(
         return poll(self)
 
     def wished(self: Client, x: float, y: float, *, jump: bool) -> None:
-        assert (x, y) == wish
+        assert (x, y) == input_
         if jump:
             jumps.append(now[0])
         set_input(self, 1, 0, jump=True)  # the ground is not even

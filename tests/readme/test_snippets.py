@@ -95,7 +95,7 @@ def test_the_smallest_game() -> None:
     match.join(bot(Follow(Random(1))))
     match.join(bot(Wander(Random(2))))
     match.run(20)
-    game = match.game.stage
+    game = match.game.api
     scores = [game.get(entity, "score") for entity in game.entities("player")]
     assert len(scores) == 2
     assert scores[0] == scores[1] > 0
@@ -109,7 +109,7 @@ def test_a_thread_that_comes_back_into_a_tick() -> None:
     match.run_until(lambda: ann.core.state == "playing", 30)
     rules.pool.shutdown()
     match.run(1)
-    assert match.game.stage.get(ann.core.entity, "gold") == 3
+    assert match.game.api.get(ann.core.entity, "gold") == 3
     assert match.game.counters.rules_failed == 0
 
 

@@ -7,7 +7,7 @@ from dataclasses import fields
 from typing import get_args
 
 from client_sdk import events
-from server.game_api.api import Stage
+from server.game_api.api import GameApi
 from server.rules import Rules
 from shared.scene import Template
 from tests.readme.pages import ROOT, section
@@ -44,7 +44,7 @@ def test_the_game_api() -> None:
     text = section(README, "Your own game").partition("### The game API")[2].partition("###")[0]
     rows = "".join(re.findall(r"^\|.*\n", text, re.MULTILINE))
     named = re.findall(r"`(\w+)(?:\([^`]*\))?`", rows)
-    public = {name for name in vars(Stage) if not name.startswith("_")} - CALLED_BY_THE_GAME
+    public = {name for name in vars(GameApi) if not name.startswith("_")} - CALLED_BY_THE_GAME
     assert sorted(named) == sorted({*public, "players"})
 
 

@@ -20,10 +20,10 @@ from shared.blocks import Blocks
 from shared.inputs import NEUTRAL, Input
 from shared.scene import SCENES, load_scene
 from shared.world import World
+from sovereign_netcode.playtest import Link as Line
+from sovereign_netcode.playtest import Match, Player
 from tests.e2e.processes import END_S, START_S, until
 from tests.lengths import long, long_but
-from tests.match import Match, Player
-from tests.match import Path as Line
 
 ROOT = Path(__file__).resolve().parents[2]
 os.environ["SDL_VIDEODRIVER"] = "dummy"
@@ -123,12 +123,12 @@ class Session:
     def __init__(self, latency_s: float = 0.01, scene: str = "meadow", rules: Rules | None = None) -> None:
         self.match = Match(load_scene(scene), 5, rules=rules or Tag())
         self.core = Core("Ann")
-        self.player: Player = self.match.join(self._wish, Line(latency_s), self.core)
+        self.player: Player = self.match.join(self._input, Line(latency_s), self.core)
         self.window = Window(Client(self.core, Idle()), keyboard, "Tag")
         self.run(2)
 
-    def _wish(self, core: object, rng: random.Random) -> Input:
-        return self.core.wish if self.core.state == "playing" else NEUTRAL
+    def _input(self, core: object, rng: random.Random) -> Input:
+        return self.core.input if self.core.state == "playing" else NEUTRAL
 
     def run(self, seconds: float) -> None:
         """So long, at 20 frames a second."""
@@ -152,7 +152,7 @@ def test_everybody_is_in_the_picture_and_the_keys_do_what_they_say() -> None:
     session = Session()
     window, core = session.window, session.core
     assert core.state == "playing"
-    assert {actor.figure.entity for actor in window.actors} == set(session.match.game.stage.entities())
+    assert {actor.figure.entity for actor in window.actors} == set(session.match.game.api.entities())
     assert sum(actor.own for actor in window.actors) == sum(actor.it for actor in window.actors) == 1
     assert len({actor.tone for actor in window.actors}) == len(window.actors) == Tag.players_min
     assert session.colours() > 200
@@ -230,7 +230,7 @@ EVERY = itertools.product([Rules, Tag, Freeze], sorted(path.stem for path in SCE
 def test_every_game_is_drawn_in_every_scene(make: type[Rules], scene: str) -> None:
     session = Session(scene=scene, rules=make())
     assert session.core.state == "playing"
-    assert {actor.figure.entity for actor in session.window.actors} == set(session.match.game.stage.entities())
+    assert {actor.figure.entity for actor in session.window.actors} == set(session.match.game.api.entities())
     assert session.colours() > 200
     assert session.match.game.counters.rules_failed == 0
 

@@ -11,8 +11,8 @@ from scripts.soak_test.walkers import LOOK_S, Walker, walk
 from shared.inputs import Input
 from shared.messages import Inputs, decode_from_client
 from shared.scene import load_scene
+from sovereign_netcode.playtest import Link as Line
 from sovereign_netcode.playtest import Match
-from sovereign_netcode.playtest import Path as Line
 
 HZ = 32
 
@@ -88,7 +88,7 @@ def joined() -> tuple[Match, Deaf]:
 
     def policy(core: Core, rng: Random) -> Input:
         walk(core)
-        return core.wish
+        return core.input
 
     match.join(policy, Line(0.02), core)
     match.run(5)

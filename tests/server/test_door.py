@@ -4,7 +4,7 @@ import pytest
 
 from server.config.hosts import is_loopback, network_of
 from server.config.limits import Limits
-from server.net.admission import SPARE, SPARE_PER_ADDRESS, Door, Request
+from server.net.admission import SPARE, SPARE_PER_ADDRESS, Admission, Request
 from server.observability.pages import Page, Pages
 
 JOIN = Request("GET", "/", "play.example:8765", None, upgrade=True)
@@ -17,7 +17,7 @@ def refused(page: Page | None) -> tuple[int, str]:
 
 
 def test_an_address_gets_its_share_and_pages_beyond_it_and_then_nothing() -> None:
-    door = Door(Limits(connections_per_address=2))
+    door = Admission(Limits(connections_per_address=2))
     for _ in range(2):
         assert door.arrive("1.2.3.4")
         assert door.answer(JOIN, "1.2.3.4", 0.0) is None
@@ -36,7 +36,7 @@ def test_an_address_gets_its_share_and_pages_beyond_it_and_then_nothing() -> Non
 
 
 def test_what_has_left_leaves_nothing_behind() -> None:
-    door = Door(Limits(connections_per_address=1))
+    door = Admission(Limits(connections_per_address=1))
     for n in range(1000):
         address = f"10.0.{n >> 8}.{n & 255}"
         assert door.arrive(address)
@@ -45,7 +45,7 @@ def test_what_has_left_leaves_nothing_behind() -> None:
 
 
 def test_all_connections_together_have_a_limit() -> None:
-    door = Door(Limits(connections_max=3))
+    door = Admission(Limits(connections_max=3))
     assert all(door.arrive("127.0.0.1") for _ in range(3 + SPARE))
     status, text = refused(door.answer(JOIN, "127.0.0.1", 0.0))
     assert (status, text) == (503, "the server is full (3 connections)")
@@ -55,7 +55,7 @@ def test_all_connections_together_have_a_limit() -> None:
 
 
 def test_joins_have_a_rate_and_a_burst_of_two_seconds() -> None:
-    door = Door(Limits(joins_per_s=10.0))
+    door = Admission(Limits(joins_per_s=10.0))
 
     def joins(now: float) -> int:
         n = 0
@@ -70,14 +70,14 @@ def test_joins_have_a_rate_and_a_burst_of_two_seconds() -> None:
 
 
 def test_a_rate_below_one_in_two_seconds_lets_somebody_in() -> None:
-    door = Door(Limits(joins_per_s=0.1))
+    door = Admission(Limits(joins_per_s=0.1))
     found = [door.answer(JOIN, "1.2.3.4", now) is None for now in (0.0, 1.0, 9.0, 10.5, 11.0, 21.0)]
     assert found == [True, False, False, True, False, True]
 
 
 def test_this_machine_is_limited_only_on_request() -> None:
-    exempt = Door(Limits(connections_per_address=1))
-    limited = Door(Limits(connections_per_address=1, loopback_exempt=False))
+    exempt = Admission(Limits(connections_per_address=1))
+    limited = Admission(Limits(connections_per_address=1, loopback_exempt=False))
     for address in ("127.0.0.1", "::1", "::ffff:127.0.0.1"):
         for door in (exempt, limited):
             door.arrive(address)
@@ -117,7 +117,7 @@ def test_ipv6_counts_by_the_network_that_one_customer_has() -> None:
     ],
 )
 def test_browsers_come_from_known_pages(allowed: tuple[str, ...], origin: str | None, host: str, welcome: bool) -> None:
-    door = Door(origins=allowed)
+    door = Admission(origins=allowed)
     page = door.answer(Request("GET", "/", host, origin, upgrade=True), "1.2.3.4", 0.0)
     assert (page is None) is welcome
     if page is not None:
@@ -126,7 +126,7 @@ def test_browsers_come_from_known_pages(allowed: tuple[str, ...], origin: str | 
 
 def test_a_server_that_goes_down_says_when_to_come_back() -> None:
     wait: list[float] = []
-    door = Door(closing=lambda: wait[0] if wait else None)
+    door = Admission(closing=lambda: wait[0] if wait else None)
     assert door.answer(JOIN, "127.0.0.1", 0.0) is None
     wait.append(3.2)
     page = door.answer(JOIN, "127.0.0.1", 0.0)
@@ -149,7 +149,7 @@ def test_a_server_that_goes_down_says_when_to_come_back() -> None:
     ],
 )
 def test_figures_are_not_for_everyone(figures: str, seen_from: list[str]) -> None:
-    door = Door(pages=Pages(private={"/stats": lambda: Page(200, b"{}")}), figures=figures)
+    door = Admission(pages=Pages(private={"/stats": lambda: Page(200, b"{}")}), figures=figures)
     for address in (
         "127.0.0.1",
         "::1",
@@ -181,7 +181,7 @@ OTHER_HOSTS = [
 @pytest.mark.parametrize("path", ["/", "/live", "/live/0", "/stats", "/metrics", "/healthz", "/readyz", "/nothing"])
 def test_pages_are_not_given_by_a_name_that_somebody_else_has_pointed_here(path: str) -> None:
     figures = {path: lambda: Page(200, b"figures")}
-    door = Door(pages=Pages(private=figures), hosts=("127.0.0.1", "Play.example"))
+    door = Admission(pages=Pages(private=figures), hosts=("127.0.0.1", "Play.example"))
     for host in OWN_HOSTS:
         assert refused(door.answer(Request("GET", path, host, None, upgrade=False), "127.0.0.1", 0.0))[0] == 200, host
     assert door.refused == {}
@@ -194,7 +194,7 @@ def test_pages_are_not_given_by_a_name_that_somebody_else_has_pointed_here(path:
 
 
 def test_an_operator_can_allow_every_name_for_pages_but_not_for_players_from_there() -> None:
-    door = Door(hosts=("*",))
+    door = Admission(hosts=("*",))
     for host in OTHER_HOSTS:
         assert refused(door.answer(Request("GET", "/healthz", host, None, upgrade=False), "127.0.0.1", 0.0))[0] == 200
         if host != "*":
@@ -203,12 +203,12 @@ def test_an_operator_can_allow_every_name_for_pages_but_not_for_players_from_the
 
 
 def test_a_client_that_is_no_browser_may_call_the_server_as_it_likes() -> None:
-    door = Door()
+    door = Admission()
     assert door.answer(Request("GET", "/", "evil.example:8765", None, upgrade=True), "127.0.0.1", 0.0) is None
 
 
 def test_browsers_come_from_the_own_pages_by_every_own_name() -> None:
-    door = Door(hosts=("play.example",))
+    door = Admission(hosts=("play.example",))
     for host, origin, welcome in (
         ("play.example:8765", "http://play.example:8765", True),
         ("PLAY.example", "https://play.EXAMPLE", True),
@@ -220,5 +220,5 @@ def test_browsers_come_from_the_own_pages_by_every_own_name() -> None:
 
 
 def test_a_long_name_is_cut_in_the_answer() -> None:
-    _, text = refused(Door().answer(Request("GET", "/", "x" * 9000, None, upgrade=False), "1.2.3.4", 0.0))
+    _, text = refused(Admission().answer(Request("GET", "/", "x" * 9000, None, upgrade=False), "1.2.3.4", 0.0))
     assert len(text) < 250

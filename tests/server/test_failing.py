@@ -10,7 +10,7 @@ import pytest
 
 from server.game import joining
 from server.game.roster import Roster
-from server.game_api.api import Stage
+from server.game_api.api import GameApi
 from server.persistence import store as stores
 from server.persistence.checkpoint import Copy
 from server.persistence.database import read
@@ -33,7 +33,7 @@ def fails(*args: Any, **given: Any) -> Any:
 @pytest.mark.parametrize(
     ("owner", "name", "told"),
     [
-        (Stage, "set", []),  # ahead of `on_join`
+        (GameApi, "set", []),  # ahead of `on_join`
         (Roster, "issue", ["join", "leave"]),
         (joining, "Welcome", ["join", "leave"]),
     ],
@@ -52,8 +52,8 @@ def test_a_join_that_fails_leaves_nothing_behind(
     assert link.closings == [(messages.INTERNAL, "internal error")]
     assert [what for what, *_ in rules.told] == told
     assert table.game.faults.total == 1
-    assert list(table.game.players) == [witness.session.entity] == table.game.stage.entities()
-    assert list(table.game.stage.kept.attributes) == []
+    assert list(table.game.players) == [witness.session.entity] == table.game.api.entities()
+    assert list(table.game.api.kept.attributes) == []
     assert (link.session.player, link.session.entity, link.session in table.game.sessions) == (None, 0, False)
     table.store._copy_due = True
     table.tick(2)
@@ -181,7 +181,7 @@ def test_a_tick_whose_record_fails_goes_on_and_is_made_up_for(
         return not table.store.trouble
 
     until(goes_on)
-    table.game.stage.set_block(3, 3, 3, 5)  # a quiet tick might not be written at once
+    table.game.api.set_block(3, 3, 3, 5)  # a quiet tick might not be written at once
     table.tick()
     assert [record.levelno for record in caplog.records if "cannot save" in record.message] == [logging.ERROR]
     copy = Store(copied(tmp_path / "data", tmp_path / "copy"), table.game.scene, compiled=False)

@@ -34,7 +34,7 @@ def test_an_input_moves_the_player_in_its_tick(table: Table) -> None:
     table.tick()
     assert table.game.world.position(1)[0] == 16 + 3 / 64
     snapshot = link.got(Snapshot)[-1]
-    assert (snapshot.newest, snapshot.first, snapshot.fates) == (3, 3, bytes([messages.USED]))
+    assert (snapshot.newest, snapshot.first, snapshot.statuses) == (3, 3, bytes([messages.USED]))
 
 
 def test_who_leaves_is_gone_before_who_comes_is_placed(table: Table) -> None:
@@ -123,7 +123,7 @@ def test_a_link_that_is_full_is_skipped_and_catches_up_in_one_snapshot(table: Ta
     link.waiting = 0
     table.tick()
     snapshot = link.got(Snapshot)[-1]
-    assert (snapshot.first, len(snapshot.fates), ids(snapshot)) == (snapshot.tick - 5, 6, [2])
+    assert (snapshot.first, len(snapshot.statuses), ids(snapshot)) == (snapshot.tick - 5, 6, [2])
     assert [part[3] for part in snapshot.segments] == [6]
     assert table.game.counters.snapshots_skipped == 5
 

@@ -19,7 +19,7 @@ from websockets.utils import apply_mask
 
 from server.config.limits import Limits
 from server.net import websocket as module
-from server.net.admission import SPARE_PER_ADDRESS, Door
+from server.net.admission import SPARE_PER_ADDRESS, Admission
 from server.net.gateway import Gateway
 from server.net.websocket import Connection
 from server.observability.pages import Pages, json_page
@@ -121,7 +121,7 @@ class Bench:
         self.notes = Notes()
         self.figures: Callable[[], Mapping[str, Any]] = lambda: {"tick": 7}
         pages = Pages(private={"/stats": json_page(lambda: self.figures())}, failed=lambda path: self.failed(path))
-        self.gateway = Gateway(self.notes, Door(Limits(handshake_s=HANDSHAKE_S), pages))
+        self.gateway = Gateway(self.notes, Admission(Limits(handshake_s=HANDSHAKE_S), pages))
         self.address = ("", 0)
         self.peers: list[Peer] = []
 

@@ -40,7 +40,7 @@ def test_who_says_hello_is_welcomed_and_shown_the_world_in_the_next_tick(table: 
     assert len(welcome.resume) == fields.RESUME_BYTES
     assert isinstance(snapshot, Snapshot)
     assert isinstance(terrain, Terrain)
-    assert (snapshot.tick, snapshot.newest, len(snapshot.fates), len(snapshot.segments)) == (1, -1, 1, 1)
+    assert (snapshot.tick, snapshot.newest, len(snapshot.statuses), len(snapshot.segments)) == (1, -1, 1, 1)
     table.tick()
     assert link.got(Snapshot)[-1].tick == 2
     assert table.game.counters.joined == 1

@@ -11,7 +11,7 @@ import trustme
 
 from server.config.limits import Limits
 from server.net import tls_accept
-from server.net.admission import SPARE_PER_ADDRESS, Door
+from server.net.admission import SPARE_PER_ADDRESS, Admission
 from server.net.gateway import Gateway
 
 TIME_OUT_S = 30.0
@@ -50,7 +50,7 @@ def trust(authority: trustme.CA) -> ssl.SSLContext:
 
 @pytest_asyncio.fixture
 async def gateway() -> AsyncIterator[Gateway]:
-    gateway = Gateway(Silent(), Door(Limits(connections_per_address=ALLOWED, loopback_exempt=False)))
+    gateway = Gateway(Silent(), Admission(Limits(connections_per_address=ALLOWED, loopback_exempt=False)))
     yield gateway
     gateway.stop_listening()
 

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from server import app
 from server.config.options import SettingsError
 from server.journal import former
-from server.journal.recorded_world import Pen, RecordedWorld
+from server.journal.recorded_world import Observer, RecordedWorld
 from server.journal.records import (
     FILL,
     MAGIC,
@@ -167,7 +167,7 @@ def test_two_pens_write_the_same_and_each_ends_on_its_own() -> None:
     copy = World(world.scene, compiled=False)
     copy.restore(world)
 
-    class Second(Pen):
+    class Second(Observer):
         def __init__(self) -> None:
             super().__init__(first=False)
             self.records: list[list[Any]] = []

@@ -46,7 +46,7 @@ def played(table: Stored) -> tuple[FakeLink, bytes]:
     link = table.connect(Hello(messages.VERSION, {}, "Ann"))
     table.tick(64)
     link.say(Inputs(table.tick_number + 1, table.tick_number, bytes((127, 0, 0)) * 8), order(7, 0, 18, 16, 1, 5))
-    game = table.game.stage
+    game = table.game.api
     npc = game.spawn("stone", (10.0, 10.0, 1.0), mood="calm")
     game.set(npc, "mood", "cross")
     game.share("score", [1, 2])
@@ -67,7 +67,7 @@ def goes_on(table: Stored, before: FakeLink, token: bytes, rules: Told) -> None:
     assert me == before.session.entity
     assert attributes(link) == {me: {"name": "Ann"}, 2: {"mood": "cross"}}
     assert link.got(Shared) == [Shared({"score": [1, 2]})]
-    table.game.stage.remove(2)
+    table.game.api.remove(2)
     table.tick()
     assert 2 in [entity for snapshot in link.got(messages.Snapshot) for entity in gone(snapshot)]
     # An order that had been answered is answered again, and not carried out again.
@@ -78,14 +78,14 @@ def goes_on(table: Stored, before: FakeLink, token: bytes, rules: Told) -> None:
 
 def test_who_touched_before_a_stop_is_not_told_to_have_begun_after_it(tmp_path: Path) -> None:
     first, told = Stored(tmp_path, Told()), Told()
-    a, b = (first.game.stage.spawn("runner", (x, 16.0, 1.0)) for x in (10.0, 10.0 - 0.625))
+    a, b = (first.game.api.spawn("runner", (x, 16.0, 1.0)) for x in (10.0, 10.0 - 0.625))
     first.tick(2)
     first.stop()
     second = Stored(tmp_path, told)
-    second.game.stage.steer(a, 0, 1)
+    second.game.api.steer(a, 0, 1)
     second.tick(8)
     assert second.game.world.position(a)[1] > 16.0
-    assert second.game.stage.touching(a) == [b]
+    assert second.game.api.touching(a) == [b]
     assert told.told == []
     second.stop()
 

@@ -59,7 +59,7 @@ def test_who_is_where_and_what_they_are_called() -> None:
     table.connect(Hello(VERSION, {}, ""))
     table.tick()
     game = table.game
-    slab = game.stage.spawn("slab", (4.25, 7.5, 2.0), name="the slab")
+    slab = game.api.spawn("slab", (4.25, 7.5, 2.0), name="the slab")
     page = live(table)
     before = page.state()
     assert before["scene"] == "test"
@@ -88,7 +88,7 @@ def test_what_is_shared_and_json_has_no_word_for_is_text() -> None:
     table.join()
     shares = {"time": 1.5, "seed": b"\x00", "odds": float("nan"), "of": [{"id": b"\x01"}], "teams": ["red"]}
     for name, value in shares.items():
-        table.game.stage.share(name, value)
+        table.game.api.share(name, value)
     answer = live(table).pages()["/live"]()
 
     def no_json(name: str) -> None:

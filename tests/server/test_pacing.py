@@ -1,6 +1,6 @@
 """How much may be on the way: by hand-made paths."""
 
-from server.replication.flow_control import HOLD_S_MAX, LEAST_BYTES, NARROW_S, RTT_WINDOW_S, SAMPLE_S, Pacing
+from server.replication.flow_control import HOLD_S_MAX, LEAST_BYTES, NARROW_S, RTT_WINDOW_S, SAMPLE_S, FlowControl
 
 TICK_S = 1 / 32
 
@@ -11,20 +11,20 @@ class Path:
     def __init__(self, outstanding: int | None = 0) -> None:
         self.outstanding = outstanding
         self.asked = 0
-        self.pacing = Pacing(self._ask)
+        self.flow = FlowControl(self._ask)
 
     def _ask(self) -> int | None:
         self.asked += 1
         return self.outstanding
 
     def window(self, snapshot_bytes: int, now: float) -> int:
-        return self.pacing.window(snapshot_bytes, TICK_S, now)
+        return self.flow.window(snapshot_bytes, TICK_S, now)
 
     def stream(self, seconds: float, bytes_per_tick: int, start: float = 0.0) -> float:
         """Sends evenly while so much is on the way; the time afterwards."""
         now = start
         for _ in range(int(seconds / TICK_S)):
-            self.pacing.sent_bytes += bytes_per_tick
+            self.flow.sent_bytes += bytes_per_tick
             now += TICK_S
             self.window(bytes_per_tick, now)
         return now
@@ -38,27 +38,27 @@ def test_of_an_unknown_path_two_snapshots_may_be_on_the_way() -> None:
 def test_the_rate_is_what_has_been_acknowledged() -> None:
     path = Path()
     path.stream(2.0, 320)
-    assert path.pacing.rate == 320 / TICK_S
+    assert path.flow.rate == 320 / TICK_S
 
 
 def test_three_round_trips_of_the_rate_may_be_on_the_way_and_of_a_long_path_one_and_a_half() -> None:
     for rtt_s, hold_s in ((0.1, 0.3), (0.2, 0.6), (0.3, HOLD_S_MAX), (1.0, 1.5)):
         path = Path()
-        path.pacing.answered(rtt_s, 0, 0.0)
+        path.flow.answered(rtt_s, 0, 0.0)
         now = path.stream(2.0, 3200)
-        assert path.window(10, now) == int(path.pacing.rate * (hold_s + TICK_S))
+        assert path.window(10, now) == int(path.flow.rate * (hold_s + TICK_S))
 
 
 def test_a_fall_of_the_rate_is_known_after_a_second() -> None:
     path = Path()
     now = path.stream(2.0, 3200)
-    fast = path.pacing.rate
+    fast = path.flow.rate
     path.stream(2.0, 320, now)
-    assert path.pacing.rate == fast / 10
+    assert path.flow.rate == fast / 10
 
 
 def test_the_shortest_round_trip_counts() -> None:
-    pacing = Path().pacing
+    pacing = Path().flow
     for now, rtt_s in enumerate((0.09, 0.05, 0.2, 0.07)):
         pacing.answered(rtt_s, 0, float(now))
     assert pacing.least_rtt_s == 0.05
@@ -68,48 +68,48 @@ def test_of_a_full_path_the_width_is_no_distance() -> None:
     path = Path()
     now = path.stream(2.0, 320) + SAMPLE_S
     path.outstanding = 10**6
-    assert path.window(320, now) < path.pacing.outstanding == 10**6  # full
-    path.pacing.answered(0.1, 512, now)
-    assert path.pacing.least_rtt_s == 0.1 - 512 / path.pacing.rate
+    assert path.window(320, now) < path.flow.outstanding == 10**6  # full
+    path.flow.answered(0.1, 512, now)
+    assert path.flow.least_rtt_s == 0.1 - 512 / path.flow.rate
 
 
 def test_a_path_that_is_always_full_is_emptied_once_a_minute() -> None:
     path = Path(10**6)
-    path.pacing.answered(0.05, 0, 0.0)
+    path.flow.answered(0.05, 0, 0.0)
     now = path.stream(RTT_WINDOW_S, 320)
     assert path.window(320, now) > 0
     now = path.stream(1.0, 320, now)
     assert path.window(320, now) == 0
-    path.pacing.answered(0.05, 0, now)
+    path.flow.answered(0.05, 0, now)
     assert path.window(320, now) > 0
 
 
 def test_a_path_that_is_never_full_is_never_emptied() -> None:
     path = Path()
-    path.pacing.answered(0.05, 0, 0.0)
+    path.flow.answered(0.05, 0, 0.0)
     now = path.stream(3 * RTT_WINDOW_S, 320)
     assert path.window(320, now) > 0
 
 
 def test_a_path_that_mostly_holds_snapshots_back_is_narrow_and_gets_small_ones_until_it_does_not() -> None:
     path = Path()
-    path.pacing.answered(0.05, 0, 0.0)
+    path.flow.answered(0.05, 0, 0.0)
     now = path.stream(2.0, 320) + SAMPLE_S
     path.outstanding = 500
     wide = path.window(1000, now)
     assert wide == 2000
-    assert path.pacing.room(wide) == 1500
+    assert path.flow.room(wide) == 1500
     path.outstanding = 10**6
     now = path.stream(0.5, 320, now)  # a stall
     path.outstanding = 500
-    path.pacing.look()
-    assert path.pacing.room(wide) == 1500
+    path.flow.look()
+    assert path.flow.room(wide) == 1500
     path.outstanding = 10**6
     now = path.stream(1.5, 320, now)
     window = path.window(1000, now)
-    assert window == int(path.pacing.rate * (0.05 + 2 * TICK_S)) < wide
+    assert window == int(path.flow.rate * (0.05 + 2 * TICK_S)) < wide
     path.outstanding = 0
-    assert path.pacing.room(window) == int(path.pacing.rate * NARROW_S)
+    assert path.flow.room(window) == int(path.flow.rate * NARROW_S)
     now = path.stream(2.0, 320, now)
     assert path.window(1000, now) == wide
 
@@ -117,40 +117,40 @@ def test_a_path_that_mostly_holds_snapshots_back_is_narrow_and_gets_small_ones_u
 def test_what_is_on_the_way_is_asked_only_where_that_decides_and_never_taken_for_less() -> None:
     path = Path()
     path.window(100, 0.0)
-    assert (path.asked, path.pacing.outstanding) == (1, 0)
+    assert (path.asked, path.flow.outstanding) == (1, 0)
     for sent in range(1, 5):  # 512 bytes may be on the way
-        path.pacing.sent_bytes += 100
+        path.flow.sent_bytes += 100
         path.outstanding = 60 * sent
         path.window(100, 0.01 * sent)
-        assert (path.asked, path.pacing.outstanding) == (1, 100 * sent)
-    path.pacing.sent_bytes += 100
+        assert (path.asked, path.flow.outstanding) == (1, 100 * sent)
+    path.flow.sent_bytes += 100
     path.outstanding = 300
     path.window(100, 0.05)  # another snapshot might not fit
-    assert (path.asked, path.pacing.outstanding) == (2, 300)
+    assert (path.asked, path.flow.outstanding) == (2, 300)
     path.outstanding = 60
     path.window(100, SAMPLE_S)
-    assert (path.asked, path.pacing.outstanding) == (3, 60)
+    assert (path.asked, path.flow.outstanding) == (3, 60)
 
 
 def test_where_the_system_cannot_tell_what_the_client_has_not_acknowledged_is_on_the_way() -> None:
     path = Path(None)
     path.window(100, 0.0)
     for tick in range(100):  # a client that waits for terrain acknowledges nothing
-        path.pacing.sent_bytes += 100
-        path.pacing.sent(tick)
-    path.pacing.look()
-    assert path.pacing.outstanding == 0
-    path.pacing.acked(99)
+        path.flow.sent_bytes += 100
+        path.flow.sent(tick)
+    path.flow.look()
+    assert path.flow.outstanding == 0
+    path.flow.acked(99)
     for tick in (101, 102, 103):
-        path.pacing.sent_bytes += 100
-        path.pacing.sent(tick)
-    path.pacing.look()
-    assert path.pacing.outstanding == 300
-    path.pacing.acked(102)
-    path.pacing.sent_bytes += 1000  # terrain: it counts with the next snapshot, or nothing would go any more
-    path.pacing.look()
-    assert path.pacing.outstanding == 100
+        path.flow.sent_bytes += 100
+        path.flow.sent(tick)
+    path.flow.look()
+    assert path.flow.outstanding == 300
+    path.flow.acked(102)
+    path.flow.sent_bytes += 1000  # terrain: it counts with the next snapshot, or nothing would go any more
+    path.flow.look()
+    assert path.flow.outstanding == 100
     path.outstanding = 700  # our own buffers are full, whatever it says
-    path.pacing.acked(103)
-    path.pacing.look()
-    assert path.pacing.outstanding == 700
+    path.flow.acked(103)
+    path.flow.look()
+    assert path.flow.outstanding == 700

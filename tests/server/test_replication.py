@@ -227,7 +227,7 @@ def test_who_was_placed_out_of_a_segment_is_flagged_in_the_other_and_in_its_keyf
 
 def test_whoever_places_an_entity_it_is_told() -> None:
     game = Game(row_of_segments(), compiled=False)
-    world, stage = game.world, game.stage
+    world, stage = game.world, game.api
     thing, pushed = stage.spawn("box", (5, 5, 1)), stage.spawn("box", (9, 5, 1))
     game.tick(0.0, 0.0)
     stage.place(thing, (7, 5, 1))
@@ -409,8 +409,8 @@ class Told:
         self.now += 1 / self.game.scene.tick_rate
         for entity in self.others:
             if self.rng.random() < 0.2:
-                wish = Input(self.rng.randint(-89, 89), self.rng.randint(-89, 89), self.rng.randint(0, 1))
-                self.game.stage.steered[entity] = wish
+                input_ = Input(self.rng.randint(-89, 89), self.rng.randint(-89, 89), self.rng.randint(0, 1))
+                self.game.api.steered[entity] = input_
         self.game.tick(self.now, self.now)
 
     def place(self) -> tuple[float, float, float]:
@@ -450,13 +450,13 @@ class Told:
         """The client has just what the server has in the segments it sees."""
         game, model, session = self.game, self.model, self.session
         assert model.tick == game.world.tick
-        sees = session.stream.sight.sees
+        sees = session.stream.view.sees
         here = [entity for entity in game.world.entities["id"].tolist() if game.log.segment(entity) in sees]
         assert model.world.states().tolist() == [list(game.world.state(entity)) for entity in here]
         assert session.entity in model.world
         under_way = {*session.stream.terrain_due, session.stream.terrain_now[0] if session.stream.terrain_now else None}
-        assert set(model.blocks) - session.stream.sight.sees == set()
-        for segment in session.stream.sight.sees - under_way:
+        assert set(model.blocks) - session.stream.view.sees == set()
+        for segment in session.stream.view.sees - under_way:
             if segment in game.world.blocks:
                 assert (model.blocks[segment] == game.world.blocks.segment(segment).reshape(-1)).all()
 
@@ -470,14 +470,14 @@ def test_a_client_has_what_the_server_has_whatever_it_skipped_and_wherever_it_lo
         told.stir()
         told.stall()
         told.tick()
-        if not told.model.stuck and told.session.stream.sight.complete:
+        if not told.model.stuck and told.session.stream.view.complete:
             told.check()
             checks += 1
     told.model.stuck = False
     for _ in range(60):
         told.tick()
     told.check()
-    assert told.session.stream.sight.complete
+    assert told.session.stream.view.complete
     assert checks > 50
     assert told.model.told > 10
     assert not told.session.stream.terrain_due

@@ -22,9 +22,9 @@ from shared.inputs import Input
 from shared.layout import Int64s
 from shared.scene import load_scene
 from shared.world import World
+from sovereign_netcode.playtest import Link, Match, Player
 from tests import worlds
 from tests.lengths import examples, long
-from tests.match import Match, Path, Player
 
 FLOOR = [worlds.floor(0)]
 NAN, INF = math.nan, math.inf
@@ -369,8 +369,8 @@ class Range:
 
     def __init__(self, delay_s: float, seed: int, limits: Limits | None = None) -> None:
         self.match = Match(load_scene("flat"), seed, limits=limits)
-        self.target = self.match.join(strafe, Path(0.02, 0.005))
-        self.shooter = self.match.join(lambda core, rng: Input(), Path(delay_s, 0.01))
+        self.target = self.match.join(strafe, Link(0.02, 0.005))
+        self.shooter = self.match.join(lambda core, rng: Input(), Link(delay_s, 0.01))
         self.shots = self.rewound = self.plain = 0
         self.lags: list[float] = []
         self.match.run_until(lambda: {self._state(player) for player in self.match.players} == {"playing"}, 20)
@@ -431,7 +431,7 @@ def test_the_window_is_a_setting() -> None:
 
 def test_a_shooter_does_not_find_itself() -> None:
     run = Match(load_scene("flat"), 1)
-    player = run.join(lambda core, rng: Input(), Path())
+    player = run.join(lambda core, rng: Input(), Link())
     run.run_until(lambda: player.core.state == "playing", 20)
     game: Game = run.game
     assert player.session is not None

@@ -8,7 +8,7 @@ import pytest
 from server.config.limits import Limits
 from server.game_api.values import ATTRIBUTES_MAX
 from server.players.player import Player
-from server.replication.flow_control import Pacing
+from server.replication.flow_control import FlowControl
 from server.rules import Rules, RulesError, load_rules
 from shared import messages
 from shared.checks import SceneError
@@ -116,7 +116,7 @@ def test_without_rules_a_command_is_not_possible() -> None:
 
 
 def test_contact_is_told_once_when_it_begins(table: Table, rules: Told) -> None:
-    game = table.game.stage
+    game = table.game.api
     table.tick()
     a, b = game.spawn("runner", (10.0, 16.0, 1.0)), game.spawn("runner", (12.0, 16.0, 1.0))
     table.tick(2)
@@ -136,7 +136,7 @@ def test_contact_is_told_once_when_it_begins(table: Table, rules: Told) -> None:
 
 
 def test_a_contact_is_not_missed_in_a_tick_in_which_somebody_joins(table: Table, rules: Told) -> None:
-    game = table.game.stage
+    game = table.game.api
     table.tick()
     a, b = game.spawn("runner", (10.0, 16.0, 1.0)), game.spawn("runner", (12.0, 16.0, 1.0))
     game.steer(a, 1, 0)
@@ -147,7 +147,7 @@ def test_a_contact_is_not_missed_in_a_tick_in_which_somebody_joins(table: Table,
 
 
 def test_who_touches_now_is_told_however_long_it_lasts(table: Table) -> None:
-    game = table.game.stage
+    game = table.game.api
     a, b, c = (game.spawn("runner", (x, 16.0, 1.0)) for x in (10.0, 11.0, 10.0 - 0.625))
     assert (game.touching(a), game.touching(b), game.touching(c)) == ([c], [], [a])
     game.steer(a, 1, 0)
@@ -168,7 +168,7 @@ def test_who_falls_out_is_the_rules_affair_or_comes_back(table: Table, rules: To
 def test_what_is_said_of_an_entity_reaches_all_who_see_it_and_changes(table: Table) -> None:
     early = table.connect(Hello(messages.VERSION, {}, "Ann"))
     table.tick()
-    game = table.game.stage
+    game = table.game.api
     npc = game.spawn("runner", (10.0, 16.0, 1.0), mood="calm")
     table.tick()
     late = table.connect(Hello(messages.VERSION, {}, ""))
@@ -188,7 +188,7 @@ def test_what_is_said_of_an_entity_reaches_all_who_see_it_and_changes(table: Tab
 def test_who_comes_into_sight_brings_along_what_is_said_of_it() -> None:
     table = Table(size=(4, 1, 1), fill=[[0, 0, 0, 128, 32, 1, 1]], spawns=((16.0, 16.0, 1.0),))
     link = table.join()
-    game = table.game.stage
+    game = table.game.api
     far = game.spawn("runner", (112.0, 16.0, 1.0), team="red")
     table.tick(2)
     assert far not in attributes(link)
@@ -202,9 +202,9 @@ def test_what_is_said_of_a_crowd_is_spread_over_messages_and_all_of_it_arrives(
     wide: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     if wide:
-        monkeypatch.setattr(Pacing, "room", lambda *_: 1 << 30)
+        monkeypatch.setattr(FlowControl, "room", lambda *_: 1 << 30)
     table = Table(size=(3, 3, 1), fill=[[0, 0, 0, 96, 96, 1, 1]], spawns=((48.0, 48.0, 1.0),))
-    game = table.game.stage
+    game = table.game.api
     rich: dict[str, Any] = {f"a{n}": "x" * 90 for n in range(ATTRIBUTES_MAX)}
     for segment in range(9):
         x, y = 32 * (segment % 3), 32 * (segment // 3)
@@ -223,7 +223,7 @@ def test_what_is_said_of_a_crowd_is_spread_over_messages_and_all_of_it_arrives(
 
 def test_events_go_to_whom_they_are_for_once(table: Table) -> None:
     ann, bob = table.join(), table.join()
-    game = table.game.stage
+    game = table.game.api
     game.send("all", {"n": 1})
     game.send("ann", [2], to=game.players[ann.session.entity])
     game.send("none", to=[])
@@ -241,7 +241,7 @@ def test_events_wait_for_who_is_slow_and_the_oldest_of_too_many_are_dropped_and_
     link = table.join()
     link.waiting = 1 << 20
     for n in range(5):
-        table.game.stage.send("n", n)
+        table.game.api.send("n", n)
         table.tick()
     assert not link.got(Happened)
     link.waiting = 0
@@ -250,7 +250,7 @@ def test_events_wait_for_who_is_slow_and_the_oldest_of_too_many_are_dropped_and_
     link.waiting = 1 << 20
     link.sent.clear()
     for n in range(7):
-        table.game.stage.send("n", n)
+        table.game.api.send("n", n)
         table.tick()
     link.waiting = 0
     table.tick()
@@ -265,7 +265,7 @@ def test_what_is_said_to_who_is_away_goes_after_the_return_and_what_was_on_its_w
     table = Table(rules=Rules(), resume_s=9.0)
     link = table.join()
     link.say(Inputs(0, table.tick_number, b""))
-    game = table.game.stage
+    game = table.game.api
     game.send("lost on its way")
     table.tick()
     table.lose(link)
@@ -288,7 +288,7 @@ def test_nothing_is_kept_for_a_player_inside_the_server() -> None:
     player = link.session.player
     assert player is not None
     player.inputs.wheel = NEUTRAL
-    table.game.stage.send("n")
+    table.game.api.send("n")
     table.tick()
     assert len(player.outbox) == 0
     assert not link.got(Happened)
@@ -296,7 +296,7 @@ def test_nothing_is_kept_for_a_player_inside_the_server() -> None:
 
 def test_shared_values_reach_all_also_who_comes_later(table: Table) -> None:
     early = table.join()
-    game = table.game.stage
+    game = table.game.api
     game.share("left_s", 60)
     game.share("winner", "Ann")
     table.tick()
@@ -312,7 +312,7 @@ def test_shared_values_reach_all_also_who_comes_later(table: Table) -> None:
 
 
 def test_a_list_that_is_changed_in_place_is_told_when_it_is_said_again(table: Table) -> None:
-    link, game = table.join(), table.game.stage
+    link, game = table.join(), table.game.api
     bag = ["key"]
     game.set(1, "bag", bag)
     game.share("teams", {"red": [1]})
@@ -335,7 +335,7 @@ def test_a_list_that_is_changed_in_place_is_told_when_it_is_said_again(table: Ta
 
 
 def test_what_is_equal_in_python_alone_is_told(table: Table) -> None:
-    link, game = table.join(), table.game.stage
+    link, game = table.join(), table.game.api
     for value in ([1], [True], [1.0], (1.0,)):
         game.share("value", value)
         table.tick()
@@ -344,7 +344,7 @@ def test_what_is_equal_in_python_alone_is_told(table: Table) -> None:
 
 
 def test_what_is_too_much_is_refused_by_name(table: Table) -> None:
-    game = table.game.stage
+    game = table.game.api
     npc = game.spawn("runner", (10.0, 16.0, 1.0))
     for value, why in (("x" * 300, "bytes"), (object(), "MessagePack"), ({1: 2}, "MessagePack")):
         with pytest.raises(SceneError, match=f"mood.*{why}"):
@@ -371,9 +371,9 @@ def test_what_is_too_much_is_refused_by_name(table: Table) -> None:
 def test_players_are_not_the_rules_to_steer_or_remove(table: Table) -> None:
     table.join()
     with pytest.raises(SceneError, match="player"):
-        table.game.stage.steer(1, 1, 0)
+        table.game.api.steer(1, 1, 0)
     with pytest.raises(SceneError, match="player"):
-        table.game.stage.remove(1)
+        table.game.api.remove(1)
 
 
 class Tidy(Rules):
@@ -424,7 +424,7 @@ def test_randomness_is_the_same_in_the_same_tick() -> None:
     for ticks in (5, 5, 6):
         table = Table()
         table.tick(ticks)
-        drawn.append([table.game.stage.random.random() for _ in range(3)])
+        drawn.append([table.game.api.random.random() for _ in range(3)])
     assert drawn[0] == drawn[1] != drawn[2]
 
 

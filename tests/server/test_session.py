@@ -12,12 +12,12 @@ from shared.inputs import NEUTRAL, Input, clamp
 from shared.messages import IDLE, MARGIN_REFUSED, NEUTRALISED, REPEATED, USED, Inputs
 
 LIMITS = bounds(32)
-AHEAD_MAX, REPEATS_MAX, FATES_MAX, MARGIN_ONE = LIMITS.ahead, LIMITS.repeats, LIMITS.fates, LIMITS.margin_one
+AHEAD_MAX, REPEATS_MAX, STATUSES_MAX, MARGIN_ONE = LIMITS.ahead, LIMITS.repeats, LIMITS.statuses, LIMITS.margin_one
 EAST, NORTH, WEST = Input(127, 0, 0), Input(0, 127, 1), Input(-127, 0, 255)
 
 
 def inputs(first: int, *wishes: Input) -> Inputs:
-    return Inputs(first, -1, bytes(part & 0xFF for wish in wishes for part in wish))
+    return Inputs(first, -1, bytes(part & 0xFF for input_ in wishes for part in input_))
 
 
 def filed(first: int, *wishes: Input, tick: int = 0, ahead: float = 1.0) -> InputQueue:
@@ -31,7 +31,7 @@ def margins(queue: InputQueue) -> dict[int, int]:
     return {queue.newest - len(queue.margins) + 1 + i: margin for i, margin in enumerate(queue.margins)}
 
 
-# -- fates ---------------------------------------------------------------------------------------------------
+# -- statuses ---------------------------------------------------------------------------------------------------
 
 
 def test_before_the_first_input_the_player_stands_and_is_idle() -> None:
@@ -39,14 +39,14 @@ def test_before_the_first_input_the_player_stands_and_is_idle() -> None:
     assert [queue.take(tick) for tick in range(1, 4)] == [NEUTRAL] * 3
     queue.file(inputs(6, EAST), 3, 1.0)
     assert [queue.take(tick) for tick in range(4, 7)] == [NEUTRAL, NEUTRAL, EAST]
-    assert list(queue.fates) == [IDLE] * 5 + [USED]
+    assert list(queue.statuses) == [IDLE] * 5 + [USED]
     assert (queue.used, queue.substituted) == (1, 0)
 
 
 def test_each_input_is_used_in_its_tick_and_once() -> None:
     queue = filed(1, EAST, NORTH, WEST)
     assert [queue.take(tick) for tick in (1, 2, 3)] == [EAST, NORTH, WEST]
-    assert list(queue.fates) == [USED] * 3
+    assert list(queue.statuses) == [USED] * 3
     assert queue.used == 3
 
 
@@ -54,7 +54,7 @@ def test_a_missing_input_is_the_last_one_ten_times_and_then_none() -> None:
     queue = filed(1, EAST)
     taken = [queue.take(tick) for tick in range(1, 15)]
     assert taken == [EAST] * (1 + REPEATS_MAX) + [NEUTRAL] * 3
-    assert list(queue.fates) == [USED] + [REPEATED] * 10 + [NEUTRALISED] * 3
+    assert list(queue.statuses) == [USED] + [REPEATED] * 10 + [NEUTRALISED] * 3
     assert (queue.used, queue.substituted) == (1, 13)
 
 
@@ -64,7 +64,7 @@ def test_an_input_after_a_silence_starts_the_count_of_repeats_anew() -> None:
         queue.take(tick)
     queue.file(inputs(16, NORTH), 15, 1.0)
     assert [queue.take(tick) for tick in range(16, 28)] == [NORTH] * 11 + [NEUTRAL]
-    assert list(queue.fates)[15:] == [USED] + [REPEATED] * 10 + [NEUTRALISED]
+    assert list(queue.statuses)[15:] == [USED] + [REPEATED] * 10 + [NEUTRALISED]
 
 
 def test_a_late_input_is_not_used_but_is_what_is_repeated_from_then_on() -> None:
@@ -72,7 +72,7 @@ def test_a_late_input_is_not_used_but_is_what_is_repeated_from_then_on() -> None
     assert [queue.take(1), queue.take(2)] == [EAST, EAST]
     queue.file(inputs(2, NORTH), 2, 0.5)
     assert queue.take(3) == NORTH
-    assert (queue.late, list(queue.fates)) == (1, [USED, REPEATED, REPEATED])
+    assert (queue.late, list(queue.statuses)) == (1, [USED, REPEATED, REPEATED])
 
 
 def test_a_late_input_does_not_replace_the_one_of_the_tick() -> None:
@@ -86,7 +86,7 @@ def test_a_late_input_does_not_replace_the_one_of_the_tick() -> None:
 def test_a_first_input_that_is_late_ends_idleness() -> None:
     queue = filed(5, EAST, tick=9)
     assert queue.take(10) == EAST
-    assert (list(queue.fates), queue.late) == ([REPEATED], 1)
+    assert (list(queue.statuses), queue.late) == ([REPEATED], 1)
 
 
 # -- what is refused -----------------------------------------------------------------------------------------
@@ -112,7 +112,7 @@ def test_the_far_future_is_refused_from_its_first_tick_on() -> None:
     for tick in range(101, 100 + AHEAD_MAX):
         assert queue.take(tick) == NEUTRAL
     assert [queue.take(100 + AHEAD_MAX + i) for i in range(3)] == [EAST] * 3
-    assert list(queue.fates)[-3:] == [USED, REPEATED, REPEATED]
+    assert list(queue.statuses)[-3:] == [USED, REPEATED, REPEATED]
 
 
 def test_all_that_may_be_ahead_fits_without_loss() -> None:
@@ -122,9 +122,9 @@ def test_all_that_may_be_ahead_fits_without_loss() -> None:
 
 
 def test_a_wish_that_is_too_long_is_shortened_by_the_rule_of_both_sides() -> None:
-    for wish in (Input(127, 127, 1), Input(-128, 0, 0), Input(-128, -128, 255), Input(100, -100, 2)):
-        queue = filed(1, wish)
-        assert queue.take(1) == clamp(wish) != wish
+    for input_ in (Input(127, 127, 1), Input(-128, 0, 0), Input(-128, -128, 255), Input(100, -100, 2)):
+        queue = filed(1, input_)
+        assert queue.take(1) == clamp(input_) != input_
 
 
 def test_a_message_without_rows_changes_nothing() -> None:
@@ -151,7 +151,7 @@ def test_what_has_been_used_stays_used() -> None:
     assert [queue.take(tick) for tick in (1, 2)] == [EAST, EAST]
     queue.restart(1)
     assert queue.take(3) == EAST, "withdrawn, so the latest to arrive is repeated"
-    assert list(queue.fates) == [USED, USED, REPEATED]
+    assert list(queue.statuses) == [USED, USED, REPEATED]
     queue.file(inputs(1, NORTH, NORTH, NORTH), 3, 1.0)
     assert (queue.late, queue.take(4)) == (3, NORTH)
 
@@ -223,11 +223,11 @@ def test_what_was_told_is_not_told_again_and_counting_goes_on() -> None:
     queue = filed(1, EAST)
     queue.take(1)
     queue.told()
-    assert (list(queue.margins), list(queue.fates)) == ([], [])
+    assert (list(queue.margins), list(queue.statuses)) == ([], [])
     queue.file(inputs(4, EAST), 1, 1.0)
     assert list(margins(queue)) == [2, 3, 4]
     assert queue.take(2) == EAST
-    assert list(queue.fates) == [REPEATED]
+    assert list(queue.statuses) == [REPEATED]
 
 
 # -- any client ----------------------------------------------------------------------------------------------
@@ -248,8 +248,8 @@ def test_every_input_of_any_client_has_one_fate_and_memory_is_bounded(
             sent += rows
             assert sent >= queue.refused + queue.late + queue.used
         assert queue.take(tick) in (EAST, NEUTRAL)
-        assert len(queue.margins) <= FATES_MAX
-        assert len(queue.fates) == tick - told
+        assert len(queue.margins) <= STATUSES_MAX
+        assert len(queue.statuses) == tick - told
         if snapshot:
             queue.told()
             told = tick
@@ -262,7 +262,7 @@ def test_a_flood_into_the_future_holds_no_more_than_the_window() -> None:
     for first in range(0, 1 << 20, 1 << 10):
         queue.file(inputs(first, *[EAST] * INPUT_ROWS_MAX), 0, 1.0)
     assert len(queue._waiting) <= AHEAD_MAX
-    assert len(queue.margins) == FATES_MAX
+    assert len(queue.margins) == STATUSES_MAX
     assert queue.refused == 64 * 1024 - (INPUT_ROWS_MAX - 1) - 1
 
 

@@ -4,7 +4,7 @@ from itertools import groupby
 
 import pytest
 
-from server.replication.client_view import Sight
+from server.replication.client_view import ClientView
 from shared.bounds import bounds
 from shared.checks import Cell
 from shared.snapshot import KEYFRAME
@@ -41,13 +41,13 @@ class Parts:
         return len(parts), b"".join(parts)
 
 
-def looking(see: int = 2) -> Sight:
-    sight = Sight()
+def looking(see: int = 2) -> ClientView:
+    sight = ClientView()
     sight.move(tuple(ROW), see)
     return sight
 
 
-def take(sight: Sight, log: Log, tick: int, room: int) -> list[Cell]:
+def take(sight: ClientView, log: Log, tick: int, room: int) -> list[Cell]:
     log.asked.clear()
     n, parts = sight.take(log, tick, room)  # type: ignore[arg-type]
     taken = [ROW[first] for first, _ in groupby(parts)]
@@ -70,7 +70,7 @@ def test_known_is_the_tick_up_to_which_all_that_was_in_sight_has_been_sent() -> 
 
 
 def test_what_comes_into_sight_later_was_not_in_sight_before() -> None:
-    sight, log = Sight(), Log(dict.fromkeys(ROW, 10))
+    sight, log = ClientView(), Log(dict.fromkeys(ROW, 10))
     sight.move((OWN,), 2, 4)
     take(sight, log, 5, 100)
     assert sight.known == 5

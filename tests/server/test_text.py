@@ -18,7 +18,7 @@ from server.auth.identity import AuthError
 from server.config.options import SettingsError
 from server.config.settings import Settings, load
 from server.game import Game
-from server.game_api.api import Stage
+from server.game_api.api import GameApi
 from server.persistence.store import Store
 from server.rules import Rules
 from shared import messages
@@ -142,7 +142,7 @@ def test_what_a_client_asks_for(bad: str) -> None:
     assert client.command("say", "é\U0001f600") == 1  # no number is lost
 
 
-def acts(game: Stage, bad: str) -> list[Callable[[], Any]]:
+def acts(game: GameApi, bad: str) -> list[Callable[[], Any]]:
     """All by which rules can say something."""
     return [
         lambda: game.set(1, bad, 1),
@@ -163,7 +163,7 @@ def acts(game: Stage, bad: str) -> list[Callable[[], Any]]:
 def test_what_rules_say(tmp_path: Path, bad: str) -> None:
     table = Stored(tmp_path)
     link = table.join()
-    game = table.game.stage
+    game = table.game.api
     game.share("score", 1)
     table.tick()
     before = (dict(game.shared), dict(game.kept.attributes), len(table.game.world), len(link.sent))
@@ -176,7 +176,7 @@ def test_what_rules_say(tmp_path: Path, bad: str) -> None:
     assert [type(message).__name__ for message in link.sent[before[3] :]] == ["Snapshot"]
     table.stop()
     again = Stored(tmp_path)
-    assert again.game.stage.shared == {"score": 1}
+    assert again.game.api.shared == {"score": 1}
     again.stop()
 
 

@@ -188,17 +188,17 @@ def test_an_edit_is_allowed_by_what_is_true(answer: Any, allowed: bool, caplog: 
 # -- who may change a game, and when ---------------------------------------------------------------------------
 
 ACTS: dict[str, Callable[[Played], Any]] = {
-    "spawn": lambda t: t.stage.spawn("stone", (8, 8, 1)),
-    "remove": lambda t: t.stage.remove(RUNNER),
-    "place": lambda t: t.stage.place(RUNNER, (8, 8, 1)),
-    "throw": lambda t: t.stage.throw(RUNNER, (0, 0, 1)),
-    "change": lambda t: t.stage.change(RUNNER, "cube"),
-    "steer": lambda t: t.stage.steer(RUNNER, 1, 0),
-    "set_block": lambda t: t.stage.set_block(8, 8, 5, 1),
-    "set": lambda t: t.stage.set(RUNNER, "mood", "cross"),
-    "share": lambda t: t.stage.share("score", 2),
-    "send": lambda t: t.stage.send("boom"),
-    "random": lambda t: t.stage.random.random(),
+    "spawn": lambda t: t.api.spawn("stone", (8, 8, 1)),
+    "remove": lambda t: t.api.remove(RUNNER),
+    "place": lambda t: t.api.place(RUNNER, (8, 8, 1)),
+    "throw": lambda t: t.api.throw(RUNNER, (0, 0, 1)),
+    "change": lambda t: t.api.change(RUNNER, "cube"),
+    "steer": lambda t: t.api.steer(RUNNER, 1, 0),
+    "set_block": lambda t: t.api.set_block(8, 8, 5, 1),
+    "set": lambda t: t.api.set(RUNNER, "mood", "cross"),
+    "share": lambda t: t.api.share("score", 2),
+    "send": lambda t: t.api.send("boom"),
+    "random": lambda t: t.api.random.random(),
 }
 
 
@@ -255,13 +255,13 @@ def test_the_thread_that_ticks_may_change_the_game_and_it_may_be_another_one_lat
 
     def tick_and_share() -> None:
         table.tick()
-        table.stage.share("score", 2)
+        table.api.share("score", 2)
 
     assert in_a_thread(tick_and_share) == ""
-    assert "from thread 'MainThread'" in caught(lambda: table.stage.share("score", 3))()
+    assert "from thread 'MainThread'" in caught(lambda: table.api.share("score", 3))()
     table.tick()
-    table.stage.share("score", 3)
-    assert table.stage.shared == {"score": 3}
+    table.api.share("score", 3)
+    assert table.api.shared == {"score": 3}
 
 
 class Awaits(Rules):
@@ -274,7 +274,7 @@ class Awaits(Rules):
 async def test_hooks_may_change_the_game_within_an_event_loop() -> None:
     table = Table(rules=Awaits())
     table.tick(3)
-    assert table.game.stage.shared == {"tick": 3}
+    assert table.game.api.shared == {"tick": 3}
     assert table.game.counters.rules_failed == 0
 
 
@@ -282,7 +282,7 @@ async def test_hooks_may_change_the_game_within_an_event_loop() -> None:
 @pytest.mark.parametrize("elsewhere", [in_a_thread, in_a_callback, lambda act: act() and ""])
 def test_what_comes_by_soon_happens_in_the_next_tick(name: str, elsewhere: Callable[[Any], str]) -> None:
     made_elsewhere, made_here = Played(), Played()
-    elsewhere(lambda: made_elsewhere.stage.soon(ACTS[name], made_elsewhere))
+    elsewhere(lambda: made_elsewhere.api.soon(ACTS[name], made_elsewhere))
     before = marks(made_elsewhere)
     ACTS[name](made_here)
     assert made_elsewhere.game.world.tick == made_here.game.world.tick
@@ -295,7 +295,7 @@ def test_what_comes_by_soon_happens_in_the_next_tick(name: str, elsewhere: Calla
 
 def test_soon_keeps_the_order_takes_arguments_and_leaves_what_is_added_for_the_tick_after() -> None:
     table = Table()
-    stage, said = table.game.stage, []
+    stage, said = table.game.api, []
 
     def note(*what: Any) -> None:
         said.append((stage.tick, *what))
@@ -327,7 +327,7 @@ class Ordered(Rules):
 def test_soon_comes_after_the_start_and_ahead_of_the_other_hooks() -> None:
     rules = Ordered()
     table = Table(rules=rules)
-    table.game.stage.soon(rules.said.append, "soon")
+    table.game.api.soon(rules.said.append, "soon")
     table.join()
     assert rules.said == ["start", "soon", "join", "tick"]
 
@@ -338,11 +338,11 @@ def test_what_fails_soon_is_counted_and_stops_nobody(caplog: pytest.LogCaptureFi
     def fails() -> None:
         raise RuntimeError("on purpose")
 
-    table.game.stage.soon(fails)
-    table.game.stage.soon(functools.partial(fails))
-    table.game.stage.soon(table.game.stage.share, "score", 1)
+    table.game.api.soon(fails)
+    table.game.api.soon(functools.partial(fails))
+    table.game.api.soon(table.game.api.share, "score", 1)
     table.tick()
-    assert (table.game.counters.rules_failed, table.game.stage.shared) == (2, {"score": 1})
+    assert (table.game.counters.rules_failed, table.game.api.shared) == (2, {"score": 1})
     assert "on purpose" in caplog.text
 
 
@@ -350,7 +350,7 @@ def test_what_fails_soon_is_counted_and_stops_nobody(caplog: pytest.LogCaptureFi
 def test_what_cannot_be_called_soon_is_named_at_once(bad: Any) -> None:
     table = Table()
     with pytest.raises(RulesError, match=r"^soon: act"):
-        table.game.stage.soon(bad)
+        table.game.api.soon(bad)
     table.tick()
     assert table.game.counters.rules_failed == 0
 
@@ -358,16 +358,16 @@ def test_what_cannot_be_called_soon_is_named_at_once(bad: Any) -> None:
 def test_a_game_that_does_not_tick_takes_only_so_much() -> None:
     table = Table()
     for _ in range(SOON_MAX):
-        table.game.stage.soon(int)
+        table.game.api.soon(int)
     with pytest.raises(OutOfTurnError, match="10000 functions wait already"):
-        table.game.stage.soon(int)
+        table.game.api.soon(int)
     table.tick()
-    table.game.stage.soon(int)
+    table.game.api.soon(int)
 
 
 def test_many_threads_at_once_lose_nothing() -> None:
     table = Table()
-    stage = table.game.stage
+    stage = table.game.api
     seen: list[tuple[int, int]] = []
 
     def work(number: int) -> None:
@@ -387,7 +387,7 @@ def test_many_threads_at_once_lose_nothing() -> None:
 
 def test_what_comes_by_soon_is_saved_as_all_else(tmp_path: Any) -> None:
     table = Stored(tmp_path)
-    stage = table.game.stage
+    stage = table.game.api
     in_a_thread(lambda: stage.soon(stage.spawn, "stone", (8, 8, 1)))
     table.tick()
     until(lambda: table.store.durable_tick == 1)
@@ -402,7 +402,7 @@ def test_what_comes_by_soon_is_saved_as_all_else(tmp_path: Any) -> None:
 def test_a_seeded_match_with_soon_is_the_same_again() -> None:
     def play() -> bytes:
         match = Match(FLAT, 3)
-        stage, dice = match.game.stage, random.Random(4)
+        stage, dice = match.game.api, random.Random(4)
         for _ in range(20):
             x, y = dice.uniform(8, 56), dice.uniform(8, 56)
             stage.soon(lambda x=x, y=y: stage.spawn("player", (x + stage.random.random(), y, 8)))

@@ -10,7 +10,7 @@ import pytest
 from server.agents import Arena
 from server.config.limits import Limits
 from server.game import Game
-from server.game_api.api import Stage
+from server.game_api.api import GameApi
 from server.journal.recorded_world import RecordedWorld
 from server.players.player import Player
 from server.rules import Rules, RulesError
@@ -20,7 +20,7 @@ from tests.shared.test_wrong_values import ENTITY, NUMBER, TEMPLATE, THREE, WHOL
 from tests.tables import Table
 
 FLAT = load_scene("flat")
-Act = Callable[[Stage, Any], Any]
+Act = Callable[[GameApi, Any], Any]
 NAN = math.nan
 PLAYER, RUNNER, GONE = 1, 2, 3
 
@@ -31,19 +31,19 @@ class Played(Table):
     def __init__(self) -> None:
         super().__init__()
         self.link = self.join()
-        self.stage = self.game.stage
+        self.api = self.game.api
         self.player = self.game.players[PLAYER]
         for x in (8.0, 24.0):
-            self.stage.spawn("runner", (x, 16.0, 1.0))
-        self.stage.remove(GONE)
-        self.stage.share("score", [1])
-        self.stage.set(RUNNER, "mood", "calm")
+            self.api.spawn("runner", (x, 16.0, 1.0))
+        self.api.remove(GONE)
+        self.api.share("score", [1])
+        self.api.set(RUNNER, "mood", "calm")
         self.tick()
 
 
 def marks(table: Played) -> tuple[Any, ...]:
     """All that an act of the rules may change."""
-    stage, kept = table.stage, table.stage.kept
+    stage, kept = table.api, table.api.kept
     return (
         table.game.world.state_hash(), len(table.game.world), table.game.world.next_id, dict(stage.steered),
         repr(kept.attributes), repr(kept.shared), len(stage.outgoing), stage.hooks.waiting, list(table.game.players),
@@ -55,7 +55,7 @@ def refused(act: Act, bad: Any, error: type[Exception], said: str) -> None:
     before = marks(table)
     table.game.world.attach(pen)
     with pytest.raises(error, match=said):
-        act(table.stage, bad)
+        act(table.api, bad)
     assert marks(table) == before
     assert pen.calls == []
     table.tick(3)
@@ -132,7 +132,7 @@ def test_an_entity_that_is_not_there_is_named(name: str) -> None:
     refused(BY_ENTITY[name], GONE, MissingError, f"^entity = {GONE}: has been removed$")
     refused(BY_ENTITY[name], 99, MissingError, "^entity = 99: there is no such entity$")
     with pytest.raises(KeyError):
-        BY_ENTITY[name](Played().stage, 99)
+        BY_ENTITY[name](Played().api, 99)
 
 
 @pytest.mark.parametrize("name", [*BY_ENTITY, "get"])
@@ -141,12 +141,12 @@ def test_what_is_no_number_of_an_entity_is_named(name: str) -> None:
     act = BY_ENTITY.get(name, reads)
     for bad in [*ENTITY, 0, -1, 1 << 31]:
         refused(act, bad, SceneError, "^entity = ")
-        assert bad not in Played().stage
+        assert bad not in Played().api
     table = Played()
     with pytest.raises(
         SceneError, match=r"^entity = <Player '', entity 1>: is a player; its entity is `player.entity`"
     ):
-        act(table.stage, table.player)
+        act(table.api, table.player)
 
 
 def test_numbers_of_numpy_do_what_pythons_do() -> None:
@@ -154,7 +154,7 @@ def test_numbers_of_numpy_do_what_pythons_do() -> None:
     kinds: list[tuple[Any, Any]] = [(int, float), (np.int64, np.float32), (np.uint8, np.float64)]
     for whole, real in kinds:
         table = Played()
-        game: Any = table.stage
+        game: Any = table.api
         pen = Calls()
         table.game.world.attach(pen)
         runner = whole(RUNNER)

@@ -37,7 +37,7 @@ from shared.layout import (
     X,
 )
 from shared.scene import Scene, load_scene
-from shared.snapshot import News, decode_parts, encode_rows, join_part
+from shared.snapshot import TickEncoder, decode_parts, encode_rows, join_part
 from shared.units import BLOCK, SEGMENT
 from shared.world import OverlapError, World
 from tests.lengths import long_but
@@ -51,7 +51,7 @@ class Told:
 
     def __init__(self, world: World) -> None:
         self.world = world
-        self.packs = News(world, 1)
+        self.packs = TickEncoder(world, 1)
         self.other = World(world.scene, compiled=world.compiled)
         self.other.put(world.states())
         self.other.rebase(world.tick)
@@ -153,8 +153,8 @@ def test_each_thing_that_happens_is_told_once(compiled: bool) -> None:
     assert events(world, me) & WHOLE
     told, found = Told(world), []
     for tick in range(400):
-        wish = {0: EAST, 80: EAST._replace(buttons=1), 84: EAST}.get(tick)
-        world.step(None if wish is None else {me: wish})
+        input_ = {0: EAST, 80: EAST._replace(buttons=1), 84: EAST}.get(tick)
+        world.step(None if input_ is None else {me: input_})
         found.append(events(world, me))
         told.tell()
         told.check()
@@ -204,7 +204,7 @@ def test_news_are_packed_in_the_order_of_ids_segment_by_segment(n: int, compiled
     kernel = kernels.get(compiled)
     arrays = SimpleNamespace(**{name: kernel.lent(each) for name, each in lists.items()})
     world = SimpleNamespace(arrays=arrays, tick=7, kernel=kernel)
-    shares, due = News(world, 4).pack(acted)  # type: ignore[arg-type]
+    shares, due = TickEncoder(world, 4).pack(acted)  # type: ignore[arg-type]
     told: dict[Cell, list[Int64s]] = {}
     everywhere: set[Cell] = set()
     for row in sorted(matrix[rows], key=lambda row: int(row[ID])):

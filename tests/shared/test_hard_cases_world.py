@@ -22,7 +22,7 @@ def test_h14_two_movers_head_on(compiled: bool, first: str, plane: float) -> Non
     if first == "west-bound":
         spots.reverse()
     entities = [world.spawn("box", (x, 0, 0)) for x, _ in spots]
-    wishes = {entity: wish for entity, (_, wish) in zip(entities, spots, strict=True)}
+    wishes = {entity: input_ for entity, (_, input_) in zip(entities, spots, strict=True)}
     east, west = entities if first == "east-bound" else entities[::-1]
     for tick in range(1, 40):
         world.step(wishes)

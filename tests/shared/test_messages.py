@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from shared import fields, messages
-from shared.fields import CLIENT_LIST_MAX, CLIENT_MESSAGE_MAX, FATES_MAX, LIST_MAX, MESSAGE_MAX, TICK_MAX
+from shared.fields import CLIENT_LIST_MAX, CLIENT_MESSAGE_MAX, LIST_MAX, MESSAGE_MAX, STATUSES_MAX, TICK_MAX
 from shared.messages import (
     CLIENT_KINDS,
     KINDS,
@@ -61,7 +61,14 @@ FROM_SERVER: list[Message] = [
     Welcome(1, -1, 1, {"name": "flat", "spawns": [[0.5, 1, 2]]}, bytes(16)),
     Snapshot(0, -1, b"", -1, b"", b"", b"", ()),
     Snapshot(
-        TICK_MAX, TICK_MAX, bytes(2 * FATES_MAX), TICK_MAX, bytes(FATES_MAX), bytes(640), bytes(12 * 4096), (PART, PART)
+        TICK_MAX,
+        TICK_MAX,
+        bytes(2 * STATUSES_MAX),
+        TICK_MAX,
+        bytes(STATUSES_MAX),
+        bytes(640),
+        bytes(12 * 4096),
+        (PART, PART),
     ),
     Terrain(-(1 << 23), 0, (1 << 23) - 1, 0, 1, b""),
     Terrain(0, 0, 0, 48 * 1024, 48 * 1024, bytes(48 * 1024)),
@@ -140,9 +147,9 @@ OUT_OF_BOUNDS: list[tuple[Message, str, list[Any]]] = [
     (Shared({}), "values", [[], None, {b"name": 1}, {str(i): 0 for i in range(65)}]),
     (BLANK, "tick", [-2, TICK_MAX + 1, None]),
     (BLANK, "newest", [-2, TICK_MAX + 1]),
-    (BLANK, "margins", [bytes(2 * FATES_MAX + 2), bytes(3), ""]),
+    (BLANK, "margins", [bytes(2 * STATUSES_MAX + 2), bytes(3), ""]),
     (BLANK, "first", [-2, TICK_MAX + 1]),
-    (BLANK, "fates", [bytes(FATES_MAX + 1), ""]),
+    (BLANK, "statuses", [bytes(STATUSES_MAX + 1), ""]),
     (BLANK, "verdicts", [bytes(645), bytes(4), ""]),
     (BLANK, "drops", [bytes(12 * 4097), bytes(11)]),
     (Terrain(0, 0, 0, 0, 1, b""), "x", [-(1 << 23) - 1, 1 << 23, 0.0]),

@@ -105,7 +105,7 @@ def test_the_snapshot_is_what_is_said_of_it() -> None:
     snapshot = example(Snapshot)
     assert (np.frombuffer(snapshot.margins, "<i2") / bounds(32).margin_one).tolist() == [2.5, -0.25, 2.0]
     assert snapshot.newest == 1021
-    assert list(snapshot.fates) == [messages.USED, messages.REPEATED]
+    assert list(snapshot.statuses) == [messages.USED, messages.REPEATED]
     (part,), states, turns = decode_parts(snapshot.segments, 1)
     assert turns.tolist() == [[12, layout.TOLD | layout.STOP_X, 0, 127, 0, 10 << 24, 0, 0]]
     assert (part.gone, part.edits["block"].tolist()) == ([9], [0x33E3])
@@ -139,8 +139,8 @@ def test_payloads() -> None:
 
 
 def test_tables_of_numbers() -> None:
-    fates = {name: int(number) for number, name, _ in table("fate", "name")}
-    assert fates == {name: getattr(messages, name) for name in ("USED", "REPEATED", "NEUTRALISED", "IDLE")}
+    statuses = {name: int(number) for number, name, _ in table("fate", "name")}
+    assert statuses == {name: getattr(messages, name) for name in ("USED", "REPEATED", "NEUTRALISED", "IDLE")}
     assert [text for _, text in table("verdict", "meaning")] == list(messages.VERDICT_TEXTS)
     assert [int(number) for number, _ in table("verdict", "meaning")] == list(range(len(messages.VERDICT_TEXTS)))
     codes = {name: int(number) for number, name, _ in table("code", "name")}

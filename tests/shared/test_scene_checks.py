@@ -148,8 +148,8 @@ def test_a_wish_is_shortened_to_a_length_of_127(x: int, y: int) -> None:
 
 
 def test_a_wish_within_the_range_is_left_alone() -> None:
-    for wish in (Input(127, 0), Input(-3, 4, 1), Input(89, 90), Input()):
-        assert clamp(wish) == wish
+    for input_ in (Input(127, 0), Input(-3, 4, 1), Input(89, 90), Input()):
+        assert clamp(input_) == input_
     assert make_input(1, 1) == clamp(Input(127, 127))
     assert make_input(0.5, -0.5, jump=True, buttons=2) == Input(64, -64, 3)
 

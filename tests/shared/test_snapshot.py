@@ -24,7 +24,7 @@ from shared.snapshot import (
     PLACED,
     ROW,
     SIDE,
-    SegmentPart,
+    DecodedDelta,
     checksum,
     decode_parts,
     encode_part,
@@ -45,7 +45,7 @@ def sent(
     ago: int = 5,
     gone: list[int] | None = None,
     edits: list[tuple[int, int]] | None = None,
-) -> tuple[SegmentPart, list[State]]:
+) -> tuple[DecodedDelta, list[State]]:
     """What a peer makes of a part."""
     rows = np.array(states, np.int64).reshape(-1, CELL)
     part = msgpack.unpackb(encode_part(segment, ago, rows, gone or [], edits or [], check=9))

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from server.journal.recorded_world import Pen, RecordedWorld
+from server.journal.recorded_world import Observer, RecordedWorld
 from shared.blocks import FILL_MAX
 from shared.checks import MissingError, SceneError
 from shared.inputs import Input, make_input
@@ -62,7 +62,7 @@ def kept_world(compiled: bool) -> RecordedWorld:
     return world_with_two(compiled=compiled)
 
 
-class Calls(Pen):
+class Calls(Observer):
     def tick(self, world: WorldState, inputs: Any) -> None: ...
 
 

@@ -11,8 +11,8 @@ from shared import edits
 from shared.inputs import Input
 from shared.messages import Command, decode_from_client
 from shared.scene import load_scene
+from sovereign_netcode.playtest import Link, Match, Player
 from tests.lengths import long
-from tests.match import Match, Path, Player
 
 
 class Building:
@@ -25,7 +25,7 @@ class Building:
     def __call__(self, core: Core, rng: random.Random) -> Input:
         if not self.stopped:
             self._bot(core)
-        return core.wish
+        return core.input
 
 
 def ordered(player: Player) -> list[int]:
@@ -43,7 +43,7 @@ def ordered(player: Player) -> list[int]:
     return numbers
 
 
-LAN, TYPICAL = Path(0.001), Path(0.05, 0.01, 0.01)
+LAN, TYPICAL = Link(0.001), Link(0.05, 0.01, 0.01)
 
 
 @pytest.mark.parametrize(
@@ -53,7 +53,7 @@ LAN, TYPICAL = Path(0.001), Path(0.05, 0.01, 0.01)
         *long((TYPICAL, "flat", 20), (TYPICAL, "hills", 20), (LAN, "flat", 20), (LAN, "hills", 20)),
     ],
 )
-def test_builders_do_not_diverge_and_hear_of_every_edit(path: Path, scene: str, seconds: float) -> None:
+def test_builders_do_not_diverge_and_hear_of_every_edit(path: Link, scene: str, seconds: float) -> None:
     match = Match(load_scene(scene), 12)
     policies = [Building(seed) for seed in range(5)]
     players = [match.join(policy, path) for policy in policies]

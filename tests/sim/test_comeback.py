@@ -7,14 +7,14 @@ import pytest
 
 from client_sdk.core import Core
 from client_sdk.events import Answered, Corrected, Disconnected, Joined, Left, Resumed
-from client_sdk.netsim.links import PRESETS, Path
-from client_sdk.reconnect import Comeback
+from client_sdk.netsim.links import PRESETS, Link
+from client_sdk.reconnect import Reconnect
 from server.config.limits import Limits
 from shared import messages
 from shared.messages import Bye, encode
 from shared.scene import load_scene
+from sovereign_netcode.playtest import Match, Player, wander
 from tests.lengths import long
-from tests.match import Match, Player, wander
 
 
 def joined(match: Match, player: Player) -> None:
@@ -38,7 +38,7 @@ def test_who_is_cut_off_goes_on_with_the_same_entity(preset: str, seed: int) -> 
     for round_ in range(1, 4):
         match.run(5)
         player.disconnect()
-        assert player.core.state == "away"
+        assert player.core.state == "reconnecting"
         match.run(0.1)
         assert entity in match.game.world
         match.run_until(lambda: player.core.state == "playing", 10)
@@ -59,7 +59,7 @@ def test_who_is_cut_off_goes_on_with_the_same_entity(preset: str, seed: int) -> 
 
 def test_what_was_ordered_meanwhile_is_done_once() -> None:
     match = Match(load_scene("flat"), 3)
-    player = match.join(lambda core, rng: core.wish, Path(0.05), Core(patience_s=10))
+    player = match.join(lambda core, rng: core.input, Link(0.05), Core(patience_s=10))
     joined(match, player)
     match.run(3)
     x, y, z = (int(part // 1) for part in match.game.world.position(player.core.entity))
@@ -81,7 +81,7 @@ def test_what_was_ordered_meanwhile_is_done_once() -> None:
 
 def test_whose_entity_was_not_kept_joins_anew() -> None:
     match = Match(load_scene("flat"), 4, limits=Limits(resume_s=0.1))
-    player = match.join(wander, Path(0.05), Core(patience_s=10))
+    player = match.join(wander, Link(0.05), Core(patience_s=10))
     joined(match, player)
     match.run(3)
     entity = player.core.entity
@@ -100,8 +100,8 @@ def test_whose_entity_was_not_kept_joins_anew() -> None:
 
 def test_who_has_no_patience_or_was_told_to_go_does_not_come_back() -> None:
     match = Match(load_scene("flat"), 5)
-    impatient = match.join(wander, Path(0.05), Core(patience_s=0))
-    rude = match.join(wander, Path(0.05), Core(patience_s=10))
+    impatient = match.join(wander, Link(0.05), Core(patience_s=0))
+    rude = match.join(wander, Link(0.05), Core(patience_s=10))
     for player in (impatient, rude):
         joined(match, player)
     impatient.disconnect()
@@ -115,14 +115,14 @@ def test_who_has_no_patience_or_was_told_to_go_does_not_come_back() -> None:
 
 def test_who_was_too_slow_to_say_hello_again_tries_once_more() -> None:
     match = Match(load_scene("flat"), 6)
-    player = match.join(wander, Path(0.05), Core(patience_s=10))
+    player = match.join(wander, Link(0.05), Core(patience_s=10))
     joined(match, player)
     entity = player.core.entity
     player.disconnect()
     match.run_until(lambda: player.session is not None, 5)
-    assert player.core.state == "away"
+    assert player.core.state == "reconnecting"
     player.core.receive(encode(Bye(messages.NO_HELLO, "no hello within 5 s", -1.0)), player.local)
-    assert player.core.state == "away"
+    assert player.core.state == "reconnecting"
     player.disconnect()
     match.run_until(lambda: player.core.state == "playing", 10)
     assert player.core.entity == entity
@@ -130,23 +130,23 @@ def test_who_was_too_slow_to_say_hello_again_tries_once_more() -> None:
 
 
 def test_waits_grow_spread_and_end() -> None:
-    comeback = Comeback(30.0, spread=7)
+    reconnect = Reconnect(30.0, spread=7)
     now, waits = 100.0, []
-    while comeback.lost(now):
-        waits.append(comeback.retry_at - now)
-        now = comeback.retry_at
-        comeback.trying()
+    while reconnect.lost(now):
+        waits.append(reconnect.retry_at - now)
+        now = reconnect.retry_at
+        reconnect.trying()
     assert 100.0 + 25 < now < 130.0
     assert 0.25 <= waits[0] <= 0.32
     assert all(a < b or b > 3.9 for a, b in itertools.pairwise(waits))
     assert max(waits) <= 5.0
-    assert comeback.away_s(now) == now - 100.0
-    comeback.back()
-    assert comeback.lost(now)
-    assert comeback.retry_at - now <= 0.32
+    assert reconnect.away_s(now) == now - 100.0
+    reconnect.back()
+    assert reconnect.lost(now)
+    assert reconnect.retry_at - now <= 0.32
     firsts = set()
     for spread in range(50):
-        other = Comeback(30.0, spread)
+        other = Reconnect(30.0, spread)
         assert other.lost(0.0, 2.0)
         firsts.add(round(other.retry_at, 3))
     assert len(firsts) == 50
@@ -154,20 +154,20 @@ def test_waits_grow_spread_and_end() -> None:
 
 
 def test_patience_without_end_has_none() -> None:
-    comeback = Comeback(math.inf)
+    reconnect = Reconnect(math.inf)
     now = 0.0
     for _ in range(2000):
-        assert comeback.lost(now)
-        assert 0 < comeback.retry_at - now <= 5.0
-        now = comeback.retry_at
+        assert reconnect.lost(now)
+        assert 0 < reconnect.retry_at - now <= 5.0
+        now = reconnect.retry_at
 
 
 @pytest.mark.parametrize("spread", range(12))
 def test_a_long_wait_that_was_asked_for_is_waited_and_not_taken_from_the_patience(spread: int) -> None:
-    comeback = Comeback(30.0, spread)
-    assert comeback.lost(0.0, 300.0)
-    assert 300 <= comeback.retry_at <= 375
-    back, now = comeback.retry_at, comeback.retry_at
-    while comeback.lost(now):
-        now = comeback.retry_at
+    reconnect = Reconnect(30.0, spread)
+    assert reconnect.lost(0.0, 300.0)
+    assert 300 <= reconnect.retry_at <= 375
+    back, now = reconnect.retry_at, reconnect.retry_at
+    while reconnect.lost(now):
+        now = reconnect.retry_at
     assert 20 < now - back <= 30

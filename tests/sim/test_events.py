@@ -14,8 +14,8 @@ from server.players.player import Player as Seat
 from server.rules import Rules
 from shared.inputs import NEUTRAL, Input
 from shared.scene import Scene, load_scene
+from sovereign_netcode.playtest import Link, Match, Player, wander
 from tests.lengths import long, long_but
-from tests.match import Match, Path, Player, wander
 
 FLAT = load_scene("flat")
 
@@ -82,9 +82,9 @@ class Born(Rules):
 
 @pytest.mark.parametrize(
     "path",
-    long_but([Path(), *(PRESETS[name] for name in ("far", "wifi", "outage"))], [Path(), Path(0.02), *PRESETS.values()]),
+    long_but([Link(), *(PRESETS[name] for name in ("far", "wifi", "outage"))], [Link(), Link(0.02), *PRESETS.values()]),
 )
-def test_an_entity_is_there_when_an_event_tells_of_it(path: Path) -> None:
+def test_an_entity_is_there_when_an_event_tells_of_it(path: Link) -> None:
     match, core = Match(FLAT, seed=1, rules=Born()), Watched()
     match.join(wander, path, core)
     match.run(20)
@@ -97,13 +97,13 @@ def test_an_entity_is_there_when_an_event_tells_of_it_where_not_all_fits_into_a_
     rules = Born()
     rules.crowd = 120
     match, core = Match(FLAT, seed=2, rules=rules), Watched()
-    player = match.join(still, Path(0.03, rate=rate), core)
+    player = match.join(still, Link(0.03, rate=rate), core)
     playing(match, player)
     behind = 0
     for _ in range(40 * 32):
         match.run(1 / 32)
         assert player.session is not None
-        behind += not player.session.stream.sight.complete
+        behind += not player.session.stream.view.complete
     assert behind > 400, "the line is narrow enough"
     assert core.named > 100
     assert core.unknown == 0
@@ -128,8 +128,8 @@ def test_an_entity_is_there_when_an_event_told_while_one_was_away_speaks_of_it()
 # -- Joined, then the rest --------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("path", long_but([Path(), PRESETS["lan"], PRESETS["thin"]], [Path(), *PRESETS.values()]))
-def test_joined_is_the_first_event_and_what_was_said_before_comes_behind_it(path: Path) -> None:
+@pytest.mark.parametrize("path", long_but([Link(), PRESETS["lan"], PRESETS["thin"]], [Link(), *PRESETS.values()]))
+def test_joined_is_the_first_event_and_what_was_said_before_comes_behind_it(path: Link) -> None:
     match = Match(FLAT, seed=4, rules=Born())
     player = match.join(still, path)
     match.run(5)
@@ -206,7 +206,7 @@ def check(match: Match, player: Player, *, dropped: bool) -> None:
 
 def test_a_game_that_did_not_ask_for_a_while_gets_all_events() -> None:
     match = Match(FLAT, seed=7, rules=Loud())
-    player = match.join(still, Path(0.02))
+    player = match.join(still, Link(0.02))
     playing(match, player)
     player.suspend(3.0)
     match.run(5)
@@ -217,7 +217,7 @@ def test_of_more_than_can_wait_the_client_says_how_many_are_missing() -> None:
     rules = Loud()
     rules.per_tick = 200
     match = Match(FLAT, seed=8, limits=Limits(outbox_max=100_000), rules=rules)
-    player = match.join(still, Path(0.02))
+    player = match.join(still, Link(0.02))
     playing(match, player)
     numbers = [player.core.command("mark", n) for n in range(3)]
     player._flush()

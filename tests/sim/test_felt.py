@@ -4,11 +4,11 @@ import pytest
 
 from client_sdk.events import Corrected
 from client_sdk.netsim.links import PRESETS
-from server.replication.flow_control import Pacing
+from server.replication.flow_control import FlowControl
 from shared.inputs import JUMP, Input
 from shared.scene import load_scene
+from sovereign_netcode.playtest import Match, Player, wander
 from tests.lengths import long
-from tests.match import Match, Player, wander
 
 TICK_MS = 1000 / 32
 
@@ -76,7 +76,7 @@ def test_snapshots_are_as_fresh_as_the_link_delivers(
     preset: str, seconds: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     held = sorted(ages(preset, seconds))
-    monkeypatch.setattr(Pacing, "window", lambda *_: 1 << 40)  # whatever is there is sent at once
+    monkeypatch.setattr(FlowControl, "window", lambda *_: 1 << 40)  # whatever is there is sent at once
     sent = sorted(ages(preset, seconds))
     p99 = int(0.99 * len(held))
     assert held[p99] <= sent[p99] + TICK_MS
@@ -124,7 +124,7 @@ def test_on_a_thin_link_nobody_is_starved(seconds: float) -> None:
     def look() -> None:
         for player in players:
             assert player.session is not None
-            waits.append(player.session.stream.sight.waits(match.game.world.tick))
+            waits.append(player.session.stream.view.waits(match.game.world.tick))
 
     match.on_tick.append(look)
     match.run(seconds)

@@ -10,8 +10,8 @@ from client_sdk.events import Corrected
 from client_sdk.netsim.links import PRESETS
 from shared.inputs import Input
 from shared.scene import load_scene
+from sovereign_netcode.playtest import Link, Match
 from tests.lengths import long
-from tests.match import Match, Path
 
 
 def walking(core: Core, rng: random.Random) -> Input:
@@ -22,7 +22,7 @@ def walking(core: Core, rng: random.Random) -> Input:
 def test_first_inputs_that_come_late_are_the_cause_of_what_they_cause(seed: int) -> None:
     """A key is held while joining, and the line stalls just as the first inputs leave: nothing stands in for them."""
     match = Match(load_scene("flat"), seed)
-    player = match.join(walking, Path(0.02))
+    player = match.join(walking, Link(0.02))
     player.core.set_input(Input(127, 0, 0))
     match.run_until(lambda: player.core.state == "playing", 30)
     send, until = player.up.send, match.now + 0.15

@@ -7,7 +7,7 @@ import pytest
 
 from shared.inputs import Input
 from shared.scene import load_scene
-from sovereign_netcode.playtest import Match, Path
+from sovereign_netcode.playtest import Link, Match
 from tests.lengths import long_but
 
 CHANGES = ((3, 0, 2, 1, 3, 0), (1, 2, 3, 2, 1, 0), (3, 3, 0, 0, 3, 1))
@@ -29,7 +29,7 @@ def test_a_figure_that_walks_east_is_never_drawn_further_west(
 ) -> None:
     rate, delay_s = link
     match = Match(dataclasses.replace(load_scene("flat"), tick_rate=rate), 1)
-    ann = match.join(lambda core, rng: Input(127, 0, 0), Path(delay_s))
+    ann = match.join(lambda core, rng: Input(127, 0, 0), Link(delay_s))
     match.run_until(lambda: ann.core.state == "playing", 20)
     match.run(2)
     drawn = []

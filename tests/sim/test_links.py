@@ -7,7 +7,7 @@ from itertools import count
 
 import pytest
 
-from client_sdk.netsim.links import PRESETS, Path, Weather, Wire
+from client_sdk.netsim.links import PRESETS, Link, LinkEvents, TcpStream
 from tests.lengths import long
 
 
@@ -32,7 +32,7 @@ class Time:
 class Stream:
     """Messages sent at a steady rate, and when each came."""
 
-    def __init__(self, path: Path, hz: float, size: int, messages: int, seed: int = 1) -> None:
+    def __init__(self, path: Link, hz: float, size: int, messages: int, seed: int = 1) -> None:
         time = Time()
         self.arrivals: list[float] = []
         self.order: list[int] = []
@@ -44,7 +44,7 @@ class Stream:
             self.arrivals.append(time.now)
             self.delays.append(time.now - number / hz)
 
-        self.wire = Wire(time, Weather(path, seed), seed, deliver)
+        self.wire = TcpStream(time, LinkEvents(path, seed), seed, deliver)
         for number in range(messages):
             time.run(number / hz)
             self.wire.send(number.to_bytes(4, "big") + bytes(size - 4))
@@ -71,7 +71,7 @@ class Stream:
 )
 def test_head_of_line_stalls_are_as_measured(hz: int, rtt_s: float, loss: float, published: float) -> None:
     """`reference/numbers.md`: 400-byte messages, the share more than 100 ms late, within a factor of two."""
-    share = Stream(Path(rtt_s / 2, 0.0, loss), hz, 400, 60_000).share_later_than(rtt_s / 2 + 0.1)
+    share = Stream(Link(rtt_s / 2, 0.0, loss), hz, 400, 60_000).share_later_than(rtt_s / 2 + 0.1)
     if published:
         assert published / 2 <= share <= published * 2
     else:
@@ -92,7 +92,7 @@ def test_one_seed_is_one_run() -> None:
 
 
 def test_a_loss_stalls_what_follows_and_then_all_comes_at_once() -> None:
-    stream = Stream(Path(0.05, 0.0, 0.01), 32, 60, 4000)
+    stream = Stream(Link(0.05, 0.0, 0.01), 32, 60, 4000)
     bursts = [stream.arrivals.count(at) for at in set(stream.arrivals)]
     assert max(bursts) >= 5
     stalls = sorted(delay for delay in stream.delays if delay > 0.06)
@@ -101,12 +101,12 @@ def test_a_loss_stalls_what_follows_and_then_all_comes_at_once() -> None:
 
 
 def test_the_last_message_is_saved_by_the_time_out() -> None:
-    delays = {round(Stream(Path(0.02, 0.0, 0.3), 32, 60, 1, seed).delays[0], 4) for seed in range(50)}
+    delays = {round(Stream(Link(0.02, 0.0, 0.3), 32, 60, 1, seed).delays[0], 4) for seed in range(50)}
     assert {0.02, 0.02 + 0.24, 0.02 + 0.24 + 0.48} <= {round(delay, 2) for delay in delays}
 
 
 def test_the_line_takes_its_time_and_queues() -> None:
-    stream = Stream(Path(0.0, rate=80e3), 32, 400, 100)
+    stream = Stream(Link(0.0, rate=80e3), 32, 400, 100)
     alone = 8 * (400 + 6 + 66) / 80e3
     assert stream.delays[0] == pytest.approx(alone)
     assert stream.arrivals[-1] == pytest.approx(100 * alone)
@@ -114,7 +114,7 @@ def test_the_line_takes_its_time_and_queues() -> None:
 
 def test_outstanding_counts_what_is_not_acknowledged() -> None:
     time = Time()
-    wire = Wire(time, Weather(Path(0.1), 1), 1, lambda message: None)
+    wire = TcpStream(time, LinkEvents(Link(0.1), 1), 1, lambda message: None)
     wire.send(bytes(94))
     assert wire.outstanding() == 100
     time.run(0.19)
@@ -125,7 +125,7 @@ def test_outstanding_counts_what_is_not_acknowledged() -> None:
 
 def test_what_is_on_a_wire_when_it_is_cut_never_comes() -> None:
     time, got = Time(), list[bytes]()
-    wire = Wire(time, Weather(Path(0.1), 1), 1, got.append)
+    wire = TcpStream(time, LinkEvents(Link(0.1), 1), 1, got.append)
     wire.send(b"before")
     time.run(0.11)
     wire.send(b"on the way")
@@ -138,7 +138,7 @@ def test_what_is_on_a_wire_when_it_is_cut_never_comes() -> None:
 def test_what_has_not_arrived_is_told_in_order_whatever_was_lost() -> None:
     for seed in range(20):
         time, got = Time(), list[bytes]()
-        wire = Wire(time, Weather(Path(0.02, 0.01, 0.3), 1), seed, got.append)
+        wire = TcpStream(time, LinkEvents(Link(0.02, 0.01, 0.3), 1), seed, got.append)
         sent = [bytes((number,)) * (1 if number % 5 else 3000) for number in range(40)]
         for number, message in enumerate(sent):
             time.run(number / 100)
@@ -151,14 +151,14 @@ def test_what_has_not_arrived_is_told_in_order_whatever_was_lost() -> None:
 
 
 def test_a_dip_narrows_the_line_for_its_time() -> None:
-    weather = Weather(PRESETS["dip"], 1)
-    assert [weather.rate(at) for at in (0.0, 29.9, 30.1, 39.9, 40.1)] == [2e6, 2e6, 120e3, 120e3, 2e6]
-    assert weather.dipped(31.0) == pytest.approx(1.0)
-    assert weather.dipped(29.0) < 0
+    link_events = LinkEvents(PRESETS["dip"], 1)
+    assert [link_events.rate(at) for at in (0.0, 29.9, 30.1, 39.9, 40.1)] == [2e6, 2e6, 120e3, 120e3, 2e6]
+    assert link_events.dipped(31.0) == pytest.approx(1.0)
+    assert link_events.dipped(29.0) < 0
 
 
 def test_spikes_are_the_same_for_both_directions_and_last_about_a_second() -> None:
-    first, second = Weather(PRESETS["wifi"], 5), Weather(PRESETS["wifi"], 5)
+    first, second = LinkEvents(PRESETS["wifi"], 5), LinkEvents(PRESETS["wifi"], 5)
     seen = [first.extra(at / 100) for at in range(60_000)]
     assert seen == [second.extra(at / 100) for at in range(60_000)]
     assert 40 <= len(first.spikes) <= 70
@@ -169,7 +169,7 @@ def test_spikes_are_the_same_for_both_directions_and_last_about_a_second() -> No
 
 
 def test_what_is_sent_during_an_outage_comes_after_it() -> None:
-    path = replace(Path(0.02), outage=(3.0, 0.12))
+    path = replace(Link(0.02), outage=(3.0, 0.12))
     stream = Stream(path, 32, 60, 320)
     worst = max(stream.delays)
     assert 0.12 < worst < 0.3

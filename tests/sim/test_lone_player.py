@@ -10,8 +10,8 @@ from shared.inputs import JUMP, Input
 from shared.scene import load_scene
 from shared.units import BLOCK
 from shared.world import World
+from sovereign_netcode.playtest import Link, Match, Player
 from tests.lengths import long
-from tests.match import Match, Path, Player
 
 
 class Tour:
@@ -20,24 +20,24 @@ class Tour:
     def __init__(self) -> None:
         self.cells: set[tuple[int, int]] = set()
         self.pressed = self.jumped = 0
-        self._wish = Input()
+        self._input = Input()
 
     def __call__(self, core: Core, rng: random.Random) -> Input:
         assert core.prediction is not None
         state = core.prediction.predicted.state(core.entity)
         x, y, vx, vy, vz = state[3], state[4], state[6], state[7], state[8]
         self.cells.add((x // BLOCK, y // BLOCK))
-        blocked = (self._wish.move_x != 0 and vx == 0) or (self._wish.move_y != 0 and vy == 0)
+        blocked = (self._input.move_x != 0 and vx == 0) or (self._input.move_y != 0 and vy == 0)
         self.pressed += blocked
         self.jumped += vz > 0
         if x > 51 * BLOCK and y > 51 * BLOCK:  # the pit into the void is near: whom it swallows, the server puts back
-            self._wish = Input(-90, -90)
+            self._input = Input(-90, -90)
         elif rng.random() < (0.1 if blocked else 0.02):
-            self._wish = Input(rng.randint(-127, 127), rng.randint(-127, 127), rng.choice((0, JUMP)))
-        return self._wish
+            self._input = Input(rng.randint(-127, 127), rng.randint(-127, 127), rng.choice((0, JUMP)))
+        return self._input
 
 
-def play(scene: str, path: Path, ticks: int, seed: int = 1) -> tuple[Match, Player, Tour]:
+def play(scene: str, path: Link, ticks: int, seed: int = 1) -> tuple[Match, Player, Tour]:
     match, tour = Match(load_scene(scene), seed), Tour()
     player = match.join(tour, path)
     match.run_until(lambda: player.core.state == "playing", 20)
@@ -50,7 +50,7 @@ def play(scene: str, path: Path, ticks: int, seed: int = 1) -> tuple[Match, Play
     [(150, 4_000, 50), *long(*((latency_ms, 20_000, 500) for latency_ms in (0, 50, 150, 300)))],
 )
 def test_no_correction_under_latency_and_jitter(latency_ms: int, ticks: int, least: int) -> None:
-    path = Path(delay_s=latency_ms / 2000, jitter_s=0.040)
+    path = Link(delay_s=latency_ms / 2000, jitter_s=0.040)
     _, player, tour = play("arena", path, ticks)
     stats = player.core.stats
     assert stats.corrections == 0
@@ -64,7 +64,7 @@ def test_no_correction_under_latency_and_jitter(latency_ms: int, ticks: int, lea
 
 
 def test_the_confirmed_world_is_the_servers_world() -> None:
-    match, player, _ = play("arena", Path(), 500)
+    match, player, _ = play("arena", Link(), 500)
     assert player.core.prediction is not None
     confirmed = player.core.prediction.confirmed
     hashes = {}
@@ -75,14 +75,14 @@ def test_the_confirmed_world_is_the_servers_world() -> None:
 
 
 def test_one_seed_is_one_run() -> None:
-    hashes = [play("arena", Path(0.05, 0.04), 500, seed)[0].game.world.state_hash() for seed in (1, 1, 2)]
+    hashes = [play("arena", Link(0.05, 0.04), 500, seed)[0].game.world.state_hash() for seed in (1, 1, 2)]
     assert hashes[0] == hashes[1]
     assert hashes[0] != hashes[2]
 
 
 def test_rolling_back_and_replaying_all_the_time_changes_nothing() -> None:
     match = Match(load_scene("arena"), 4)
-    player = match.join(Tour(), Path(0.15, 0.04))
+    player = match.join(Tour(), Link(0.15, 0.04))
     match.run_until(lambda: player.core.state == "playing", 20)
     prediction = player.core.prediction
     assert prediction is not None
@@ -91,7 +91,7 @@ def test_rolling_back_and_replaying_all_the_time_changes_nothing() -> None:
     def rehearse() -> None:
         before = prediction.predicted.state_hash()
         rehearsed.append(prediction.predicted.tick - prediction.confirmed.tick)
-        prediction.rehearse()
+        prediction.sync_test()
         assert prediction.predicted.state_hash() == before
 
     match.on_tick.append(rehearse)
@@ -102,7 +102,7 @@ def test_rolling_back_and_replaying_all_the_time_changes_nothing() -> None:
 
 def test_a_wall_that_only_the_server_has_corrects_the_client_to_the_bit() -> None:
     match = Match(load_scene("flat"), 1)
-    player = match.join(lambda core, rng: Input(127, 0), Path(0.05, 0.01))
+    player = match.join(lambda core, rng: Input(127, 0), Link(0.05, 0.01))
     match.run_until(lambda: player.core.state == "playing", 20)
     prediction = player.core.prediction
     assert prediction is not None
@@ -129,7 +129,7 @@ def test_a_wall_that_only_the_server_has_corrects_the_client_to_the_bit() -> Non
 
 def test_edits_are_predicted_and_undone_where_the_server_refuses() -> None:
     match = Match(load_scene("flat"), 1)
-    player = match.join(lambda core, rng: Input(), Path(0.1, 0.01))
+    player = match.join(lambda core, rng: Input(), Link(0.1, 0.01))
     match.run_until(lambda: player.core.state == "playing", 20)
     core, prediction = player.core, player.core.prediction
     assert prediction is not None

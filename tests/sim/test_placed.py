@@ -16,8 +16,8 @@ from server.rules import Rules
 from shared.checks import Vec
 from shared.inputs import NEUTRAL, Input
 from shared.scene import Scene, load_scene
+from sovereign_netcode.playtest import Link, Match, Player
 from tests.lengths import long, long_but
-from tests.match import Match, Path, Player
 
 FLAT = load_scene("flat")
 
@@ -90,7 +90,7 @@ class Skipped(Player):
         return 1 << 30 if self.rng.random() < 0.35 else super().outstanding()
 
 
-def join(match: Match, path: Path, kind: type[Player] = Player) -> Player:
+def join(match: Match, path: Link, kind: type[Player] = Player) -> Player:
     player = kind(match, Core("Ann"), path, still, 5)
     match.players.append(player)
     match.at(match.now, player.connect)
@@ -108,7 +108,7 @@ def test_an_entity_that_is_placed_is_never_drawn_elsewhere(far: float, rate: int
     rules = Acts()
     rules.far = far
     match = Match(dataclasses.replace(FLAT, tick_rate=rate), seed=1, rules=rules)
-    player = join(match, Path(0.02, 0.01))
+    player = join(match, Link(0.02, 0.01))
     match.run(2)
     drawn: dict[str, set[float]] = {"one": set(), "steps": set()}
     for _ in range(3 * 240):
@@ -123,13 +123,13 @@ def test_an_entity_that_is_placed_is_never_drawn_elsewhere(far: float, rate: int
 @pytest.mark.parametrize(
     ("path", "rate"),
     long_but(
-        [(Path(0.01, loss=0.01), 32), (PRESETS["wifi"], 32)],
+        [(Link(0.01, loss=0.01), 32), (PRESETS["wifi"], 32)],
         product(
-            [Path(), Path(0.02), Path(0.01, loss=0.01), PRESETS["lan"], PRESETS["regional"], PRESETS["wifi"]], [32, 128]
+            [Link(), Link(0.02), Link(0.01, loss=0.01), PRESETS["lan"], PRESETS["regional"], PRESETS["wifi"]], [32, 128]
         ),
     ),
 )
-def test_a_shot_at_what_is_drawn_hits(path: Path, rate: int) -> None:
+def test_a_shot_at_what_is_drawn_hits(path: Link, rate: int) -> None:
     rules = Acts()
     match = Match(dataclasses.replace(FLAT, tick_rate=rate), seed=3, rules=rules)
     player = join(match, path)
@@ -142,8 +142,8 @@ def test_a_shot_at_what_is_drawn_hits(path: Path, rate: int) -> None:
     assert rules.misses == []
 
 
-@pytest.mark.parametrize("path", [Path(0.02, 0.01), *long(Path())])
-def test_a_shot_at_what_is_drawn_between_snapshots_that_are_far_apart_hits(path: Path) -> None:
+@pytest.mark.parametrize("path", [Link(0.02, 0.01), *long(Link())])
+def test_a_shot_at_what_is_drawn_between_snapshots_that_are_far_apart_hits(path: Link) -> None:
     rules = Acts()
     match = Match(FLAT, seed=4, rules=rules)
     player = join(match, path, Skipped)
@@ -161,7 +161,7 @@ def test_a_shot_at_what_is_drawn_between_snapshots_that_are_far_apart_hits(path:
 def test_a_shot_at_what_is_drawn_after_a_pause_of_the_program_hits() -> None:
     rules = Acts()
     match = Match(FLAT, seed=5, rules=rules)
-    player = join(match, Path(0.01))
+    player = join(match, Link(0.01))
     match.run(3)
     for number in range(500):
         match.run(0.0293)
@@ -197,7 +197,7 @@ class Seen(Rules):
 def test_an_entity_that_is_placed_where_all_is_sent_anew_is_never_drawn_elsewhere() -> None:
     rules = Seen()
     match = Match(FLAT, seed=6, rules=rules)
-    player = join(match, Path(0.02))
+    player = join(match, Link(0.02))
     drawn = set()
     for _ in range(16 * 240):
         match.run(1 / 240)
@@ -221,7 +221,7 @@ class Moved(Rules):
                 self.game.place(entity, self.places[tick % 96 == 0])
 
 
-def drawn_in_loopback(fps: float, link: str | Path | None, delay: int) -> set[float]:
+def drawn_in_loopback(fps: float, link: str | Link | None, delay: int) -> set[float]:
     client = Loopback(Game(FLAT, rules=Moved())).join("Ann", link=link)
     client.set_input_delay(delay)
     drawn = set()
@@ -245,11 +245,11 @@ def test_i_am_never_drawn_between_where_i_was_and_where_i_was_put(fps: float, de
 @pytest.mark.parametrize(
     ("link", "delay"),
     long_but(
-        [("lan", 3), ("typical", 0), (Path(0.016), 3)],
-        product(["lan", "regional", "typical", "wifi", Path(0.002), Path(0.016)], [0, 3]),
+        [("lan", 3), ("typical", 0), (Link(0.016), 3)],
+        product(["lan", "regional", "typical", "wifi", Link(0.002), Link(0.016)], [0, 3]),
     ),
 )
-def test_i_am_never_drawn_between_on_any_line(link: str | Path, delay: int) -> None:
+def test_i_am_never_drawn_between_on_any_line(link: str | Link, delay: int) -> None:
     assert drawn_in_loopback(60.0, link, delay) == {64.0, 74.0}
 
 
@@ -261,7 +261,7 @@ class Pushed(Moved):
 
 def test_a_short_way_is_no_correction_to_be_smoothed() -> None:
     match = Match(FLAT, seed=7, rules=Pushed())
-    player = join(match, Path(0.03))
+    player = join(match, Link(0.03))
     match.run(3)
     drawn = set()
     for _ in range(10 * 240):
@@ -287,7 +287,7 @@ class Falls(Rules):
 @pytest.mark.parametrize("others", [False, True])
 def test_an_entity_that_fell_out_is_not_drawn_on_its_way_back(others: bool) -> None:
     match = Match(FLAT, seed=8, rules=Falls())
-    player, watcher = match.join(still, Path(0.02)), match.join(still, Path(0.02))
+    player, watcher = match.join(still, Link(0.02)), match.join(still, Link(0.02))
     playing(match, player, watcher)
     match.run(3)
     heights = []

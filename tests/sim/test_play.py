@@ -11,8 +11,8 @@ from shared.bounds import UPDATE_S
 from shared.inputs import JUMP, Input
 from shared.messages import Command, decode_from_client
 from shared.scene import load_scene
+from sovereign_netcode.playtest import Link, Match, Player, wander
 from tests.lengths import long
-from tests.match import Match, Path, Player, wander
 
 
 def joined(match: Match, *players: Player) -> None:
@@ -29,7 +29,7 @@ def ahead(player: Player) -> int:
 )
 def test_any_frame_rate_plays(frames_per_s: int, seconds: float) -> None:
     match = Match(load_scene("hills"), 3)
-    player = match.join(wander, Path(0.05, 0.01))
+    player = match.join(wander, Link(0.05, 0.01))
     player.frame_s = 1 / frames_per_s
     joined(match, player)
     match.run(5)  # the lead has learned how long a frame is
@@ -71,7 +71,7 @@ def test_who_sleeps_until_something_is_due_wakes_up_once_per_tick_and_ping(prese
 @pytest.mark.parametrize("seconds", [0.3, 2.0, 12.0, *long(1.0, 5.0)])
 def test_a_suspended_program_begins_anew_without_a_spiral(seconds: float) -> None:
     match = Match(load_scene("hills"), 4)
-    player = match.join(wander, Path(0.05, 0.01))
+    player = match.join(wander, Link(0.05, 0.01))
     joined(match, player)
     match.run(5)
     stats = player.core.stats
@@ -95,7 +95,7 @@ def test_a_suspended_program_begins_anew_without_a_spiral(seconds: float) -> Non
 
 def test_a_long_sleep_ends_the_connection_with_a_reason() -> None:
     match = Match(load_scene("flat"), 5)
-    player = match.join(wander, Path(0.05))
+    player = match.join(wander, Link(0.05))
     joined(match, player)
     match.run(1)  # it is heard of
     player.suspend(20)
@@ -110,7 +110,7 @@ def test_a_long_sleep_ends_the_connection_with_a_reason() -> None:
 
 def test_the_input_delay_changes_in_mid_play_without_a_correction() -> None:
     match = Match(load_scene("arena"), 6)
-    player = match.join(wander, Path(0.05, 0.01))
+    player = match.join(wander, Link(0.05, 0.01))
     joined(match, player)
     depths = {}
     for ticks in (0, 3, 1, 2, 0):
@@ -160,7 +160,7 @@ class Crowd:
     """Everyone presses to the middle, jumps, and sometimes goes away: blocking each other, jumping on heads."""
 
     def __init__(self) -> None:
-        self._wish = Input()
+        self._input = Input()
 
     def __call__(self, core: Core, rng: random.Random) -> Input:
         assert core.prediction is not None
@@ -171,13 +171,13 @@ class Crowd:
                 rng.randint(20, 127) * sign * (1 if x < 64 else -1),
                 rng.randint(20, 127) * sign * (1 if y < 64 else -1),
             )
-            self._wish = Input(*way, JUMP if rng.random() < 0.3 else 0)
-        return self._wish
+            self._input = Input(*way, JUMP if rng.random() < 0.3 else 0)
+        return self._input
 
 
 def crowd(size: int, seconds: float, neighbours: bool, seed: int = 7) -> tuple[Match, list[Player]]:
     match = Match(load_scene("flat"), seed)
-    players = [match.join(Crowd(), Path(0.05, 0.01), Core(neighbours=neighbours)) for _ in range(size)]
+    players = [match.join(Crowd(), Link(0.05, 0.01), Core(neighbours=neighbours)) for _ in range(size)]
     joined(match, *players)
     match.run(seconds)
     return match, players

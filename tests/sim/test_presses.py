@@ -14,8 +14,8 @@ from server.game import Game
 from shared.inputs import JUMP, Input
 from shared.messages import Inputs, decode_from_client
 from shared.scene import load_scene
+from sovereign_netcode.playtest import Link, Match, Player
 from tests.lengths import long_but
-from tests.match import Match, Path, Player
 
 FLAT = load_scene("flat")
 
@@ -98,11 +98,11 @@ def playing(player: Player) -> Sent:
 
 
 def kept(core: Core, rng: random.Random) -> Input:
-    return core.wish
+    return core.input
 
 
-@pytest.mark.parametrize("path", [Path(), Path(0.02), PRESETS["typical"], PRESETS["wifi"]])
-def test_a_press_at_any_time_between_two_ticks_is_in_one_input(path: Path) -> None:
+@pytest.mark.parametrize("path", [Link(), Link(0.02), PRESETS["typical"], PRESETS["wifi"]])
+def test_a_press_at_any_time_between_two_ticks_is_in_one_input(path: Link) -> None:
     """As with `AsyncClient`: ticks are predicted when they are due, and the input is set at any time."""
     match = Match(FLAT, seed=1)
     core = playing(match.join(kept, path, Sent()))
@@ -119,7 +119,7 @@ def test_a_press_at_any_time_between_two_ticks_is_in_one_input(path: Path) -> No
 
 def test_a_button_that_is_held_is_in_the_inputs_of_its_ticks_and_of_no_others() -> None:
     match = Match(FLAT, seed=3)
-    core = playing(match.join(kept, Path(0.02), Sent()))
+    core = playing(match.join(kept, Link(0.02), Sent()))
     rng = random.Random(4)
     match.run(3)
     expected: dict[int, int] = {}
@@ -152,7 +152,7 @@ def test_a_tap_in_mid_air_is_not_remembered_for_the_landing() -> None:
 @pytest.mark.parametrize("pause_s", [0.3, 1.0, 3.0, 7.0])
 def test_a_press_ahead_of_a_pause_is_not_remembered_for_the_time_after_it(pause_s: float) -> None:
     match = Match(FLAT, seed=5)
-    player = match.join(kept, Path(0.02), Sent())
+    player = match.join(kept, Link(0.02), Sent())
     core = playing(player)
     match.run(3)
     last = max(core.buttons)
@@ -166,7 +166,7 @@ def test_a_press_ahead_of_a_pause_is_not_remembered_for_the_time_after_it(pause_
 
 def test_a_press_while_nothing_is_heard_is_not_remembered() -> None:
     match = Match(FLAT, seed=6)
-    player = match.join(kept, Path(0.02), Sent())
+    player = match.join(kept, Link(0.02), Sent())
     core = playing(player)
     match.run(3)
     core.held = []

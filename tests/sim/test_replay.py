@@ -15,7 +15,7 @@ from shared.inputs import Input
 from shared.scene import load_scene
 from shared.world import World
 from sovereign_netcode import replay
-from sovereign_netcode.playtest import Match, Path, wander
+from sovereign_netcode.playtest import Link, Match, wander
 from tests.lengths import long
 
 
@@ -55,7 +55,7 @@ class Played:
         self.ends: list[int] = []
         match.on_tick.append(lambda: self.hashes.update({world.tick: world.state_hash()}))
         match.on_tick.append(lambda: self.ends.append(len(self.file.getvalue())))
-        path = Path(0.03, 0.02)
+        path = Link(0.03, 0.02)
         players = [match.join(wander, path) for _ in range(8)]
         players += [match.join(to_the_pit, path), match.join(build_and_dig, path)]
         match.run(seconds / 4)

@@ -12,15 +12,15 @@ from server.players.input_queue import InputQueue
 from shared.bounds import UNCONFIRMED_S
 from shared.inputs import Input
 from shared.scene import load_scene
+from sovereign_netcode.playtest import Link, Match, Player, wander
 from tests.lengths import long, long_but
-from tests.match import Match, Path, Player, wander
 
 FLAT = load_scene("flat")
-NEAR = Path(0.02)
+NEAR = Link(0.02)
 RATES = (1, 20, 32, 60, 128, 240)
 
 
-def at(rate: int, path: Path = NEAR, seed: int = 1) -> tuple[Match, Player]:
+def at(rate: int, path: Link = NEAR, seed: int = 1) -> tuple[Match, Player]:
     """A match at a tick rate with one player who has wandered about for 10 s."""
     match = Match(dataclasses.replace(FLAT, tick_rate=rate), seed)
     player = match.join(wander, path)
@@ -123,7 +123,7 @@ def test_stop_after_stop() -> None:
 def test_after_a_stop_what_is_pressed_now_is_what_counts() -> None:
     """Inputs that were sent ahead while the server stood still are withdrawn, not played back."""
     match = Match(FLAT, 1)
-    player = match.join(lambda core, rng: core.wish, NEAR)
+    player = match.join(lambda core, rng: core.input, NEAR)
     match.run(10)
     player.core.set_input(Input(127, 0, 0))
     stop_server(match, 3.0)
@@ -170,7 +170,7 @@ def test_any_frame_rate_plays(rate: int, fps: float) -> None:
 )
 def test_a_long_way_plays_at_any_rate(rate: int, rtt_s: float, fps: float) -> None:
     match = Match(dataclasses.replace(FLAT, tick_rate=rate), 3)
-    player = match.join(wander, Path(rtt_s / 2))
+    player = match.join(wander, Link(rtt_s / 2))
     player.frame_s = 1 / fps if fps else 0.0
     match.run_until(lambda: player.core.state == "playing", 60)
     match.run(15)

@@ -16,8 +16,8 @@ from client_sdk.timing.lead import PricedLead
 from scripts.experiments import lead_trial, league
 from shared.inputs import Input
 from shared.scene import load_scene
+from sovereign_netcode.playtest import Match
 from tests.lengths import long
-from tests.match import Match
 
 MINUTES = 10.0
 TICK_MS = lead_trial.TICK_MS
@@ -58,7 +58,7 @@ def test_must_hold(preset: str, late: float, added_ticks: float, above_ticks: fl
 def test_after_a_spike_all_is_well_within_250_ms() -> None:
     run = lead_trial.Trial("wifi", PricedLead(), seed=11)
     run.run(300)
-    ends = [end for _, end, _ in run.weather.spikes if end < 295]
+    ends = [end for _, end, _ in run.link_events.spikes if end < 295]
     assert len(ends) > 20
     after = [tick for tick, made in run.made.items() for end in ends if end + 0.25 <= made < end + 3]
     assert sum(run.margins[tick] < 0 for tick in after) <= 0.02 * len(after)
