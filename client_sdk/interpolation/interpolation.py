@@ -16,6 +16,7 @@ from collections import deque
 import numpy as np
 import numpy.typing as npt
 
+from shared.between import between
 from shared.layout import ID, VX, Int64s, X
 from shared.units import BLOCK, SPEED
 
@@ -123,14 +124,9 @@ def _between(before: Entry, after: Entry, at: float) -> tuple[Int64s, Positions]
     """
     share = (at - before[0]) / (after[0] - before[0])
     states, new = before[1], after[1]
-    places = states[:, X : X + 3] / BLOCK
+    ids, places = states[:, ID], states[:, X : X + 3]
     if not len(new):
-        return states, places
-    place = np.searchsorted(new[:, ID], states[:, ID])
-    place[place == len(new)] = 0
-    moves = new[place, ID] == states[:, ID]
-    if after[2]:
-        moves &= ~np.isin(states[:, ID], list(after[2]))
-    was = places[moves]
-    places[moves] = was + (new[place[moves], X : X + 3] / BLOCK - was) * share
-    return states, places
+        return states, places / BLOCK
+    row = np.searchsorted(new[:, ID], ids)
+    row[row == len(new)] = 0
+    return states, between(ids, places, new[row, X : X + 3], new[row, ID] == ids, after[2], share)

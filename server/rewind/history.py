@@ -24,6 +24,7 @@ import numpy.typing as npt
 
 from server.rewind.rays import Ray
 from shared import layout
+from shared.between import between
 from shared.checks import Cell, Vec, finite, vector
 from shared.layout import ID, TEMPLATE, Int64s, X
 from shared.scene import Scene
@@ -270,14 +271,9 @@ def _between(old: Int64s, new: Int64s, share: float, placed: set[int]) -> tuple[
     Returns:
         The rows of `old` with an entity, and their positions in blocks.
     """
-    places = old[:, 2:] / BLOCK
-    if share > 0:
-        moves = old[:, 0] == new[:, 0]
-        if placed:
-            moves &= ~np.isin(old[:, 0], list(placed))
-        was = places[moves]
-        places[moves] = was + (new[moves, 2:] / BLOCK - was) * share
-    there = old[:, 0] != 0
+    ids = old[:, 0]
+    places = between(ids, old[:, 2:], new[:, 2:], ids == new[:, 0], placed, share)
+    there = ids != 0
     return old[there], places[there]
 
 
