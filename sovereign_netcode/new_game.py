@@ -70,7 +70,7 @@ TEST = '''\
 
 from {name} import {title}
 from sovereign_netcode.client_sdk.events import Happened
-from sovereign_netcode.playtest import Match, Path, bot
+from sovereign_netcode.playtest import Match, Link, bot
 from sovereign_netcode.shared.inputs import NEUTRAL, Input, make_input
 from sovereign_netcode.shared.scene import load_scene
 from sovereign_netcode.shared.world import World
@@ -87,7 +87,7 @@ def seek(world: World, me: int) -> Input:
 
 def test_two_bots_play() -> None:
     match = Match(load_scene({title}.scene), seed=1, rules={title}())
-    ann, bob = match.join(bot(seek), Path(0.05)), match.join(bot(seek), Path(0.05))  # 50 ms each way
+    ann, bob = match.join(bot(seek), Link(0.05)), match.join(bot(seek), Link(0.05))  # 50 ms each way
     match.run(20)
 
     game = match.game.api  # the object that the rules have as `self.game`

@@ -8,6 +8,7 @@ import email
 import shutil
 import subprocess
 import tarfile
+import tomllib
 import zipfile
 from contextlib import AbstractContextManager
 from pathlib import Path
@@ -32,6 +33,8 @@ PACKAGES = (
     *("mypy", "pytest"),
 )
 """What the package requires with all its extras but Numba, which is for other platforms; and tools of users."""
+DIST_INFO = f"sovereign_netcode-{tomllib.loads((ROOT / 'pyproject.toml').read_text())['project']['version']}.dist-info"
+"""Folder of the metadata in the wheel."""
 COMMANDS = ("loadtest", "new-game", "play", "replay", "server")
 
 
@@ -87,7 +90,7 @@ def names(wheel: Path) -> set[str]:
     """All files of a wheel but its metadata, relative to the package."""
     with zipfile.ZipFile(wheel) as archive:
         files = {Path(name) for name in archive.namelist()}
-    assert {file.parts[0] for file in files} == {"sovereign_netcode", "sovereign_netcode-0.1.0.dist-info"}
+    assert {file.parts[0] for file in files} == {"sovereign_netcode", "{DIST_INFO}"}
     return {"/".join(file.parts[1:]) for file in files if file.parts[0] == "sovereign_netcode"}
 
 
@@ -117,9 +120,9 @@ def test_no_source_of_the_wheel_imports_a_folder(wheel: Path) -> None:
 
 def test_the_metadata_says_what_it_is(wheel: Path) -> None:
     with zipfile.ZipFile(wheel) as archive:
-        metadata = email.message_from_bytes(archive.read("sovereign_netcode-0.1.0.dist-info/METADATA"))
-        commands = archive.read("sovereign_netcode-0.1.0.dist-info/entry_points.txt").decode()
-        licence = archive.read("sovereign_netcode-0.1.0.dist-info/licenses/LICENSE")
+        metadata = email.message_from_bytes(archive.read(f"{DIST_INFO}/METADATA"))
+        commands = archive.read(f"{DIST_INFO}/entry_points.txt").decode()
+        licence = archive.read(f"{DIST_INFO}/licenses/LICENSE")
     assert str(metadata.get_payload()).startswith("# Sovereign Netcode\n")
     assert "Typing :: Typed" in metadata.get_all("Classifier", [])
     assert metadata["License-Expression"] == "MIT"
