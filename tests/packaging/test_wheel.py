@@ -90,7 +90,7 @@ def names(wheel: Path) -> set[str]:
     """All files of a wheel but its metadata, relative to the package."""
     with zipfile.ZipFile(wheel) as archive:
         files = {Path(name) for name in archive.namelist()}
-    assert {file.parts[0] for file in files} == {"sovereign_netcode", "{DIST_INFO}"}
+    assert {file.parts[0] for file in files} == {"sovereign_netcode", DIST_INFO}
     return {"/".join(file.parts[1:]) for file in files if file.parts[0] == "sovereign_netcode"}
 
 
