@@ -247,6 +247,7 @@ class AsyncClient(BaseClient):
         except OSError as error:  # includes ConnectError, SSLError and TimeoutError
             if connection.refused is None:
                 connection.broke(f"no connection ({str(error) or 'no answer in time'})", time.monotonic())
+            self._answered.cancel()  # nobody waits for it: an exception in it would be logged as never retrieved
             self._drop()
             self._pump(time.monotonic())
             self._schedule(time.monotonic())

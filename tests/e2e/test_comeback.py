@@ -2,11 +2,13 @@
 
 import asyncio
 import contextlib
+import gc
 import math
 import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -76,7 +78,8 @@ def test_a_client_gives_up_after_its_patience(tmp_path: Path) -> None:
 
 
 async def test_a_client_in_an_event_loop_survives_its_server(tmp_path: Path) -> None:
-    loop = asyncio.get_running_loop()
+    loop, reported = asyncio.get_running_loop(), list[dict[str, Any]]()
+    loop.set_exception_handler(lambda _, context: reported.append(context))
     with contextlib.ExitStack() as first:
         process, url = await loop.run_in_executor(None, first.enter_context, server(tmp_path))
         client = await AsyncClient.connect(url, name="Ann", before_update=walk)
@@ -110,3 +113,5 @@ async def test_a_client_in_an_event_loop_survives_its_server(tmp_path: Path) -> 
         assert way > MOVING_BLOCKS
         await client.close()
         assert not any(isinstance(event, Left) for event in seen)
+        gc.collect()
+        assert reported == [], "attempts that failed leave nothing that asyncio complains of"
