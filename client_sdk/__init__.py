@@ -64,10 +64,11 @@ RENAMED = {"Figure": "EntityView", "Path": "Link"}
 
 def __getattr__(name: str) -> Any:
     """Loads the simulator of links when a program asks for `Link`, and knows the old names of `RENAMED`."""
-    if name in RENAMED:
-        return __getattr__(RENAMED[name]) if RENAMED[name] == "Link" else globals()[RENAMED[name]]
-    if name == "Link":
+    known = RENAMED.get(name, name)
+    if known == "Link":
         from client_sdk.netsim.links import Link
 
         return Link
+    if name in RENAMED:
+        return globals()[known]
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -13,7 +13,7 @@ import ssl
 import time
 from collections.abc import Callable
 from types import TracebackType
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, cast
 
 from client_sdk.base import BaseClient, set_link
 from client_sdk.compiling import COMPILER
@@ -130,45 +130,6 @@ class AsyncClient(BaseClient):
             raise
         return client
 
-    def edit(self, x: int, y: int, z: int, kind: int) -> int:
-        """Places or removes one block with the next tick. The client predicts the change and shows it at once.
-
-        Args:
-            x: east, in blocks.
-            y: north, in blocks.
-            z: up, in blocks.
-            kind: the block to place, 1 to 255; 0 removes the block.
-
-        Returns:
-            The number of the edit. The event `Answered` with this number brings the result.
-
-        Raises:
-            RuntimeError: the client has not joined.
-            TypeError: an argument is not a whole number.
-            ValueError: an argument is out of range.
-        """
-        number = self.core.edit(x, y, z, kind)
-        self._pump(time.monotonic())
-        return number
-
-    def command(self, name: str, data: Any = None) -> int:
-        """Sends a request to the rules of the game, which define what `name` and `data` mean.
-
-        Args:
-            name: name of the command, up to 32 characters.
-            data: any value that MessagePack can hold, up to 1,024 bytes when packed.
-
-        Returns:
-            The number of the command. The event `Answered` with this number brings the result.
-
-        Raises:
-            RuntimeError: the client has not joined.
-            ValueError: the name or the data are too long, or MessagePack cannot hold the data.
-        """
-        number = self.core.command(name, data)
-        self._pump(time.monotonic())
-        return number
-
     def view(self) -> View:
         """Returns what to draw now; positions in blocks, velocities in blocks/s."""
         return self.core.view(time.monotonic())
@@ -251,6 +212,9 @@ class AsyncClient(BaseClient):
             self._drop()
             self._pump(time.monotonic())
             self._schedule(time.monotonic())
+
+    def _filed(self) -> None:
+        self._pump(time.monotonic())
 
     def _ended(self, error: Exception | None) -> None:
         now = time.monotonic()

@@ -113,6 +113,51 @@ class BaseClient:
         """
         self.core.set_input_delay(ticks)
 
+    def edit(self, x: int, y: int, z: int, kind: int) -> int:
+        """Places or removes one block with the next tick. The client predicts the change and shows it at once.
+
+        The server may refuse it: the block is out of reach, an entity is in the way, or there were too many edits. The
+        client then takes the change back by itself.
+
+        Args:
+            x: east, in blocks.
+            y: north, in blocks.
+            z: up, in blocks.
+            kind: the block to place, 1 to 255; 0 removes the block.
+
+        Returns:
+            The number of the edit. The event `Answered` with this number brings the result.
+
+        Raises:
+            RuntimeError: the client has not joined.
+            TypeError: an argument is not a whole number.
+            ValueError: an argument is out of range.
+        """
+        number = self.core.edit(x, y, z, kind)
+        self._filed()
+        return number
+
+    def command(self, name: str, data: Any = None) -> int:
+        """Sends a request to the rules of the game, which define what `name` and `data` mean.
+
+        Args:
+            name: name of the command, up to 32 characters.
+            data: any value that MessagePack can hold, up to 1,024 bytes when packed.
+
+        Returns:
+            The number of the command. The event `Answered` with this number brings the result.
+
+        Raises:
+            RuntimeError: the client has not joined.
+            ValueError: the name or the data are too long, or MessagePack cannot hold the data.
+        """
+        number = self.core.command(name, data)
+        self._filed()
+        return number
+
+    def _filed(self) -> None:
+        """Called after a command has been filed, for a client that sends it at once; others send with `update`."""
+
 
 def set_link(core: Core, link: "str | Link | None") -> None:
     """Puts a simulated link in front of a core, or changes it. Without a link, the simulator is not even loaded.

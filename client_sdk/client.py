@@ -12,7 +12,7 @@ with Client.connect("ws://localhost:8765", name="Ann") as client:
 import ssl
 import time
 from types import TracebackType
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Protocol
 
 from client_sdk.base import BaseClient, set_link
 from client_sdk.compiling import COMPILER
@@ -104,44 +104,6 @@ class Client(BaseClient):
         """Reads what has arrived. Returns the events since the last call, oldest first. Never blocks."""
         self._transport.poll(_time(now))
         return self.core.events()
-
-    def edit(self, x: int, y: int, z: int, kind: int) -> int:
-        """Places or removes one block with the next tick. The client predicts the change and shows it at once.
-
-        The server may refuse it: the block is out of reach, an entity is in the way, or there were too many edits. The
-        client then takes the change back by itself.
-
-        Args:
-            x: east, in blocks.
-            y: north, in blocks.
-            z: up, in blocks.
-            kind: the block to place, 1 to 255; 0 removes the block.
-
-        Returns:
-            The number of the edit. The event `Answered` with this number brings the result.
-
-        Raises:
-            RuntimeError: the client has not joined.
-            TypeError: an argument is not a whole number.
-            ValueError: an argument is out of range.
-        """
-        return self.core.edit(x, y, z, kind)
-
-    def command(self, name: str, data: Any = None) -> int:
-        """Sends a request to the rules of the game, which define what `name` and `data` mean.
-
-        Args:
-            name: name of the command, up to 32 characters.
-            data: any value that MessagePack can hold, up to 1,024 bytes when packed.
-
-        Returns:
-            The number of the command. The event `Answered` with this number brings the result.
-
-        Raises:
-            RuntimeError: the client has not joined.
-            ValueError: the name or the data are too long, or MessagePack cannot hold the data.
-        """
-        return self.core.command(name, data)
 
     def update(self, now: float | None = None) -> None:
         """Predicts every tick that is due, and sends its input. Starts the play once the world has arrived."""

@@ -1,5 +1,9 @@
 """Decorators of the kernel's functions: Numba's in the compiled instance of a source, none in the plain instance."""
 
+import importlib.util
+import sys
+from pathlib import Path
+from types import ModuleType
 from typing import Any, Protocol, TypeVar
 
 F = TypeVar("F")
@@ -29,6 +33,22 @@ def decorators(module: str) -> tuple[Decorator, Decorator]:
 
     njit: Any = numba.njit
     return njit(**OPTIONS), njit(**OPTIONS, forceinline=True)
+
+
+def second_instance(path: Path, name: str) -> ModuleType:
+    """Loads a source file as another module, beside the instance that is imported by its own name.
+
+    Args:
+        path: the source file.
+        name: name of the new module; with the suffix `COMPILED`, `decorators` compiles its functions.
+    """
+    spec = importlib.util.spec_from_file_location(name, path)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[name] = module
+    spec.loader.exec_module(module)
+    return module
 
 
 def _plain(function: F, /) -> F:

@@ -2,8 +2,6 @@
 
 import functools
 import importlib
-import importlib.util
-import sys
 import zlib
 from collections.abc import Iterable
 from pathlib import Path
@@ -11,7 +9,7 @@ from types import ModuleType
 from typing import Any
 
 from shared import exports, freshness
-from shared.jit import COMPILED, OPTIONS
+from shared.jit import COMPILED, OPTIONS, second_instance
 from shared.layout import Arrays
 
 
@@ -55,19 +53,13 @@ def jitted(source: ModuleType) -> ModuleType:
         ImportError: Numba is not installed.
     """
     config: Any = importlib.import_module("numba.core.config")
-    name = source.__name__ + COMPILED
     assert source.__file__ is not None
-    spec = importlib.util.spec_from_file_location(name, source.__file__)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[name] = module
+    path = Path(source.__file__)
     place = config.CACHE_DIR
     # Numba's cache depends on the source file alone, so the folder's name has a checksum of the imported constants.
     kept = f"numba-{zlib.crc32(repr((freshness.constants(source), OPTIONS)).encode()):08x}"
-    config.CACHE_DIR = str(Path(place or Path(source.__file__).parent / "__pycache__") / kept)
+    config.CACHE_DIR = str(Path(place or path.parent / "__pycache__") / kept)
     try:
-        spec.loader.exec_module(module)
+        return second_instance(path, source.__name__ + COMPILED)
     finally:
         config.CACHE_DIR = place
-    return module

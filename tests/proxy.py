@@ -26,7 +26,7 @@ HIDDEN_BYTES = 2 * 1152
 FLIGHT_PACKETS_MAX = 256
 """More are not read, however long the delay."""
 STEP_S = 0.005
-"""The link_events is looked at so often while it lets nothing through."""
+"""Seconds between two looks at the link while it lets nothing through."""
 
 
 class Proxy:

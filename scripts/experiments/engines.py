@@ -1,9 +1,8 @@
 """The engines of the accuracy report: the product's world and the variants behind one interface."""
 
-import importlib.util
-import sys
 from dataclasses import dataclass
 from functools import cache
+from pathlib import Path
 from types import ModuleType
 from typing import Any, Protocol
 
@@ -13,6 +12,7 @@ import numpy.typing as npt
 from scripts.experiments import variants
 from scripts.experiments.slabs import Slabs
 from shared.inputs import JUMP, MOVE_MAX, Input
+from shared.jit import second_instance
 from shared.layout import FLAGS, MOVE_X, VX, X
 from shared.scene import Scene
 from shared.units import BLOCK, SEGMENT, SPEED, rounded
@@ -197,11 +197,4 @@ def _on(value: float, scale: float) -> float:
 
 @cache
 def _fast() -> ModuleType:
-    name = "scripts.experiments.variants_fast"
-    spec = importlib.util.spec_from_file_location(name, variants.__file__)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[name] = module
-    spec.loader.exec_module(module)
-    return module
+    return second_instance(Path(variants.__file__), "scripts.experiments.variants_fast")

@@ -9,12 +9,9 @@ and needs nothing from outside.
 
 from __future__ import annotations
 
-import importlib.util
 import re
-import sys
 from dataclasses import dataclass
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import llvmlite.binding as llvm
@@ -74,7 +71,7 @@ def numba_sources(root: Path, *, bounds: bool = False) -> list[Source]:
     scope |= {f"array_{kind}": of_array(getattr(types, name)) for kind, (name, _) in exports.ARRAYS.items()}
     made: list[Source] = []
     for module, functions in exports.EXPORTS.items():
-        compiled = _load(root / "shared" / f"{module}.py", module + jit.COMPILED)
+        compiled = jit.second_instance(root / "shared" / f"{module}.py", module + jit.COMPILED)
         for name, kinds in functions.items():
             local = {**scope, "function": getattr(compiled, name)}
             exec(_wrapper(name, kinds, local["function"].py_func.__annotations__["return"] is not None), local)
@@ -160,16 +157,6 @@ def _words_type() -> Any:
 
     pointer: Any = types.CPointer
     return pointer(types.int64)
-
-
-def _load(path: Path, name: str) -> ModuleType:
-    spec = importlib.util.spec_from_file_location(name, path)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[name] = module
-    spec.loader.exec_module(module)
-    return module
 
 
 EXPORT = """

@@ -69,25 +69,18 @@ CASES: list[tuple[str, str, Act, list[Any]]] = [
 def test_a_wrong_value_is_named_and_nothing_is_done(playing: Playing, said: str, act: Act, wrong: list[Any]) -> None:
     client = playing.client
     core = client.core
-    assert core.prediction is not None
+    prediction = core.prediction
+    assert prediction is not None
+
+    def state() -> tuple[Any, ...]:
+        filed = core._commands._number
+        return core.input, core.controls.delay, client.link, prediction.predicted.state_hash(), filed
+
     for bad in wrong:
-        before = (
-            core.input,
-            core.controls.delay,
-            client.link,
-            core.prediction.predicted.state_hash(),
-            core._commands._number,
-        )
+        before = state()
         with pytest.raises((ValueError, TypeError), match=f"^{said}"):
             act(client, bad)
-        after = (
-            core.input,
-            core.controls.delay,
-            client.link,
-            core.prediction.predicted.state_hash(),
-            core._commands._number,
-        )
-        assert after == before
+        assert state() == before
     playing.play(10)
     assert client.playing
     assert (client.stats.divergences, client.stats.corrections, playing.game.counters.malformed) == (0, 0, 0)

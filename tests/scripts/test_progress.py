@@ -63,7 +63,7 @@ def test_a_return_begins_the_time_anew() -> None:
 
 
 def watched(match: Match, core: Core, seconds: float) -> Walker:
-    """Runs a match for so many seconds. Returns a walker that has looked at the core all the time."""
+    """Runs a match for `seconds`. Returns a walker that looked at the core every `LOOK_S` seconds."""
     walker = Walker(0, 0)
     for _ in range(round(seconds / LOOK_S)):
         match.run(LOOK_S)
