@@ -33,6 +33,10 @@ INTEGRATORS = ("mean", "semi")
 SHOWN = ("interpolated", "predicted")
 """Choices of `Template.shown`."""
 
+OPTIONAL: frozenset[str] = frozenset()
+"""Fields of scenes and templates that a table leaves out if they have their default, so that scenes without them keep
+their bytes and their fingerprint."""
+
 SCENES = Path(__file__).parent / "scenes"
 """Folder of the scenes that come with the package."""
 
@@ -223,11 +227,7 @@ class Scene:
 
     def to_table(self) -> dict[str, Any]:
         """Returns a table for `from_table`, of plain lists, tables, texts and numbers."""
-        table = {f.name: _plain(getattr(self, f.name)) for f in fields(self)}
-        table["templates"] = [
-            {f.name: _plain(getattr(entry, f.name)) for f in fields(entry)} for entry in self.templates
-        ]
-        return table
+        return _table(self) | {"templates": [_table(entry) for entry in self.templates]}
 
     @functools.cached_property
     def fingerprint(self) -> bytes:
@@ -339,6 +339,12 @@ def _template(entry: object) -> Template:
     if "name" not in entry:
         raise SceneError("templates.name: missing")
     return Template(**entry)
+
+
+def _table(owner: Any) -> dict[str, Any]:
+    """Returns the fields of a dataclass by name, without the optional ones that have their default."""
+    values = [(f, _plain(getattr(owner, f.name))) for f in fields(owner)]
+    return {f.name: value for f, value in values if f.name not in OPTIONAL or value != _plain(f.default)}
 
 
 def _plain(value: Any) -> Any:
