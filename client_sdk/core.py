@@ -320,7 +320,7 @@ class Core:
         self._events.append(Resumed(tick, away_s) if same else Joined(self.entity, world.scene, tick))
         self._game_events.release()
         self.reconnect.back()
-        for inputs in play.unheard() if same else ():
+        for inputs in play.unreceived() if same else ():
             self._send(inputs)
 
     def _cut_off(self, left: Left, now: float) -> None:

@@ -205,15 +205,15 @@ class InputLoop:
         missing = statuses.count(REPEATED) + neutralised
         if IDLE in statuses:  # the very first inputs were late, and the server had no earlier one to repeat
             ticks = enumerate(statuses, snapshot.first)
-            missing += sum(fate == IDLE and phases.get(tick) is not None for tick, fate in ticks)
+            missing += sum(status == IDLE and phases.get(tick) is not None for tick, status in ticks)
         stats.inputs_substituted += missing
         stats.inputs_neutralised += neutralised
         self._late |= missing > 0
 
-    def unheard(self) -> list[Message]:
+    def unreceived(self) -> list[Message]:
         """Returns the inputs to send again after a reconnect: those that the server may not have received yet."""
         prediction, newest = self.world.prediction, self.newest
-        since = max(self.world.heard, prediction.confirmed.tick, newest - self._bounds.ahead)
+        since = max(self.world.newest_received, prediction.confirmed.tick, newest - self._bounds.ahead)
         return [
             Inputs(
                 first + 1,

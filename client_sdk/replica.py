@@ -49,14 +49,14 @@ class Replica:
         compiled: bool | None,
     ) -> None:
         self.scene = check_scene(welcome.scene)
-        self.known = Confirmed(self.scene, welcome.entity, compiled=compiled)
-        self.prediction = Prediction(self.known, controls, neighbours=neighbours)
+        self.confirmed = Confirmed(self.scene, welcome.entity, compiled=compiled)
+        self.prediction = Prediction(self.confirmed, controls, neighbours=neighbours)
         self.picture = ViewBuilder(self.scene, self.prediction)
         self.clock = clock
         if clock.rate == 0 or abs(clock.tick(now) - welcome.tick) > CLOCK_S * self.scene.tick_rate:
             self.clock = ServerClock()
             self.clock.rate = float(self.scene.tick_rate)
-        self.heard = -1
+        self.newest_received = -1
         """Newest tick for which the server has received an input; -1 before the first snapshot."""
         self.wrong = ""
         """Text that names a difference from the server's world, for `Diverged`; empty if there is none."""
@@ -70,8 +70,8 @@ class Replica:
     @property
     def complete(self) -> bool:
         """Whether enough is known to play: the server's time, the own entity and the terrain around it."""
-        known = self.known
-        return self.clock.ready and known.entity in known.world and known.grounded()
+        confirmed = self.confirmed
+        return self.clock.ready and confirmed.entity in confirmed.world and confirmed.grounded()
 
     def terrain(self, terrain: Terrain) -> Cell | None:
         """Takes a piece of a segment's terrain. Edits that arrived between the pieces are applied to it.
@@ -85,7 +85,7 @@ class Replica:
         segment = (terrain.x, terrain.y, terrain.z)
         if terrain.offset == 0:
             self._pieces = (segment, bytearray())
-            self.known.expect_segment(segment)
+            self.confirmed.expect_segment(segment)
         if self._pieces[0] != segment or len(self._pieces[1]) != terrain.offset:
             raise ProtocolError("Terrain: a piece is missing")
         self._pieces[1].extend(terrain.chunk)
@@ -95,7 +95,7 @@ class Replica:
             kinds = unpack(bytes(self._pieces[1]))
         except ValueError as error:
             raise ProtocolError(f"Terrain.chunk: {error}") from error
-        self.known.load_segment(segment, kinds)
+        self.confirmed.load_segment(segment, kinds)
         return segment
 
     def skipped(self, snapshot: Snapshot) -> int:
@@ -104,7 +104,7 @@ class Replica:
         Raises:
             ProtocolError: this one is not newer.
         """
-        world = self.known.world
+        world = self.confirmed.world
         if snapshot.tick <= world.tick:
             raise ProtocolError(f"Snapshot.tick = {snapshot.tick}: not newer than the one before")
         return snapshot.tick - world.tick - 1 if len(world) else 0
@@ -115,10 +115,10 @@ class Replica:
         Raises:
             ProtocolError: a part of the snapshot is malformed.
         """
-        self.heard = max(self.heard, snapshot.newest)
-        self.wrong = self.known.apply(snapshot) or self.wrong
-        placed = self.known.placed.get(snapshot.tick)
-        self.picture.interpolation.push(snapshot.tick, self.known.states, placed or frozenset())
+        self.newest_received = max(self.newest_received, snapshot.newest)
+        self.wrong = self.confirmed.apply(snapshot) or self.wrong
+        placed = self.confirmed.placed.get(snapshot.tick)
+        self.picture.interpolation.push(snapshot.tick, self.confirmed.states, placed or frozenset())
 
     def take_over(self, old: "Replica") -> bool:
         """Takes the place of an earlier replica, and its inputs and edits if the own entity is the same.

@@ -58,7 +58,7 @@ class View:
 
 NOTHING = View(0.0, None, [])
 """The view before the client has joined."""
-NONE_SAID: Mapping[str, Any] = MappingProxyType({})
+NO_ATTRIBUTES: Mapping[str, Any] = MappingProxyType({})
 """Attributes of an entity that has none."""
 
 
@@ -128,5 +128,5 @@ class ViewBuilder:
         """Returns the entity view of a state, drawn at `place` (in blocks)."""
         x, y, z = place
         vx, vy, vz = (part / SPEED for part in state[VX : VX + 3])
-        said = self._prediction.attributes.get(state[ID], NONE_SAID)
-        return EntityView(state[ID], self._templates[state[TEMPLATE]], (x, y, z), (vx, vy, vz), said)
+        attributes = self._prediction.attributes.get(state[ID], NO_ATTRIBUTES)
+        return EntityView(state[ID], self._templates[state[TEMPLATE]], (x, y, z), (vx, vy, vz), attributes)

@@ -80,7 +80,7 @@ class Worlds:
         world = Replica(
             welcome, self.clock, now, controls=self._controls, neighbours=self._neighbours, compiled=compiled
         )
-        self._stats.kernel = "plain for now" if self.plain_for_now else world.known.world.kernel.form
+        self._stats.kernel = "plain for now" if self.plain_for_now else world.confirmed.world.kernel.form
         return world
 
     def speed_up(self) -> None:
@@ -112,12 +112,12 @@ class Worlds:
         if self.play:
             self.play.answered(pong.sent)
 
-    def snapshot(self, snapshot: Snapshot, orders: SentCommands, now: float) -> None:
+    def snapshot(self, snapshot: Snapshot, commands: SentCommands, now: float) -> None:
         """Takes a snapshot: what became of inputs, the results of commands, and the changes of the world.
 
         Args:
             snapshot: the snapshot.
-            orders: the commands that wait for their results.
+            commands: the commands that wait for their results.
             now: local time in seconds.
 
         Raises:
@@ -128,7 +128,7 @@ class Worlds:
         stats.snapshots += 1
         if play:
             play.learn(snapshot, now)
-        for answered in orders.answer(snapshot.verdicts):
+        for answered in commands.answer(snapshot.verdicts):
             if play:
                 play.world.prediction.settle(answered.number, answered.done)
             self._events.append(answered)

@@ -134,7 +134,7 @@ class Arena(ParallelEnv):  # type: ignore[misc]  # it has no type information
         return self._game.world
 
     @property
-    def stage(self) -> GameApi:
+    def api(self) -> GameApi:
         """The game API of the running game."""
         return self._game.api
 
@@ -166,14 +166,14 @@ class Arena(ParallelEnv):  # type: ignore[misc]  # it has no type information
         game.tick(0.0, 0.0)  # lets the rules prepare the world before agents join
         self.agents = list(self.possible_agents)
         self._seats = {agent: Session(_Nobody(), 0.0) for agent in self.agents}
-        self._wheels: dict[str, InputQueue] = {}
+        self._queues: dict[str, InputQueue] = {}
         for agent, seat in self._seats.items():
             with game.api.turn:
                 player = game.roster.enter(seat, agent)
             if player is None:
                 raise ValueError(f"{len(self.agents)} agents: no room to spawn {agent} in {self.scene.name}")
-            self._wheels[agent] = player.inputs
-            player.inputs.wheel = NEUTRAL
+            self._queues[agent] = player.inputs
+            player.inputs.override = NEUTRAL
         self._number, self._end = 0, game.world.tick + self._ticks
         self._scores = {agent: self._reward(game.api, self.entity(agent)) for agent in self.agents}
         return self._look(), {agent: {"verdicts": []} for agent in self.agents}
@@ -217,18 +217,18 @@ class Arena(ParallelEnv):  # type: ignore[misc]  # it has no type information
         """
         for agent in self.agents:
             given = actions.get(agent)
-            self._wheels[agent].wheel = NEUTRAL if given is None else clamp(Input(*map(int, given)))
+            self._queues[agent].override = NEUTRAL if given is None else clamp(Input(*map(int, given)))
         for _ in range(self._repeat):
             self._game.tick(0.0, 0.0)
-        truncated, stage = self.world.tick >= self._end, self._game.api
+        truncated, api = self.world.tick >= self._end, self._game.api
         rewards, over, infos = {}, {}, {}
         for agent in self.agents:
             player = self._seats[agent].player
             assert player is not None
-            score = self._reward(stage, player.entity)
+            score = self._reward(api, player.entity)
             rewards[agent] = score - self._scores[agent] if self._scores_change else score
             self._scores[agent] = score
-            over[agent] = bool(stage.get(player.entity, self._over))
+            over[agent] = bool(api.get(player.entity, self._over))
             infos[agent] = {"verdicts": list(player.verdicts)}
             player.verdicts.clear()
         observations = self._look()
@@ -291,8 +291,8 @@ class _Nobody:
 
 
 def _attribute(name: str) -> Reward:
-    def value(stage: GameApi, entity: int) -> float:
-        found = stage.get(entity, name, 0.0)
+    def value(api: GameApi, entity: int) -> float:
+        found = api.get(entity, name, 0.0)
         return float(found) if isinstance(found, int | float) else 0.0
 
     return value

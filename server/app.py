@@ -138,7 +138,7 @@ class Server:
         self.store = store
         self.faults = game.faults
         live = Live(game, self.stats, self._durations).pages() if settings.page else {}
-        self.door = Admission(
+        self.admission = Admission(
             settings.limits,
             Pages(
                 {"/readyz": ready_page(self.unready)},
@@ -150,7 +150,7 @@ class Server:
             hosts=(settings.host, *settings.allowed_hosts),
             closing=lambda: settings.restart_s if self.draining else None,
         )
-        self.gateway = Gateway(game, self.door, self.faults)
+        self.gateway = Gateway(game, self.admission, self.faults)
         self.ticker: Ticker | None = None
         self.watchdog: Watchdog | None = None
         self.draining = False
@@ -175,7 +175,7 @@ class Server:
             logger.info("started", scene=scene, tick_rate=rate, loop=kind, auth=auth, kernel=form)
             secure, host = "" if self.settings.tls_cert is None else "s", self.settings.host
             print(f"listening on ws{secure}://{bracketed(host)}:{port}", flush=True)
-            if self.settings.page and self.door.trusted(reachable(address)):
+            if self.settings.page and self.admission.trusted(reachable(address)):
                 print(f"live page at http{secure}://{bracketed(reachable(host))}:{port}/", flush=True)
             reason, code = await self._stop
         self.watchdog.stop()
@@ -213,7 +213,7 @@ class Server:
             **figures,
             **({} if self.store is None else self.store.stats()),
             "connections": len(self.gateway.connections),
-            "refused_at_door": dict(self.door.refused),
+            "refused_at_door": dict(self.admission.refused),
             "internal_errors": self.faults.total + (0 if self.store is None else self.store.faults.total),
             "stalls": 0 if self.watchdog is None else self.watchdog.stalls,
             "ready": not self.unready(),

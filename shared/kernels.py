@@ -173,11 +173,11 @@ def compiling(tell: Callable[[], None]) -> Iterator[None]:
     from numba.core import event
 
     class Once(event.Listener):
-        told = False
+        reported = False
 
         def on_start(self, _: object) -> None:
-            if not self.told:
-                self.told = True
+            if not self.reported:
+                self.reported = True
                 tell()
 
         def on_end(self, _: object) -> None:

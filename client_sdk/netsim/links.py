@@ -293,8 +293,8 @@ class TcpStream:
         self._flying.append(packet)
         self._time.at(comes, self._arrive)
         if self._missing and self._random() >= path.loss:  # its acknowledgement reveals the missing packets
-            told = comes + path.delay_s + path.jitter_s / 2 + extra + path.rtt_s / 4 + TIMER_S
-            self._time.at(told, lambda: self._find_missing(now))
+            noticed = comes + path.delay_s + path.jitter_s / 2 + extra + path.rtt_s / 4 + TIMER_S
+            self._time.at(noticed, lambda: self._find_missing(now))
 
     def _find_missing(self, sent: float) -> None:
         found = [loss for loss in self._missing if loss.sent < sent]

@@ -244,8 +244,8 @@ def _refusal(url: str, error: Exception) -> ConnectError:
         answer = f"HTTP status {response.status_code}"
         kind, retry = (" ".join(response.headers.get_all(name)) for name in ("Content-Type", "Retry-After"))
         if response.status_code in REFUSALS and response.body and kind.startswith("text/plain"):
-            said = response.body.decode(errors="replace").strip()[:REASON_MAX]
+            text = response.body.decode(errors="replace").strip()[:REASON_MAX]
             wait = float(retry) if retry.isdecimal() and retry.isascii() else -1.0
-            return ConnectError(f"{url}: {said}" + (f"; try again in {wait:g} s" if wait >= 0 else ""), wait)
+            return ConnectError(f"{url}: {text}" + (f"; try again in {wait:g} s" if wait >= 0 else ""), wait)
     what = f"something is there, but it is not a Sovereign Netcode server ({answer})"
     return ConnectError(f"{url}: {what}; are host, port and path right?")

@@ -99,9 +99,9 @@ class PollingTransport:
         try:
             self._dialing = socket.socket(self._family, socket.SOCK_STREAM)
             self._dialing.setblocking(False)
-            said = self._dialing.connect_ex(self._address)
-            if said not in UNDER_WAY:
-                raise OSError(said, os.strerror(said))
+            code = self._dialing.connect_ex(self._address)
+            if code not in UNDER_WAY:
+                raise OSError(code, os.strerror(code))
         except OSError as error:  # no network, no descriptor left
             self._give_up(error.strerror or str(error), now)
 

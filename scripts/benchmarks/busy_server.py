@@ -32,7 +32,7 @@ from server.config.settings import Settings
 from server.game import Game
 from server.game.session import Session
 from server.net.websocket import Connection
-from server.observability.errors import Faults
+from server.observability.errors import FaultReporter
 from server.observability.histogram import Histogram
 from server.replication.change_log import ChangeLog
 from server.replication.client_stream import Transport
@@ -59,7 +59,7 @@ class Echo:
         self.scene = load_scene(scene)
         self.world = World(self.scene)  # for the server's log, which names its kernel
         self.size = size
-        self.faults = Faults()
+        self.faults = FaultReporter()
         self.links: dict[int, tuple[Transport, bool]] = {}
         self.ticks = 0
         self._made = 0

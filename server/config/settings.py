@@ -275,8 +275,8 @@ def parse(arguments: Sequence[str], environment: Mapping[str, str] = os.environ)
         formatter_class=argparse.RawDescriptionHelpFormatter,
         allow_abbrev=False,
     )
-    told = {name for names in GROUPS.values() for name in names}
-    for title, names in {**GROUPS, "limits": tuple(name for name in KINDS if name not in told)}.items():
+    grouped = {name for names in GROUPS.values() for name in names}
+    for title, names in {**GROUPS, "limits": tuple(name for name in KINDS if name not in grouped)}.items():
         group = parser.add_argument_group(title)
         for name in names:
             kind, default = KINDS[name], DEFAULTS[name]

@@ -46,14 +46,14 @@ class Clocks:
         if paused_s > AWAY_S:
             credit = paused_s * self._rate * self._limits.messages_per_tick
             for session in self._connections.sessions:
-                session.opened = session.heard = session.stream.sent_at = now
+                session.opened = session.received_at = session.stream.sent_at = now
                 session.allowance += credit
             self._roster.excuse(paused_s, now)
         self._deadline, self._ticked = deadline, now
 
     def allow(self, session: Session, now: float) -> bool:
         """Counts one message of a client. Returns False if these are more than the client may send."""
-        session.heard = now
+        session.received_at = now
         session.allowance -= 1
         return session.allowance >= -self._burst or self._owes(session, now)
 
@@ -75,7 +75,7 @@ class Clocks:
             if not session.entity:
                 if session.hello is None and now - session.opened > limits.hello_s:
                     kick(session, messages.NO_HELLO, f"no hello within {limits.hello_s:g} s")
-            elif now - session.heard > limits.silence_s:
+            elif now - session.received_at > limits.silence_s:
                 kick(session, messages.TOO_SLOW, f"no message received for {limits.silence_s:g} s")
             elif now - session.stream.sent_at > limits.stalled_s:
                 kick(session, messages.TOO_SLOW, f"the client read nothing for {limits.stalled_s:g} s")

@@ -7,7 +7,7 @@ from typing import Any
 from server.config.limits import Limits
 from server.game_api.api import GameApi
 from server.journal.recorded_world import RecordedWorld, Saves
-from server.observability.errors import Faults
+from server.observability.errors import FaultReporter
 from server.players import persisted_state
 from server.players.player import Player
 from shared import edits, messages
@@ -20,16 +20,16 @@ class Commands:
 
     Args:
         world: the world.
-        stage: the game API, which calls the rules.
+        api: the game API, which calls the rules.
         limits: the limits.
         faults: where exceptions in commands are reported.
         saves: the store of the world; None: the world is not saved.
     """
 
     def __init__(
-        self, world: RecordedWorld, stage: GameApi, limits: Limits, faults: Faults, saves: Saves | None = None
+        self, world: RecordedWorld, api: GameApi, limits: Limits, faults: FaultReporter, saves: Saves | None = None
     ) -> None:
-        self._world, self._api, self._limits, self._faults, self._saves = world, stage, limits, faults, saves
+        self._world, self._api, self._limits, self._faults, self._saves = world, api, limits, faults, saves
         self._ahead = bounds(world.scene.tick_rate).ahead
         self._unanswered: deque[tuple[int, Player, int, int]] = deque()
         """Verdicts that are not durable yet: tick, player, number, verdict."""

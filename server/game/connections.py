@@ -8,7 +8,7 @@ client that it affected its connection, and the tick goes on. A link may report 
 from server.game.roster import Roster
 from server.game.session import Session
 from server.observability.counters import Counters
-from server.observability.errors import Faults
+from server.observability.errors import FaultReporter
 from server.replication.client_stream import Transport
 from shared import fields, messages
 from shared.messages import Bye, encode
@@ -23,7 +23,7 @@ class Connections:
         faults: where exceptions in our own code are reported.
     """
 
-    def __init__(self, roster: Roster, counters: Counters, faults: Faults) -> None:
+    def __init__(self, roster: Roster, counters: Counters, faults: FaultReporter) -> None:
         self._roster, self._counters, self._faults = roster, counters, faults
         self.sessions: list[Session] = []
 
@@ -71,7 +71,7 @@ class Connections:
             session.close(messages.INTERNAL, "internal error")
         except Exception:
             self._faults.report("closing a link")
-        self.lost(session, session.heard)
+        self.lost(session, session.received_at)
 
     def end(self, session: Session, code: int, reason: str, wait: float = -1.0) -> None:
         """Sends a Bye and closes the connection.

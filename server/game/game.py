@@ -20,7 +20,7 @@ from server.game.session import Session
 from server.game_api.api import GameApi
 from server.journal.recorded_world import RecordedWorld, Saves
 from server.observability.counters import Counters
-from server.observability.errors import Faults
+from server.observability.errors import FaultReporter
 from server.players import persisted_state
 from server.players.player import Player
 from server.replication.client_stream import Transport
@@ -100,7 +100,7 @@ class Game:
         if saves is not None and self.world.tick > 0:
             kept = persisted_state.restored([*(saves.kept or ()), *(value for _, value in saves.notes)])
         self.api = GameApi(self.world, self.rewind, self.counters, rules or Rules(), kept=kept, seed=seed)
-        self.faults = Faults()
+        self.faults = FaultReporter()
         self.log = self.api.log
         self.log.faults = self.faults
         self.sender = Sender(self.world, self.log, self.limits, self.counters)

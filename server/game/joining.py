@@ -10,7 +10,7 @@ from server.game.roster import Roster
 from server.game.session import Session
 from server.journal.recorded_world import RecordedWorld
 from server.observability.counters import Counters
-from server.observability.errors import Faults
+from server.observability.errors import FaultReporter
 from shared import messages
 from shared.messages import Hello, Welcome, encode
 
@@ -25,7 +25,7 @@ class Joining:
         faults: where wrong results of `authenticate` are reported.
         connections: the sessions.
         roster: the players.
-        orders: says up to which tick the world is durable.
+        commands: says up to which tick the world is durable.
         authenticate: returns the subject of a token, as for `Game`; None: anyone may play.
     """
 
@@ -34,14 +34,14 @@ class Joining:
         world: RecordedWorld,
         limits: Limits,
         counters: Counters,
-        faults: Faults,
+        faults: FaultReporter,
         connections: Connections,
         roster: Roster,
-        orders: Commands,
+        commands: Commands,
         authenticate: Callable[[str], str] | None,
     ) -> None:
         self._world, self._limits, self._counters, self._faults = world, limits, counters, faults
-        self._connections, self._roster, self._commands = connections, roster, orders
+        self._connections, self._roster, self._commands = connections, roster, commands
         self._rules = world.scene.to_table()
         self.authenticate = authenticate
 

@@ -21,7 +21,7 @@ from server.players.player import Player
 from shared.bounds import bounds
 from shared.fields import RESUME_BYTES
 
-UNHEARD_S = 2.0
+UNACKNOWLEDGED_S = 2.0
 """Seconds that a new player may take to reconnect if its client has not acknowledged anything yet."""
 
 
@@ -30,13 +30,13 @@ class Roster:
 
     Args:
         world: the world.
-        stage: the game API, which is notified of joins and leaves.
+        api: the game API, which is notified of joins and leaves.
         limits: the limits.
         counters: where joins and leaves are counted.
     """
 
-    def __init__(self, world: RecordedWorld, stage: GameApi, limits: Limits, counters: Counters) -> None:
-        self._world, self._api, self._limits, self._counters = world, stage, limits, counters
+    def __init__(self, world: RecordedWorld, api: GameApi, limits: Limits, counters: Counters) -> None:
+        self._world, self._api, self._limits, self._counters = world, api, limits, counters
         self._bounds = bounds(world.scene.tick_rate)
         self._spawns = Spawns(world)
         self._fallen: list[int] = []
@@ -99,7 +99,7 @@ class Roster:
         wanted = _digest(token)
         for player in self._api.players.values() if token else ():
             if player.session is not None and player.session.stream.acked >= 0:
-                player.heard()
+                player.drop_older_tokens()
             if wanted in player.tokens and player.subject == subject:
                 player.tokens[:] = [wanted]  # an older token is used up, and the client never got a newer one
                 return player
@@ -112,29 +112,31 @@ class Roster:
             return
         known = session.stream.acked >= 0 or len(player.tokens) > 1
         if session.stream.acked >= 0:
-            player.heard()
+            player.drop_older_tokens()
         player.session = None
-        player.away_until = now + (self._limits.resume_s if known else min(UNHEARD_S, self._limits.resume_s))
+        player.reconnect_until = now + (
+            self._limits.resume_s if known else min(UNACKNOWLEDGED_S, self._limits.resume_s)
+        )
 
     def dismiss(self, session: Session) -> None:
         """Makes the player of a session leave in the next tick, without a chance to reconnect."""
         if session.player is not None and session.player.session is session:
             session.player.session = None
-            session.player.away_until = -math.inf
+            session.player.reconnect_until = -math.inf
 
     def excuse(self, seconds: float, now: float) -> None:
         """Extends the time to reconnect of all players by a pause of the server, in which nobody could reconnect."""
         for player in self._api.players.values():
             if player.session is None:
-                player.away_until = min(player.away_until + seconds, now + self._limits.resume_s)
+                player.reconnect_until = min(player.reconnect_until + seconds, now + self._limits.resume_s)
 
     def leave(self, now: float) -> None:
         """Removes the players whose time to reconnect is over."""
         away = [player for player in self._api.players.values() if player.session is None]
         for player in away:
-            if player.away_until == math.inf:  # the player of a restored game
-                player.away_until = now + self._limits.resume_s
-        self._let_go([player for player in away if now >= player.away_until])
+            if player.reconnect_until == math.inf:  # the player of a restored game
+                player.reconnect_until = now + self._limits.resume_s
+        self._let_go([player for player in away if now >= player.reconnect_until])
 
     def fell_out(self) -> None:
         """Takes note of the entities that fell out of the world in this step, for `revive` in the next tick."""
@@ -153,7 +155,7 @@ class Roster:
         excess = len(self._api.players) + 1 - self._limits.clients_max
         if excess > 0:
             away = [player for player in self._api.players.values() if player.session is None]
-            self._let_go(sorted(away, key=lambda player: player.away_until)[:excess])
+            self._let_go(sorted(away, key=lambda player: player.reconnect_until)[:excess])
 
     def _let_go(self, leaving: list[Player]) -> None:
         for player in leaving:

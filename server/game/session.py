@@ -29,7 +29,7 @@ class Session:
         self.greeting: tuple[int, bytes] | None = None
         """Tick that must be durable before the welcome is sent, because of its resume token; and the welcome."""
         self.subject = ""
-        self.opened = self.heard = now
+        self.opened = self.received_at = now
         """Times in seconds: when the connection opened, and when the latest message arrived."""
         self.allowance = 0.0
         """Number of messages that the client may send besides a full burst. Negative: the used part of the burst."""
@@ -42,7 +42,7 @@ class Session:
     def seat(self, player: Player) -> None:
         """Makes this the connection of a player."""
         self.player, self.entity, self.inputs = player, player.entity, player.inputs
-        player.session, player.away_until = self, math.inf
+        player.session, player.reconnect_until = self, math.inf
         del player.verdicts[:-SETTLED_MAX]  # bounds them for a client that reconnects again and again without reading
         self.hello = None
 

@@ -5,7 +5,7 @@ from typing import Any
 
 from server.game_api import values
 from server.journal.recorded_world import RecordedWorld
-from server.players.persisted_state import SAID
+from server.players.persisted_state import ATTRIBUTES
 from server.replication.change_log import ChangeLog
 from shared.checks import text
 from shared.fields import NAME_MAX
@@ -42,7 +42,7 @@ class Attributes:
         """Replaces all attributes of an existing entity by checked ones."""
         self._table[entity] = dict(attributes)
         self._log.note_attributes(entity)
-        self._world.note([SAID, entity, attributes])
+        self._world.note([ATTRIBUTES, entity, attributes])
 
     def forget(self, entity: int) -> None:
         """Forgets the attributes of an entity that was removed."""

@@ -13,7 +13,7 @@ from server.game_api.contacts import Contacts
 from server.game_api.turn import OutOfTurnError
 from server.journal.recorded_world import RecordedWorld
 from server.observability.counters import Counters
-from server.observability.errors import Faults
+from server.observability.errors import FaultReporter
 from server.players.player import Player
 from server.rules import Rules, RulesError, checked_function, checked_result
 from shared import messages
@@ -53,7 +53,7 @@ class Hooks:
         self._contacts = Contacts(world, goes_on=goes_on)
         self._reports_contacts = _overrides(rules, "on_contact")
         self._started = goes_on
-        self._faults = Faults("the rules have failed")
+        self._faults = FaultReporter("the rules have failed")
 
     # -- in the order of a tick ------------------------------------------------------------------------------
 

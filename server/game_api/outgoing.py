@@ -55,7 +55,7 @@ class Outgoing:
         for entities, message in self._events:
             for entity in players if entities is None else entities & players.keys():
                 player = players[entity]
-                if player.inputs.wheel is None:  # an in-process player has no client to send to
+                if player.inputs.override is None:  # an in-process player has no client to send to
                     self._counters.events_dropped += player.outbox.add(tick, message, most)
         self._events.clear()
 

@@ -8,7 +8,7 @@ from server.net.addresses import listeners
 from server.net.admission import Admission
 from server.net.tls_accept import Handshakes
 from server.net.websocket import Connection
-from server.observability.errors import Faults
+from server.observability.errors import FaultReporter
 
 ACCEPT_BACKLOG = 1024
 """Connections that may wait to be accepted."""
@@ -32,14 +32,14 @@ class Gateway:
 
     Args:
         game: gets every event.
-        door: decides which connections are accepted, and answers requests for pages.
+        admission: decides which connections are accepted, and answers requests for pages.
         faults: where exceptions of the game are reported.
     """
 
-    def __init__(self, game: Events, door: Admission | None = None, faults: Faults | None = None) -> None:
+    def __init__(self, game: Events, admission: Admission | None = None, faults: FaultReporter | None = None) -> None:
         self.game = game
-        self.door = door or Admission()
-        self.faults = faults or Faults()
+        self.admission = admission or Admission()
+        self.faults = faults or FaultReporter()
         self.connections: set[Connection] = set()
         self._servers: list[asyncio.Server | Handshakes] = []
         self._fewer: asyncio.Event = asyncio.Event()
@@ -63,7 +63,7 @@ class Gateway:
         sockets = await listeners(host, port, ACCEPT_BACKLOG)
         address: tuple[str, int] = sockets[0].getsockname()[:2]
         if tls is not None:
-            handshakes = Handshakes(lambda: Connection(self, loop), tls, self.door.limits.handshake_s)
+            handshakes = Handshakes(lambda: Connection(self, loop), tls, self.admission.limits.handshake_s)
             handshakes.listen(sockets)
             self._servers = [handshakes]
             return address

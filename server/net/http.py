@@ -14,7 +14,7 @@ from server.net.admission import Admission, Request
 from server.observability.pages import Page
 
 
-def answer_request(protocol: ServerProtocol, data: bytes, door: Admission, address: str) -> bytes:
+def answer_request(protocol: ServerProtocol, data: bytes, admission: Admission, address: str) -> bytes:
     """Passes data to websockets until the request is complete, and answers it.
 
     The request is passed on line by line, because websockets would parse the bytes after it before it is answered.
@@ -22,7 +22,7 @@ def answer_request(protocol: ServerProtocol, data: bytes, door: Admission, addre
     Args:
         protocol: the protocol of the connection. The answer waits in its `data_to_send`.
         data: bytes of the peer.
-        door: decides about the request.
+        admission: decides about the request.
         address: the peer's address; empty if it is unknown.
 
     Returns:
@@ -35,7 +35,7 @@ def answer_request(protocol: ServerProtocol, data: bytes, door: Admission, addre
         start = end
         events = protocol.events_received()
         if events:
-            _answer(protocol, cast("HttpRequest", events[0]), door, address)
+            _answer(protocol, cast("HttpRequest", events[0]), admission, address)
             break
         if isinstance(protocol.handshake_exc, InvalidMessage):  # websockets itself closes without an answer
             response = protocol.reject(HTTPStatus.BAD_REQUEST, "this is not an HTTP request\n")
@@ -45,12 +45,12 @@ def answer_request(protocol: ServerProtocol, data: bytes, door: Admission, addre
     return data[start:]
 
 
-def _answer(protocol: ServerProtocol, request: HttpRequest, door: Admission, address: str) -> None:
+def _answer(protocol: ServerProtocol, request: HttpRequest, admission: Admission, address: str) -> None:
     headers = request.headers
     upgrade = any("websocket" in value.lower() for value in headers.get_all("Upgrade"))
     origins, hosts = headers.get_all("Origin"), headers.get_all("Host")
     asked = Request(request.method, request.path, " ".join(hosts), " ".join(origins) if origins else None, upgrade)
-    page = door.answer(asked, address, time.monotonic())
+    page = admission.answer(asked, address, time.monotonic())
     protocol.send_response(protocol.accept(request) if page is None else _response(page))
 
 

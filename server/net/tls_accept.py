@@ -31,13 +31,13 @@ class Handshakes:
     """Accepts connections and runs their TLS handshakes.
 
     Args:
-        guest: makes the protocol of a connection.
+        make_protocol: makes the protocol of a connection.
         context: the TLS context of the server.
         limit_s: maximum time of one handshake, in seconds.
     """
 
-    def __init__(self, guest: Callable[[], AcceptedSocket], context: ssl.SSLContext, limit_s: float) -> None:
-        self._guest, self._context, self._limit_s = guest, context, limit_s
+    def __init__(self, make_protocol: Callable[[], AcceptedSocket], context: ssl.SSLContext, limit_s: float) -> None:
+        self._make_protocol, self._context, self._limit_s = make_protocol, context, limit_s
         self._loop = asyncio.get_running_loop()
         self._tasks: set[asyncio.Task[None]] = set()
         """Tasks that accept, and those of handshakes that have begun. A task that is cancelled before it begins would
@@ -71,25 +71,25 @@ class Handshakes:
                 self._loop.call_exception_handler({"message": "cannot accept a connection", "exception": error})
                 await asyncio.sleep(AGAIN_S)
                 continue
-            guest = self._guest()
-            if guest.enter(str(peer[0])):
-                self._loop.create_task(self._shake(sock, guest))  # the task adds itself to `_tasks` when it begins
+            accepted = self._make_protocol()
+            if accepted.enter(str(peer[0])):
+                self._loop.create_task(self._shake(sock, accepted))  # the task adds itself to `_tasks` when it begins
             else:
                 sock.close()
             await asyncio.sleep(0)  # `sock_accept` does not yield if a connection waits, so let other tasks run
 
-    async def _shake(self, sock: socket.socket, guest: AcceptedSocket) -> None:
+    async def _shake(self, sock: socket.socket, accepted: AcceptedSocket) -> None:
         if self._closed:
             sock.close()
-            guest.leave()
+            accepted.leave()
             return
         self._keep(asyncio.current_task())
         try:
             await self._loop.connect_accepted_socket(
-                lambda: guest, sock, ssl=self._context, ssl_handshake_timeout=self._limit_s
+                lambda: accepted, sock, ssl=self._context, ssl_handshake_timeout=self._limit_s
             )
         except BaseException as error:
-            guest.leave()  # asyncio closes the socket
+            accepted.leave()  # asyncio closes the socket
             if not isinstance(error, OSError):  # TLS errors and timeouts are OSErrors, too, and the peer's fault
                 raise
 

@@ -124,7 +124,7 @@ class Connection(AcceptedSocket):
         if self._address is None and not self.enter(str(peer[0]) if peer else ""):
             self.abort()
             return
-        self._abort_in(self._gateway.door.limits.handshake_s)
+        self._abort_in(self._gateway.admission.limits.handshake_s)
         sock = transport.get_extra_info("socket")
         self._fd = sock.fileno()
         try:
@@ -167,14 +167,14 @@ class Connection(AcceptedSocket):
 
     def enter(self, address: str) -> bool:
         """Counts the connection in admission. Returns False if it is to be dropped."""
-        if self._gateway.door.arrive(address):
+        if self._gateway.admission.arrive(address):
             self._address = address
         return self._address is not None
 
     def leave(self) -> None:
         """Counts the end of the connection in admission, once."""
         if self._address is not None:
-            self._gateway.door.leave(self._address)
+            self._gateway.admission.leave(self._address)
             self._address = None
 
     def abort(self) -> None:
@@ -183,7 +183,7 @@ class Connection(AcceptedSocket):
 
     def _shake_hands(self, data: bytes) -> bytes:
         """Handles the HTTP request. Returns the bytes after it, from clients that do not wait for the answer."""
-        rest = answer_request(self._protocol, data, self._gateway.door, self._address or "")
+        rest = answer_request(self._protocol, data, self._gateway.admission, self._address or "")
         self._flush()
         if not self._live:
             return b""

@@ -7,16 +7,16 @@ from collections import Counter
 logger = logging.getLogger(__name__)
 
 
-class Faults:
+class FaultReporter:
     """Counts exceptions by the place where they were raised, and logs the 1st, 10th, 100th, ... of each place.
 
     Args:
-        whose: beginning of the line in the log.
+        prefix: beginning of the line in the log.
     """
 
-    def __init__(self, whose: str = "internal error") -> None:
+    def __init__(self, prefix: str = "internal error") -> None:
         self.total = 0
-        self._whose = whose
+        self._prefix = prefix
         self._places: Counter[tuple[str, str, int]] = Counter()
 
     def report(self, where: str) -> None:
@@ -34,4 +34,4 @@ class Faults:
         self._places[where, *place] += 1
         times = self._places[where, *place]
         if str(times).strip("0") == "1":
-            logger.exception("%s in %s (no. %d at this place)", self._whose, where, times)
+            logger.exception("%s in %s (no. %d at this place)", self._prefix, where, times)

@@ -101,9 +101,9 @@ class Relief:
             column = cells[rows[:, :, level]].transpose(2, 0, 3, 1, 4).reshape(SEGMENT, depth, width)[::-1]
             depth_of_top = (column != AIR).argmax(axis=0)
             kind = np.take_along_axis(column, depth_of_top[None], axis=0)[0]
-            news = (heights == 0) & (kind != AIR)
-            heights[news] = (level + 1) * SEGMENT - depth_of_top[news]
-            kinds[news] = kind[news]
+            visible = (heights == 0) & (kind != AIR)
+            heights[visible] = (level + 1) * SEGMENT - depth_of_top[visible]
+            kinds[visible] = kind[visible]
             if heights.all():
                 break
         return heights, kinds
@@ -173,7 +173,7 @@ class Live:
         listed = listed[np.sort(np.unique(listed[:, ID], return_index=True)[1])]
         listed[:, X : Z + 1] = listed[:, X : Z + 1] * 100 // BLOCK
         ids = listed[:, ID].tolist()
-        said = ((entity, game.api.get(entity, "name")) for entity in ids)
+        names = ((entity, game.api.get(entity, "name")) for entity in ids)
         return {
             "scene": scene.name,
             "templates": [
@@ -187,7 +187,7 @@ class Live:
                 "versions": relief.versions(),
             },
             "entities": listed[:, [ID, TEMPLATE, X, Y, Z]].reshape(-1).tolist(),
-            "names": {entity: name[:NAME_MAX] for entity, name in said if isinstance(name, str)},
+            "names": {entity: name[:NAME_MAX] for entity, name in names if isinstance(name, str)},
             "players": shown,
             "away": [entity for entity in shown if game.players[entity].session is None],
             "shared": {name: _shown(value) for name, value in game.api.shared.items()},

@@ -46,7 +46,7 @@ from typing import Any
 import msgpack
 
 from server.journal.recorded_world import Observer
-from server.observability.errors import Faults
+from server.observability.errors import FaultReporter
 from server.observability.histogram import Histogram
 from server.persistence.checkpoint import Checkpoint, Copy, Saved
 from server.persistence.database import Database, Record, StoreError, chained, seal_of
@@ -113,7 +113,7 @@ class Store(Observer):
         text(game, "game", GAME_MAX, shortest=0)
         self._path = Path(directory) / "world.db"
         self._rules, self._game = msgpack.packb(scene.to_table()), game
-        self.faults = Faults("the store has failed")
+        self.faults = FaultReporter("the store has failed")
         """Exceptions in our own code."""
         self.checkpoints_failed = 0
         self._power = power

@@ -52,7 +52,7 @@ class InputQueue:
         self.statuses = bytearray()
         """Input statuses of the ticks that are not sent yet, as on the wire. At most `bounds.statuses` of them."""
         self.late = self.refused = self.used = self.substituted = 0
-        self.wheel: Input | None = None
+        self.override: Input | None = None
         """Input of an in-process player. If it is set, it is used in every tick and queued inputs are ignored."""
 
     def file(self, message: Inputs, tick: int, ahead: float) -> None:
@@ -119,25 +119,25 @@ class InputQueue:
 
     def take(self, tick: int) -> Input:
         """Takes the input for the tick that is about to be computed, or a substitute, and notes the input status."""
-        if self.wheel is not None:
+        if self.override is not None:
             self.used += 1
-            return self.wheel
+            return self.override
         input_ = self._waiting.pop(tick, None)
         if input_ is not None:
-            fate, self._missing, self._held = USED, 0, input_
+            status, self._missing, self._held = USED, 0, input_
             self.used += 1
         elif self.first < 0 or tick < self.first:
-            fate = IDLE
+            status = IDLE
         else:
             self._missing += 1
             self.substituted += 1
-            fate = REPEATED if self._bounds.stands_in(self._missing) else NEUTRALISED
-        self.statuses.append(fate)
+            status = REPEATED if self._bounds.stands_in(self._missing) else NEUTRALISED
+        self.statuses.append(status)
         if len(self.statuses) > self._bounds.statuses:
             del self.statuses[0]
-        return NEUTRAL if fate == NEUTRALISED else self._held
+        return NEUTRAL if status == NEUTRALISED else self._held
 
-    def told(self) -> tuple[bytes, bytes]:
+    def take_feedback(self) -> tuple[bytes, bytes]:
         """Takes the margins and statuses for the next snapshot, as on the wire. They count as sent."""
         margins, statuses = self.margins.tobytes(), bytes(self.statuses)
         del self.margins[:]

@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 
 from server.players.player import Player
 
-PLAYER, ANSWERED, SETTLED, LEFT, SAID, SHARED = "player", "answered", "settled", "left", "said", "shared"
+PLAYER, ANSWERED, SETTLED, LEFT, ATTRIBUTES, SHARED = "player", "answered", "settled", "left", "said", "shared"
 
 
 class PersistedState(NamedTuple):
@@ -38,7 +38,7 @@ def whole(kept: PersistedState) -> list[list[Any]]:
     """Returns the whole state as the notes that lead to it."""
     notes = [note_of(player) for player in kept.players.values()]
     notes += [[SETTLED, entity, player.settled] for entity, player in kept.players.items() if player.settled]
-    notes += [[SAID, entity, attributes] for entity, attributes in kept.attributes.items()]
+    notes += [[ATTRIBUTES, entity, attributes] for entity, attributes in kept.attributes.items()]
     return [*notes, [SHARED, kept.shared]]
 
 

@@ -46,7 +46,7 @@ class Player:
         """Number of edits that the player may do now; it grows with time."""
         self.tokens: list[bytes] = []
         """Digests of the valid resume tokens: the newest one, and the one before until the client has the newest."""
-        self.away_until = math.inf
+        self.reconnect_until = math.inf
         """Time in seconds at which a player without a connection leaves."""
         self.session: Session | None = None
         """Present connection; None: the connection is lost."""
@@ -56,7 +56,7 @@ class Player:
     def __repr__(self) -> str:
         return f"<Player {self.name!r}, entity {self.entity}>"
 
-    def heard(self) -> None:
+    def drop_older_tokens(self) -> None:
         """Invalidates all resume tokens but the newest one, which the client has now."""
         del self.tokens[:-1]
 

@@ -14,7 +14,7 @@ from typing import Any
 
 import msgpack
 
-from server.observability.errors import Faults
+from server.observability.errors import FaultReporter
 from shared.blocks import offset_of, pack, segment_of
 from shared.bounds import bounds, in_ticks
 from shared.checks import Cell
@@ -105,9 +105,9 @@ class ChangeLog:
         self,
         world: World,
         attributes: Mapping[int, Mapping[str, Any]] | None = None,
-        faults: Faults | None = None,
+        faults: FaultReporter | None = None,
     ) -> None:
-        self.faults = faults or Faults()
+        self.faults = faults or FaultReporter()
         self._world = world
         self._attributes = {} if attributes is None else attributes
         self._said: set[int] = set()

@@ -122,7 +122,7 @@ class Sender:
         if player.verdicts:
             verdicts = np.array(player.verdicts[: fields.VERDICTS_MAX], VERDICT).tobytes()
             del player.verdicts[: fields.VERDICTS_MAX]
-        margins, statuses = inputs.told()
+        margins, statuses = inputs.take_feedback()
         header = (tick, inputs.newest, margins, tick - len(statuses) + 1, statuses, verdicts, drops)
         message = messages.join_snapshot(header, n, parts)
         stream.send(message)

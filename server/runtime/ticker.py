@@ -18,7 +18,7 @@ from collections.abc import Callable
 from typing import Any, Protocol
 
 from server.config.limits import catch_up_ticks
-from server.observability.errors import Faults
+from server.observability.errors import FaultReporter
 from server.observability.histogram import Histogram
 
 FAILURES_MAX = 10
@@ -174,7 +174,7 @@ class Ticker:
         tick: Callable[[float, float], None],
         broken: Callable[[], None],
         alarm: Callable[[Callable[[], None]], Alarm],
-        faults: Faults | None = None,
+        faults: FaultReporter | None = None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self.lateness = Histogram()
@@ -186,7 +186,7 @@ class Ticker:
         """Time in seconds at which the latest tick began."""
         self._tick = tick
         self._broken = broken
-        self._faults = faults or Faults()
+        self._faults = faults or FaultReporter()
         self._clock = clock
         self._failures_in_a_row = 0
         self._stopped = False

@@ -49,12 +49,12 @@ def warm_up(scene: Scene) -> RecordedWorld:
 
     sessions = [game.open(_Void(), now) for _ in range(2)]
 
-    def say(*said: Message) -> None:
+    def send(*sent: Message) -> None:
         for session in sessions:
-            for message in said:
+            for message in sent:
                 game.receive(session, encode(message), now)
 
-    say(Ping(now), Hello(messages.VERSION, scene.digests, "warm-up"))
+    send(Ping(now), Hello(messages.VERSION, scene.digests, "warm-up"))
     tick()  # inputs count from here on
     joined = [session for session in sessions if session.entity]
     if not joined:
@@ -63,20 +63,20 @@ def warm_up(scene: Scene) -> RecordedWorld:
     x, y, z = (int(part // 1) for part in game.world.position(shooter.entity))
     for n in range(TICKS):
         at = game.world.tick
-        say(Inputs(at + 1, at, bytes((127, 0, n % 2))), Ping(now))
+        send(Inputs(at + 1, at, bytes((127, 0, n % 2))), Ping(now))
         # Edits of the block in which they stand (refused), on which they stand (dug), and above them (placed).
         cell = (x, y, z + (0, -1, 3)[n % 3])
         for kind in (1, 0):
-            say(Command(2 * n + 1 - kind, at + 1, at - 1.5, edits.NAME, edits.pack(edits.Edit(*cell, kind))))
+            send(Command(2 * n + 1 - kind, at + 1, at - 1.5, edits.NAME, edits.pack(edits.Edit(*cell, kind))))
         tick()
         past = game.rewind.at(game.world.tick - 2.5, shooter.entity)
         past.ray((x, y, z + 1.0), (1.0, 0.25, -0.125), 32.0)
         past.box((x - 2.0, y - 2.0, z - 2.0), (x + 2.0, y + 2.0, z + 2.0))
     game.world.place(other.entity, (x, y, scene.origin[2] * SEGMENT - 64.0))  # falls out, and is put at a spawn
-    say(Resync())
+    send(Resync())
     tick()
     tick()
     game.stats()
-    say(Bye(messages.GOING_AWAY, "", -1.0))
+    send(Bye(messages.GOING_AWAY, "", -1.0))
     tick()
     return fresh

@@ -62,26 +62,26 @@ class Watchdog:
 
     def _watch(self) -> None:
         woken, cpu = time.monotonic(), time.process_time()
-        excused = counted = told = -1.0  # times at which the loop was last alive: excused, counted and logged
+        excused = counted = logged = -1.0  # times at which the loop was last alive: excused, counted and logged
         quiet_until = woken
         while not self._stopped.wait(self._beat_s):
             before, cpu_before = woken, cpu
             woken, cpu = time.monotonic(), time.process_time()
             if woken - before > self._asleep_s:
-                self._say_asleep(woken - before, cpu - cpu_before)
+                self._log_asleep(woken - before, cpu - cpu_before)
                 excused = woken  # the loop could not run, either
             latest = max(self._latest, excused)
-            if told >= 0 and latest != told:
-                logger.warning("the event loop goes on", stalled_s=round(latest - told, 3))
-                told = -1.0
+            if logged >= 0 and latest != logged:
+                logger.warning("the event loop goes on", stalled_s=round(latest - logged, 3))
+                logged = -1.0
             if woken - latest > self._stall_s and latest != counted:
                 self.stalls += 1
                 counted = latest
                 if woken >= quiet_until:
-                    told, quiet_until = latest, woken + QUIET_S
+                    logged, quiet_until = latest, woken + QUIET_S
                     logger.warning("the event loop has stalled", for_s=round(woken - latest, 3), stack=self._stack())
 
-    def _say_asleep(self, seconds: float, cpu_s: float) -> None:
+    def _log_asleep(self, seconds: float, cpu_s: float) -> None:
         self.stalls += 1
         if cpu_s > seconds / 2:
             logger.warning("code that held the interpreter has stalled the event loop", for_s=round(seconds, 3))

@@ -142,15 +142,15 @@ async def measure(
     with Stage(console) as stage:
         stage.begin(f"{args.clients} clients join", args.clients)
         deadline = time.monotonic() + args.clients / JOINS_PER_S + JOIN_S_MAX
-        while sum(worker.told["playing"] + len(worker.told["ended"]) for worker in workers) < args.clients:
+        while sum(worker.report["playing"] + len(worker.report["ended"]) for worker in workers) < args.clients:
             if time.monotonic() > deadline:
                 break
             await asyncio.sleep(0.05)
             check()
-            stage.at(sum(worker.told["playing"] for worker in workers))
-        playing = sum(worker.told["playing"] for worker in workers)
+            stage.at(sum(worker.report["playing"] for worker in workers))
+        playing = sum(worker.report["playing"] for worker in workers)
         if not playing:
-            reasons = {left["reason"] for worker in workers for left in worker.told["ended"]}
+            reasons = {left["reason"] for worker in workers for left in worker.report["ended"]}
             raise CannotStartError(
                 "; ".join(sorted(reasons)) or f"no client joined within {args.clients / JOINS_PER_S + JOIN_S_MAX:.0f} s"
             )
@@ -163,14 +163,14 @@ async def measure(
             await worker.tell("measure")
         before, began = await stats(url), time.monotonic()
         rss_mb: list[float] = []
-        looked = shown = Look(before, [worker.told for worker in workers])
+        looked = shown = Look(before, [worker.report for worker in workers])
         sample, line = began + 1, began
         while (now := time.monotonic()) < began + args.seconds:
             check()
             stage.at(now - began)
             if now >= sample:
                 sample += 1
-                looked = Look(await stats(url), [worker.told for worker in workers])
+                looked = Look(await stats(url), [worker.report for worker in workers])
                 rss_mb += [looked.server["rss_mb"]] if "rss_mb" in looked.server else []
                 if console.is_terminal or now >= line + args.seconds / LINES_MAX:
                     line = now

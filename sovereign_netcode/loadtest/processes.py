@@ -38,7 +38,7 @@ class Worker:
 
     def __init__(self, process: Process) -> None:
         self.process = process
-        self.told: Figures = {"playing": 0, "ended": []}
+        self.report: Figures = {"playing": 0, "ended": []}
         """The latest report of the process; the docstring of the module `swarm` lists its fields."""
         self._result: Figures | None = None
         self._reading = asyncio.create_task(self._read())
@@ -69,11 +69,11 @@ class Worker:
     async def _read(self) -> None:
         assert self.process.stdout is not None
         while (line := await self.process.stdout.readline()).endswith(b"\n"):  # else it died within a line
-            told = json.loads(line)
-            if "clients" in told:
-                self._result = told
+            report = json.loads(line)
+            if "clients" in report:
+                self._result = report
             else:
-                self.told = told
+                self.report = report
 
 
 @contextlib.asynccontextmanager

@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 
 from server.config.limits import Limits
-from server.observability.errors import Faults
+from server.observability.errors import FaultReporter
 from server.replication.flow_control import SAMPLE_S
 from shared import edits, messages
 from shared.checks import Cell
@@ -203,7 +203,7 @@ def test_who_was_to_come_back_while_the_server_was_away_still_may() -> None:
 
 
 def test_of_the_same_mistake_the_first_the_tenth_and_so_on_are_logged(caplog: pytest.LogCaptureFixture) -> None:
-    faults = Faults()
+    faults = FaultReporter()
 
     def mistake() -> None:
         try:

@@ -394,7 +394,7 @@ async def test_the_peer_goes_in_the_middle(bench: Bench, sent: bytes, way: str) 
 
 
 async def test_a_handshake_must_be_finished_in_time(bench: Bench) -> None:
-    bench.gateway.door.limits = Limits(handshake_s=0.05)
+    bench.gateway.admission.limits = Limits(handshake_s=0.05)
     slow, good = await bench.connect(UPGRADE[:-2]), await bench.client()
     assert await slow.end() == b""
     good.write(binary(b"echo"))
@@ -602,7 +602,7 @@ async def test_stats_that_fail_are_our_mistake(bench: Bench) -> None:
 
 async def test_beyond_the_limits_a_websocket_is_refused_a_page_is_shown_and_a_flood_is_dropped(bench: Bench) -> None:
     limits = Limits(connections_per_address=2, loopback_exempt=False)
-    bench.gateway.door.limits = limits
+    bench.gateway.admission.limits = limits
     one, two = await bench.client(), await bench.client()
     third = await bench.connect(UPGRADE)
     answer = await third.end()
@@ -616,7 +616,7 @@ async def test_beyond_the_limits_a_websocket_is_refused_a_page_is_shown_and_a_fl
     async with asyncio.timeout(TIME_OUT_S):
         ended = [await peer.end() for peer in silent[SPARE_PER_ADDRESS:]]
     assert ended == [b""] * 3
-    assert bench.gateway.door.refused == {"address": 4}
+    assert bench.gateway.admission.refused == {"address": 4}
     one.write(binary(b"echo"))
     assert await one.frame() == (0x82, b"echo")
     two.reset()
@@ -631,7 +631,7 @@ async def test_a_browser_of_another_page_is_refused(bench: Bench) -> None:
     assert (await peer.end()).startswith(b"HTTP/1.1 403 ")
     peer = await bench.connect(UPGRADE.replace(b"Host: x\r\n", b"Host: localhost\r\nOrigin: http://localhost\r\n"))
     assert (await peer.line()).startswith(b"HTTP/1.1 101 ")
-    assert bench.gateway.door.refused == {"origin": 1}
+    assert bench.gateway.admission.refused == {"origin": 1}
 
 
 async def test_stop_listening_ends_what_is_no_websocket_and_leaves_the_rest(bench: Bench) -> None:

@@ -79,20 +79,20 @@ async def test_who_only_opens_the_socket_counts_until_it_goes(
     silent = [await asyncio.open_connection(*address) for _ in range(ALL + 2)]
     async with asyncio.timeout(TIME_OUT_S):
         assert [await reader.read() for reader, _ in silent[ALL:]] == [b""] * 2
-    assert gateway.door.refused == {"address": 2}
+    assert gateway.admission.refused == {"address": 2}
     with pytest.raises(ConnectionError):
         await page(address, trust)
     for _, writer in silent:
         writer.close()
-    await until(lambda: gateway.door.total == 0)
+    await until(lambda: gateway.admission.total == 0)
     assert await page(address, trust) == b"HTTP/1.1 200 OK\r\n"
-    await until(lambda: gateway.door.total == 0)
+    await until(lambda: gateway.admission.total == 0)
 
 
 async def test_a_handshake_has_a_limit_and_rubbish_is_none(
     gateway: Gateway, context: ssl.SSLContext, trust: ssl.SSLContext
 ) -> None:
-    gateway.door.limits = Limits(handshake_s=0.2)
+    gateway.admission.limits = Limits(handshake_s=0.2)
     address = await gateway.listen("127.0.0.1", 0, context)
     peers = [await asyncio.open_connection(*address) for _ in range(4)]
     for (_, writer), first in zip(peers, (b"", b"\x16\x03\x01", b"GET / HTTP/1.1\r\n\r\n", bytes(100)), strict=True):
@@ -101,19 +101,19 @@ async def test_a_handshake_has_a_limit_and_rubbish_is_none(
         for reader, writer in peers:
             await reader.read()
             writer.close()
-    await until(lambda: gateway.door.total == 0)
+    await until(lambda: gateway.admission.total == 0)
     assert await page(address, trust) == b"HTTP/1.1 200 OK\r\n"
 
 
 async def test_the_end_cuts_handshakes_off(gateway: Gateway, context: ssl.SSLContext) -> None:
     address = await gateway.listen("127.0.0.1", 0, context)
     reader, writer = await asyncio.open_connection(*address)
-    await until(lambda: gateway.door.total == 1)
+    await until(lambda: gateway.admission.total == 1)
     gateway.stop_listening()
     async with asyncio.timeout(TIME_OUT_S):
         assert await reader.read() == b""
     writer.close()
-    assert gateway.door.total == 0
+    assert gateway.admission.total == 0
     with pytest.raises(ConnectionError):
         await asyncio.open_connection(*address)
 
@@ -121,18 +121,18 @@ async def test_the_end_cuts_handshakes_off(gateway: Gateway, context: ssl.SSLCon
 async def test_the_end_finds_who_is_accepted_and_has_not_begun(
     gateway: Gateway, context: ssl.SSLContext, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    arrive, loop = gateway.door.arrive, asyncio.get_running_loop()
+    arrive, loop = gateway.admission.arrive, asyncio.get_running_loop()
 
     def arrive_at_the_end(address: str) -> bool:
         loop.call_soon(gateway.stop_listening)
         return arrive(address)
 
-    monkeypatch.setattr(gateway.door, "arrive", arrive_at_the_end)
+    monkeypatch.setattr(gateway.admission, "arrive", arrive_at_the_end)
     reader, writer = await asyncio.open_connection(*await gateway.listen("127.0.0.1", 0, context))
     async with asyncio.timeout(TIME_OUT_S):
         assert await reader.read() == b""
     writer.close()
-    assert gateway.door.total == 0
+    assert gateway.admission.total == 0
 
 
 async def test_many_who_come_at_once_are_accepted_one_in_a_pass_of_the_loop(
@@ -142,7 +142,7 @@ async def test_many_who_come_at_once_are_accepted_one_in_a_pass_of_the_loop(
     peers = [socket.create_connection(address) for _ in range(20)]
     passes = 0
     async with asyncio.timeout(TIME_OUT_S):
-        while gateway.door.total + gateway.door.refused["address"] < len(peers):
+        while gateway.admission.total + gateway.admission.refused["address"] < len(peers):
             await asyncio.sleep(0)
             passes += 1
     for peer in peers:

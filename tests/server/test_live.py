@@ -190,7 +190,7 @@ def test_it_is_for_those_who_may_see_figures_and_can_be_switched_off() -> None:
     def statuses(address: str, **flags: str) -> list[int]:
         server = Server(load(flags, {}), Table().game)
         asked = (Request("GET", path, "", None, upgrade=False) for path in ("/", "/live", "/live/0", "/live/1"))
-        return [page.status for request in asked if (page := server.door.answer(request, address, 0.0))]
+        return [page.status for request in asked if (page := server.admission.answer(request, address, 0.0))]
 
     assert statuses("127.0.0.1") == [200, 200, 200, 404]
     assert statuses("93.184.215.14") == [426, 403, 403, 404]

@@ -3,7 +3,7 @@
 import pytest
 
 from server.config.limits import Limits
-from server.game.roster import UNHEARD_S
+from server.game.roster import UNACKNOWLEDGED_S
 from server.players.player import SETTLED_MAX
 from shared import messages
 from shared.messages import Bye, Hello, Inputs, Snapshot, Welcome
@@ -172,11 +172,11 @@ def test_who_was_never_heard_of_is_kept_for_a_moment_only() -> None:
     heard(table, known)
     table.lose(silent)
     table.lose(known)
-    table.tick(int(UNHEARD_S / table.tick_s) + 1)
+    table.tick(int(UNACKNOWLEDGED_S / table.tick_s) + 1)
     assert list(table.game.players) == [known.session.entity]
     again = back(table, token(known))
     table.lose(again)  # cut off before it was heard of over this connection, but it is known
-    table.tick(int(UNHEARD_S / table.tick_s) + 1)
+    table.tick(int(UNACKNOWLEDGED_S / table.tick_s) + 1)
     assert list(table.game.players) == [known.session.entity]
 
 

@@ -287,7 +287,7 @@ def test_nothing_is_kept_for_a_player_inside_the_server() -> None:
     link = table.join()
     player = link.session.player
     assert player is not None
-    player.inputs.wheel = NEUTRAL
+    player.inputs.override = NEUTRAL
     table.game.api.send("n")
     table.tick()
     assert len(player.outbox) == 0

@@ -167,7 +167,7 @@ def test_nothing_is_withdrawn_where_there_is_nothing() -> None:
 
 def test_margins_that_were_sent_are_not_counted_off_again() -> None:
     queue = filed(1, EAST, EAST, EAST, EAST)
-    queue.told()
+    queue.take_feedback()
     queue.file(inputs(5, EAST), 0, 1.0)
     queue.restart(3)
     assert (queue.newest, list(queue.margins)) == (2, [])
@@ -222,7 +222,7 @@ def test_margins_count_off_across_gaps_and_refusals() -> None:
 def test_what_was_told_is_not_told_again_and_counting_goes_on() -> None:
     queue = filed(1, EAST)
     queue.take(1)
-    queue.told()
+    queue.take_feedback()
     assert (list(queue.margins), list(queue.statuses)) == ([], [])
     queue.file(inputs(4, EAST), 1, 1.0)
     assert list(margins(queue)) == [2, 3, 4]
@@ -251,7 +251,7 @@ def test_every_input_of_any_client_has_one_fate_and_memory_is_bounded(
         assert len(queue.margins) <= STATUSES_MAX
         assert len(queue.statuses) == tick - told
         if snapshot:
-            queue.told()
+            queue.take_feedback()
             told = tick
     assert set(queue._waiting) <= set(range(len(ticks) + 1, len(ticks) + AHEAD_MAX + 1))
     assert sent == queue.used + queue.late + queue.refused + len(queue._waiting)

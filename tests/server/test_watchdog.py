@@ -110,5 +110,5 @@ async def test_a_loop_that_has_its_turns_is_left_alone(ears: Ears, watch: Watch)
 async def test_where_the_thread_had_no_turn_either_cpu_time_tells_why(
     ears: Ears, watch: Watch, cpu_s: float, said: str
 ) -> None:
-    watch(stall_s=60.0)._say_asleep(3.0, cpu_s)
+    watch(stall_s=60.0)._log_asleep(3.0, cpu_s)
     assert ears.said == [(said, {"for_s": 3.0})]
