@@ -1,6 +1,7 @@
-"""Property tests are the same in every run and on every machine: the same examples, and no limit on time.
+"""Settings of property tests: the same examples in every run and on every machine, without a time limit.
 
-A test that steps a world runs it both ways: by the compiled kernel that runs here, and by the same source plain.
+A test that steps a world runs twice: with the compiled kernel of this machine, and with the same source as plain
+Python.
 """
 
 import signal
@@ -14,10 +15,10 @@ from tests.lengths import EXAMPLES
 SAME = settings(derandomize=True, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.register_profile("short", SAME, max_examples=EXAMPLES // 5)
 settings.register_profile("long", SAME, max_examples=EXAMPLES)
-settings.load_profile("short")  # or the one that --hypothesis-profile names
+settings.load_profile("short")  # the option --hypothesis-profile selects another profile
 
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
-    # A script has started the tests in the background. What they start in turn shall be as on a terminal.
+    # A script has started the tests in the background. Processes that they start must behave as on a terminal.
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import settings
 
 EXAMPLES = 100
-"""The examples of a property test in a long run, unless it names a number (`examples`)."""
+"""Number of examples of a property test in a long run, unless the test has a number of its own (`examples`)."""
 
 
 def long(*values: Any) -> list[Any]:

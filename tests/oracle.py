@@ -1,8 +1,8 @@
-"""The physics contract a second time, in exact rationals and with nothing clever: the judge of the product.
+"""A second implementation of the physics contract, in exact rationals and without optimisations.
 
-No grid integers, no cells, no sleep: blocks are a set, entities a dictionary, and every entity has its whole turn
-in every tick, in ascending order of id. An obstacle is a box; a move is the shortest way to the first one of them.
-Only `fractions.Fraction` decides; whole numbers (`near`) merely skip what is provably out of reach.
+It has no grid integers, no cells and no sleep. Blocks are a set and entities a dictionary. Every entity has a turn in
+every tick, in ascending order of id. An obstacle is a box, and a move ends at the nearest obstacle.
+Only `fractions.Fraction` decides. The integer test `near` merely skips what is provably out of reach.
 
     1  supported?   a solid block or a solid entity touches the underside exactly, with an area
     2  input        walkers: horizontal velocity = intent x walk speed; jump only when supported
@@ -25,14 +25,14 @@ HALF = Fraction(1, 2)
 
 
 def nearest(value: Fraction, width: Fraction) -> Fraction:
-    """The nearest multiple of `width`, halves away from zero."""
+    """Returns the nearest multiple of `width`; halves are rounded away from zero."""
     whole = math.floor(abs(value) / width + HALF)
     return whole * width if value >= 0 else -whole * width
 
 
 @dataclass
 class Kind:
-    """A template entity: the box relative to the position, what it may do."""
+    """A template: the box relative to the position, and what the entity may do."""
 
     offset: list[Fraction]
     size: list[Fraction]
@@ -41,7 +41,7 @@ class Kind:
     solid: bool
 
     def corners(self) -> Box:
-        """The box as low and high corner: a negative side extends it the other way."""
+        """The low and the high corner of the box. A negative side extends it the other way."""
         ends = [o + s for o, s in zip(self.offset, self.size, strict=True)]
         return [min(pair) for pair in zip(self.offset, ends, strict=True)], [
             max(pair) for pair in zip(self.offset, ends, strict=True)
@@ -66,9 +66,9 @@ class Oracle:
     """A world of the contract.
 
     Args:
-        kinds: the templates, in the scene's order; lengths and speeds as their people gave them.
+        kinds: the templates, in the scene's order, with lengths and speeds as the scene gives them.
         rate: ticks per second.
-        lowest: z of the lowest block: below it there is the void.
+        lowest: z of the lowest block; the void is below it.
     """
 
     def __init__(
@@ -90,14 +90,14 @@ class Oracle:
         self.pairs = pairs
         self.lowest = lowest
         self.solid: dict[Block, set[Block]] = {}
-        """The solid blocks of every segment that is loaded."""
+        """Solid blocks of each loaded segment."""
         self.bodies: dict[int, Body] = {}
         self.fell: list[int] = []
         self._corners = [self._rounded(kind) for kind in kinds]
         self._reach = 2 + max(math.ceil(abs(part)) for low, high in self._corners for part in (*low, *high))
 
     def is_solid(self, block: Block) -> bool:
-        """Whether a block stops things: what is not loaded does, the void does not."""
+        """Returns whether a block stops things. A place that is not loaded stops them; the void does not."""
         loaded = self.solid.get((block[0] // SEGMENT, block[1] // SEGMENT, block[2] // SEGMENT))
         return block[2] >= self.lowest if loaded is None else block in loaded
 
@@ -108,7 +108,7 @@ class Oracle:
         ]
 
     def step(self, inputs: dict[int, tuple[int, int, int]]) -> None:
-        """One tick: inputs by id; who has none goes on with its latest."""
+        """Computes one tick. An entity without an input goes on with its latest one."""
         for entity, (x, y, buttons) in inputs.items():
             self.bodies[entity].move = x, y
             self.bodies[entity].buttons = buttons
@@ -122,7 +122,7 @@ class Oracle:
                 self.fell.append(entity)
 
     def taken(self, body: Body) -> bool:
-        """Whether a body overlaps a block, or an entity that it would meet."""
+        """Returns whether a body overlaps a block, or an entity that would stop it."""
         low, high = self.box(body)
         if any(self.is_solid(block) for block in _cells(low, high)):
             return True
@@ -164,7 +164,7 @@ class Oracle:
             low[k] += went
             high[k] += went
             body.position[k] += went
-            if went != wish[k]:  # stopped
+            if went != wish[k]:  # the move was stopped
                 v[k] = Fraction(0)
                 if k == 2 and wish[k] < 0:
                     body.falling = False
@@ -181,7 +181,7 @@ class Oracle:
         )
 
     def _others(self, body: Body, wish: Fraction) -> list[Box]:
-        """The boxes of the solid entities that a body meets, if it could reach them."""
+        """Yields the boxes of the solid entities that could stop a body within its reach."""
         if not self.pairs or not self.kinds[body.kind].solid:
             return []
         x, y, z = body.near
@@ -197,7 +197,7 @@ class Oracle:
         ]
 
     def _way(self, low: list[Fraction], high: list[Fraction], k: int, wish: Fraction, others: list[Box]) -> Fraction:
-        """How far a box gets along axis k: to the nearest face that was not behind its leading one."""
+        """Returns how far a box moves along axis k: to the nearest face ahead of its leading face."""
         ahead_low, ahead_high = list(low), list(high)
         if wish > 0:
             ahead_low[k], ahead_high[k] = high[k], high[k] + wish
@@ -222,6 +222,6 @@ class Oracle:
 
 
 def _cells(low: list[Fraction], high: list[Fraction]) -> list[Block]:
-    """The blocks that the open box between two corners overlaps."""
+    """Yields the blocks that the open box between two corners overlaps."""
     spans = [range(math.floor(a), math.ceil(b)) for a, b in zip(low, high, strict=True)]
     return [(x, y, z) for z in spans[2] for y in spans[1] for x in spans[0]]

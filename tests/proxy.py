@@ -1,11 +1,11 @@
-"""A TCP proxy on loopback that is as bad as a path of `client_sdk.netsim.links`, in real time.
+"""A TCP proxy on loopback that delays data like a link of `client_sdk.netsim.links`, in real time.
 
-Theory of operation. Each direction of each connection is a line: what it reads is a packet, which takes its time on
-the line (`rate`), then flies (`delay`, jitter, the link_events), in order. While the line is busy nothing is read: what
-waits for the line waits in the kernels' buffers. This side of them is made as small as it gets, so that all but
-`HIDDEN_BYTES` stands at the sender, where SIOCOUTQ counts it, as on a real path; only that what is read counts as
-acknowledged at once, and not a round trip later. A lost packet, which no proxy can lose, comes late instead: after
-what it takes to find it missing and send it again.
+Theory of operation. Each direction of a connection is a line. A read of at most `PACKET_BYTES` is a packet. It occupies
+the line for some time (`rate`) and then travels (delay, jitter, link events); packets stay in order. While the line is
+busy, nothing is read, and data waits in the buffers of the kernels. The proxy's receive buffers are as small as
+possible, so all but `HIDDEN_BYTES` waits at the sender, where SIOCOUTQ counts it, as on a real link. There is one
+difference: data counts as acknowledged when it is read, not a round trip later. A proxy cannot lose a packet, so a lost
+packet is delivered late: after the time to detect the loss and to send it again.
 """
 
 import asyncio
@@ -18,24 +18,26 @@ from types import TracebackType
 from client_sdk.netsim.links import HEADER_BYTES, TIMER_S, Link, LinkEvents
 
 PACKET_BYTES = 536
-"""The least that every path carries."""
+"""Bytes of a packet: the minimum that every IPv4 path carries (MSS)."""
 READ_BYTES = 4096
-"""More than a kernel has: after a read its window is wide open, and the sender's kernel need not probe for that."""
+"""Bytes of one read: more than the receive buffer holds. It empties the buffer, so the sender does not have to probe
+for a window."""
 HIDDEN_BYTES = 2 * 1152
-"""So much may wait for the line without its sender knowing: what was read at once, and what the kernel has."""
+"""Bytes that may wait for the line without being counted at the sender: those just read, and those in the receive
+buffer."""
 FLIGHT_PACKETS_MAX = 256
-"""More are not read, however long the delay."""
+"""Maximum number of packets on the way. When it is reached, nothing is read."""
 STEP_S = 0.005
-"""Seconds between two looks at the link while it lets nothing through."""
+"""Seconds between two checks of a link that lets nothing through."""
 
 
 class Proxy:
-    """Forwards every connection to `target`; use it with `async with`.
+    """Forwards every connection to `target`. Use it with `async with`.
 
     Args:
         target: host and port.
-        path: what each connection's two directions are like, from the moment when the proxy starts.
-        seed: everything random comes from it.
+        path: the link that both directions of each connection simulate. Its time begins when the proxy starts.
+        seed: seed of all random numbers.
     """
 
     def __init__(self, target: tuple[str, int], path: Link, seed: int = 1) -> None:
@@ -49,7 +51,7 @@ class Proxy:
 
     @property
     def url(self) -> str:
-        """Where a client connects to."""
+        """The URL for clients."""
         return f"ws://127.0.0.1:{self._listener.getsockname()[1]}"
 
     @property
@@ -58,15 +60,15 @@ class Proxy:
         return time.monotonic() - self._started
 
     def stall(self) -> None:
-        """From now on nothing is read and nothing arrives."""
+        """Stops reading and delivering until `flow` is called."""
         self._flowing.clear()
 
     def flow(self) -> None:
-        """Ends a stall: what has waited goes on."""
+        """Ends a stall; the waiting data is delivered."""
         self._flowing.set()
 
     async def cut(self) -> None:
-        """Breaks all connections off, in both directions, without a goodbye."""
+        """Resets all connections in both directions, without a closing handshake."""
         for life in self._lives:
             life.cancel()
         await asyncio.gather(*self._lives, return_exceptions=True)
@@ -96,7 +98,7 @@ class Proxy:
             life.add_done_callback(self._lives.discard)
 
     async def _join(self, client: socket.socket) -> None:
-        """One connection, until both directions have ended or one has broken."""
+        """Serves one connection until both directions have ended or one has failed."""
         link_events = LinkEvents(self.path, self._rng.randrange(1 << 30))
         with client, _small() as server:
             client.setblocking(False)
@@ -113,7 +115,7 @@ class Proxy:
             except* OSError:
                 pass
             finally:
-                if not in_order:  # both ends get a reset
+                if not in_order:  # an unordered end resets both ends
                     for sock in (client, server):
                         sock.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
 
@@ -131,11 +133,11 @@ class _Line:
         self._source, self._sink = source, sink
         self._rng = random.Random(seed)
         self._flight: asyncio.Queue[tuple[float, bytes]] = asyncio.Queue(FLIGHT_PACKETS_MAX)
-        self._free = 0.0  # when the line is
-        self._last = 0.0  # when the newest packet arrives
+        self._free = 0.0  # time at which the line is free
+        self._last = 0.0  # time at which the newest packet arrives
 
     async def read(self) -> None:
-        """Takes in what has come as fast as the line allows; the last packet is empty."""
+        """Reads packets as fast as the line allows. The last packet is empty."""
         loop = asyncio.get_running_loop()
         data = b"?"
         while data:
@@ -153,7 +155,7 @@ class _Line:
         await self._flight.put((self._last, packet))
 
     async def write(self) -> None:
-        """Hands over each packet when its time has come."""
+        """Delivers each packet at its time of arrival."""
         loop = asyncio.get_running_loop()
         while True:
             due, data = await self._flight.get()
@@ -165,7 +167,7 @@ class _Line:
             await loop.sock_sendall(self._sink, data)
 
     def _arrival(self, gone: float) -> float:
-        """When a packet that left the line at `gone` has flown, as often as it takes."""
+        """Returns the time at which a packet that left the line at `gone` arrives, with all its losses."""
         path, sent = self._path, gone
         while self._link_events.out(sent):
             sent += STEP_S
@@ -177,7 +179,7 @@ class _Line:
 
 
 def _small() -> socket.socket:
-    """A socket whose kernel takes in as little ahead of its reader as it can be told to; so do those it accepts."""
+    """Returns a socket with the smallest possible receive buffer. Sockets that it accepts have it, too."""
     sock = socket.socket()
     sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1)
     sock.setblocking(False)

@@ -1,4 +1,4 @@
-"""A game at a table: fake links that keep what they are sent, and a time that is told."""
+"""A game with fake links, which keep the messages sent to them, and with a simulated time."""
 
 from dataclasses import replace
 from typing import Any
@@ -21,7 +21,7 @@ FLOOR = [[0, 0, 0, 32, 32, 1, 1]]
 
 
 class FakeLink:
-    """Keeps what it is sent; may call back while it is being closed, as a link is free to do."""
+    """A transport that keeps the messages sent to it. It may call the game back while it is being closed."""
 
     def __init__(self, table: "Table", *, calls_back: bool = False) -> None:
         self.table = table
@@ -37,7 +37,7 @@ class FakeLink:
 
     @property
     def waiting(self) -> int:
-        """Bytes on the way; who sets it need not wait for the game to look, which it does where it has sent some."""
+        """Bytes on the way. Setting it makes the game ask for it again, which otherwise happens only after a send."""
         return self._waiting
 
     @waiting.setter
@@ -62,14 +62,14 @@ class FakeLink:
         return [message for message in self.sent if isinstance(message, kind)]
 
     def refusal(self) -> tuple[int, str]:
-        """With what it was closed, having been told the same in a `Bye`."""
+        """Returns the code and the reason of the close, which the client has received in a `Bye`, too."""
         ((code, reason),) = self.closings
         assert self.sent[-1] == Bye(code, reason, -1.0)
         return code, reason
 
 
 class Table:
-    """A game and its time; whose connection is lost leaves at once, if nothing else is said."""
+    """A game and its time. By default, a player whose connection is lost leaves at once."""
 
     def __init__(
         self,
@@ -113,12 +113,12 @@ class Table:
 
 
 def whole(part: list[Any]) -> list[Any]:
-    """A segment's part with the fields that were left out."""
+    """Returns a segment's part with its left-out fields."""
     return part + NO_FIELDS[len(part) - 4 :]
 
 
 def ids(snapshot: Snapshot) -> list[int]:
-    """Who is told of, without regard to segments."""
+    """Returns the numbers of all entities in a snapshot."""
     found: list[int] = []
     for part in map(whole, snapshot.segments):
         found += np.frombuffer(part[4], HEAD)["id"].tolist() + np.frombuffer(part[6], ROW)["id"].tolist()
@@ -131,5 +131,5 @@ def gone(snapshot: Snapshot) -> list[int]:
 
 
 def order(number: int, tick: int, *block: int) -> Command:
-    """The command to edit a block: x, y, z, kind."""
+    """Returns the command to edit a block: x, y, z, kind."""
     return Command(number, tick, 0.0, edits.NAME, edits.pack(Edit(*block)))

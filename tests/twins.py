@@ -1,7 +1,7 @@
 """A world and the oracle under one random script, compared bit for bit after every tick.
 
-A seed decides everything: the rules, the terrain, who is there and all that happens. `Twins(seed).run()` raises
-`AssertionError` at the first difference, with the seed and the tick in the message.
+A seed decides everything: rules, terrain, entities, events. `Twins(seed).run()` raises `AssertionError` at the first
+difference, with the seed and the tick in the message.
 """
 
 import random
@@ -28,10 +28,10 @@ class Twins:
     """One seeded run.
 
     Args:
-        seed: all of it.
-        compiled: how the world runs.
-        bodies: at most so many entities at the start.
-        ticks: at most so many.
+        seed: seed of the whole run.
+        compiled: whether the world runs the compiled kernel.
+        bodies: maximum number of entities at the start.
+        ticks: maximum number of ticks.
     """
 
     def __init__(self, seed: int, *, compiled: bool, bodies: int = 10, ticks: int = 30) -> None:
@@ -59,7 +59,7 @@ class Twins:
                 self._spawn()
 
     def run(self) -> None:
-        """The whole script; raises at the first difference."""
+        """Runs the script. Raises an `AssertionError` at the first difference."""
         try:
             for _ in range(self.ticks):
                 for _ in range(self.random.choice((0, 0, 0, 1, 3))):
@@ -98,7 +98,7 @@ class Twins:
         )
 
     def _terrain(self) -> None:
-        """One to eight segments around the centre, with noise of some density near it, on a floor as often as not."""
+        """Makes one to eight segments around the centre, with random blocks near it, often on a floor."""
         r = self.random
         density = r.choice((0.0, 0.02, 0.1, 0.3, 0.6))
         ground = r.random() < 0.7
@@ -125,10 +125,10 @@ class Twins:
             (x + at % 32, y + at // 32 % 32, z + at // 1024) for at in np.flatnonzero(kinds).tolist()
         }
 
-    # -- what may happen between two ticks -----------------------------------------------------------------
+    # -- what can happen between two ticks -------------------------------------------------------------------
 
     def _somewhere(self, kind: int | None = None) -> tuple[float, float, float]:
-        """A position near the centre: on the block grid, in halves, or anywhere; or, for a kind, on top of somebody."""
+        """Returns a random position near the centre: on the block grid, in halves, anywhere, or on top of an entity."""
         r = self.random
         if kind is not None and self.oracle.bodies and r.random() < 0.4:
             under = self.oracle.bodies[r.choice(list(self.oracle.bodies))]
@@ -214,7 +214,7 @@ class Twins:
         body.falling = body.falling or (self.scene.gravity > 0 and body.velocity[2] > 0)
 
     def _edit(self) -> None:
-        """Fills or clears a small box of blocks; refused as a whole where a solid entity is."""
+        """Fills or clears a small box of blocks. The edit is refused as a whole if a solid entity is in the way."""
         r = self.random
         low = [int(part // 1) for part in self._somewhere()]
         high = [part + r.choice((1, 1, 2, 4)) for part in low]
@@ -242,7 +242,7 @@ class Twins:
                 segment.discard(cell)
 
     def _reload(self) -> None:
-        """Loads a segment, perhaps one that was not there, or in place of another."""
+        """Loads a segment, a new one or one that replaces another."""
         index = segment_of(*(int(part // 1) for part in self._somewhere()))
         density = self.random.choice((0.0, 0.01))
         self._load(
@@ -250,7 +250,7 @@ class Twins:
         )
 
     def _unload(self) -> None:
-        """Forgets a segment, which is solid from then on; refused while entities are in it."""
+        """Unloads a segment, which is solid from then on. This is refused while entities are in it."""
         index = segment_of(*(int(part // 1) for part in self._somewhere()))
         if index not in self.oracle.solid:
             return
@@ -264,7 +264,7 @@ class Twins:
         del self.oracle.solid[index]
 
     def _put(self) -> None:
-        """Writes states as a snapshot does: verbatim, wherever they are, some of them for nothing."""
+        """Writes states as a snapshot does, without any check. Some of them are written without a change."""
         states = []
         for entity, body in self.oracle.bodies.items():
             if self.random.random() < 0.5:
@@ -278,7 +278,7 @@ class Twins:
         self.world.put(states)
 
     def _rewind(self) -> None:
-        """Becomes a copy, runs on alone, and is restored: as if nothing had happened."""
+        """Replaces the world by a copy, steps that, and restores it. This must change nothing."""
         before = self.world.copy()
         self.world.step()
         if self.oracle.bodies and self.random.random() < 0.5:
@@ -333,7 +333,7 @@ def _kind(template: Template) -> Kind:
 
 
 def _state(entity: int, body: Body) -> tuple[int, ...]:
-    """The 12 whole numbers of `World.state`."""
+    """Returns the 12 whole numbers of `World.state`."""
     place = [_whole(part * BLOCK) for part in body.position]
     speed = [_whole(part * SPEED) for part in body.velocity]
     return (entity, body.kind, int(body.falling), *place, *speed, *body.move, body.buttons)

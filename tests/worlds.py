@@ -1,7 +1,7 @@
-"""Small worlds for tests: a scene and some boxes of blocks in one line, and exact numbers.
+"""Small worlds for tests: a scene with some boxes of blocks in one line, and exact numbers.
 
-Positions that lie within +-2^28 blocks have at most 53 significant bits, so `World.position` is exact and every
-comparison in the tests is `==`.
+Positions within +-2^28 blocks have at most 53 significant bits, so `World.position` is exact and the tests compare with
+`==`.
 """
 
 from collections.abc import Iterable
@@ -14,29 +14,29 @@ from shared.units import BLOCK, SEGMENT
 from shared.world import World
 
 STEP = 1 / BLOCK
-"""One grid step in blocks."""
+"""One grid step, in blocks."""
 
 EAST, WEST, NORTH, SOUTH = Input(127, 0), Input(-127, 0), Input(0, 127), Input(0, -127)
 JUMP = Input(0, 0, 1)
 
 TEMPLATES = (
-    # The hard cases' box: 5/8 x 5/8 x 7/4 with its low corner at the position.
+    # the box of the hard cases: 5/8 x 5/8 x 7/4 with its low corner at the position
     Template("box", (0, 0, 0), (5 / 8, 5 / 8, 7 / 4), walk_speed=3, jump_speed=8),
     Template("stone", (0, 0, 0), (5 / 8, 5 / 8, 7 / 4)),
     Template("cube", (0, 0, 0), (1, 1, 1), walk_speed=3, jump_speed=8),
     Template("slab", (0, 0, 0), (4, 4, 1)),
     Template("ghost", (0, 0, 0), (5 / 8, 5 / 8, 7 / 4), walk_speed=3, jump_speed=8, solid=False),
-    # Intent (96, 64) is exactly 3 and 2 blocks/s.
+    # intent (96, 64) is exactly 3 and 2 blocks/s
     Template("runner", (0, 0, 0), (5 / 8, 5 / 8, 7 / 4), walk_speed=127 / 32, jump_speed=8),
     Template("person", (-0.3, -0.3, 0), (0.6, 0.6, 1.8), walk_speed=3, jump_speed=8),
 )
 
 Fill = list[int]
-"""A box of blocks: [x0, y0, z0, x1, y1, z1, kind]."""
+"""Box of blocks: [x0, y0, z0, x1, y1, z1, kind]."""
 
 
 def scene(fill: Iterable[Fill] = (), **changes: Any) -> Scene:
-    """The scene of the hard cases: dt = 1/64, g = v_t = 16; eight segments around the origin."""
+    """Returns the scene of the hard cases: dt = 1/64, g = v_t = 16; eight segments around the origin."""
     values: dict[str, Any] = {
         "name": "test",
         "templates": TEMPLATES,
@@ -52,31 +52,31 @@ def scene(fill: Iterable[Fill] = (), **changes: Any) -> Scene:
 
 
 def build(fill: Iterable[Fill] = (), *, compiled: bool = False, **changes: Any) -> World:
-    """A world of `scene(fill, **changes)` with all its segments loaded."""
+    """Returns a world of `scene(fill, **changes)` with all its segments loaded."""
     world = World(scene(fill, **changes), compiled=compiled)
     world.load_terrain()
     return world
 
 
 def floor(top: int = 0, half: int = 30, x: int = 0, y: int = 0) -> Fill:
-    """A floor one block thick around (x, y)."""
+    """Returns a floor one block thick around (x, y)."""
     return [x - half, y - half, top - 1, x + half, y + half, top, 1]
 
 
 def around(*block: int) -> dict[str, Any]:
-    """The origin and size of a scene whose eight segments meet near a block."""
+    """Returns the origin and size of a scene whose eight segments meet near a block."""
     return {"origin": tuple((part + SEGMENT // 2) // SEGMENT - 1 for part in block), "size": (2, 2, 2)}
 
 
 def steps(world: World, n: int, inputs: dict[int, Input] | None = None) -> None:
-    """`n` ticks; the inputs come with the first (they last)."""
+    """Steps `n` ticks. The inputs are given in the first tick and last."""
     world.step(inputs)
     for _ in range(n - 1):
         world.step()
 
 
 def settle(world: World, limit: int = 2000) -> int:
-    """Steps until everything sleeps; how many ticks that took."""
+    """Steps until all entities sleep. Returns the number of ticks."""
     for tick in range(limit):
         if world.awake_count == 0:
             return tick
@@ -85,17 +85,17 @@ def settle(world: World, limit: int = 2000) -> int:
 
 
 def high(world: World, entity: int) -> tuple[float, ...]:
-    """The high corner of an entity's box, in blocks."""
+    """Returns the high corner of an entity's box, in blocks."""
     return tuple(part / BLOCK for part in box(world, entity)[3:])
 
 
 def low(world: World, entity: int) -> tuple[float, ...]:
-    """The low corner of an entity's box, in blocks."""
+    """Returns the low corner of an entity's box, in blocks."""
     return tuple(part / BLOCK for part in box(world, entity)[:3])
 
 
 def box(world: World, entity: int) -> tuple[int, ...]:
-    """The corners of an entity's box, in grid steps, from the template's own numbers."""
+    """Returns the corners of an entity's box in grid steps, from the template's own numbers."""
     state = world.state(entity)
     template = world.scene.templates[state[1]]
     lows, highs = [], []
@@ -107,17 +107,17 @@ def box(world: World, entity: int) -> tuple[int, ...]:
 
 
 def grid(blocks: float | Fraction) -> int:
-    """Blocks in grid steps, halves away from zero, by exact rationals."""
+    """Returns blocks in grid steps, rounded by exact rationals; halves go away from zero."""
     steps = abs(Fraction(blocks)) * BLOCK
     whole = int(steps + Fraction(1, 2))
     return whole if blocks >= 0 else -whole
 
 
 def states(world: World) -> list[tuple[int, ...]]:
-    """The state of every entity, ascending by id."""
+    """Returns the state of every entity, ascending by id."""
     return [world.state(entity) for entity in world.entities["id"].tolist()]
 
 
 def wake_all(world: World) -> None:
-    """Gives every entity a turn in the next tick, as if none had been asleep."""
+    """Gives every entity a turn in the next tick, as if none slept."""
     world.put(states(world))

@@ -35,6 +35,10 @@ COMPLIANT = (
     "server",
     "shared",
     "sovereign_netcode",
+    "tests/conftest.py",
+    "tests/lengths.py",
+    "tests/oracle.py",
+    "tests/proxy.py",
     "tests/readme/pages.py",
     "tests/readme/test_links.py",
     "tests/readme/run_snippet.py",
@@ -42,6 +46,10 @@ COMPLIANT = (
     "tests/readme/test_snippets.py",
     "tests/readme/test_tables.py",
     "tests/scripts/test_language.py",
+    "tests/shared",
+    "tests/tables.py",
+    "tests/twins.py",
+    "tests/worlds.py",
 )
 """Files and folders whose texts comply. Add a folder once it does. When all are here, check the whole tree instead."""
 SUFFIXES = (".c", ".html", ".js", ".md", ".mjs", ".py", ".service", ".toml", ".ts")

@@ -1,9 +1,9 @@
-"""What tests of the physics run under."""
+"""Fixtures for tests of the physics."""
 
 import pytest
 
 
 @pytest.fixture(params=["mean", "semi"])
 def integrator(request: pytest.FixtureRequest) -> str:
-    """Each of the two integrators."""
+    """Name of the integrator. The test runs once with each."""
     return str(request.param)

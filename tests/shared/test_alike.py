@@ -1,4 +1,4 @@
-"""Which states count for an entity: the kernel against the same rule in numpy."""
+"""States that count for an entity: the kernel compared with the same rule in numpy."""
 
 import random
 
@@ -22,7 +22,7 @@ def that_count(states: Int64s, entity: int) -> Int64s:
 
 
 def drawn(rng: random.Random) -> Int64s:
-    """Up to six entities on a line of 40 steps, half of them where the own one (1) could meet them."""
+    """Returns up to six entities on a line of 40 steps; half of them are where the own one (1) could meet them."""
     states = np.zeros((6, CELL), np.int64)
     states[:, ID] = range(1, 7)
     states[:, TEMPLATE] = [rng.randrange(3) for _ in states]
@@ -33,7 +33,7 @@ def drawn(rng: random.Random) -> Int64s:
 
 
 def changed(states: Int64s, rng: random.Random) -> Int64s:
-    """A few values are others, or someone is not there."""
+    """Returns states with a few other values, or without one of the entities."""
     other = states.copy()
     for _ in range(rng.randrange(3)):
         if len(other):

@@ -1,6 +1,6 @@
-"""The compiled kernels stay within their arrays: what they do is done once more with every index checked.
+"""The compiled kernels stay within their arrays. Tests run again with a kernel that checks every index.
 
-Compiled code that writes beside an array damages the process without a word, and some of it reads what peers send.
+Compiled code that writes outside an array damages the process without an error, and some of it reads data from peers.
 """
 
 import os
@@ -32,7 +32,7 @@ pytestmark = [
 
 
 def test_no_index_of_the_prebuilt_kernel_is_out_of_bounds() -> None:
-    """The other process has made sure that the checks work (`tests.kernels.checking`)."""
+    """The other process has verified that the checks work (`tests.kernels.checking`)."""
     command = (sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "-p", "tests.kernels.checking")
     environment = os.environ | {"NUMBA_OPT": "0", "NUMBA_CPU_NAME": "generic"}
     done = subprocess.run(

@@ -1,4 +1,4 @@
-"""Copies, restores, rows used again and lists that must not go stale: the bookkeeping behind the state."""
+"""Copies, restored worlds, reused rows and cached lists: the bookkeeping behind the state."""
 
 import random
 
@@ -12,7 +12,7 @@ from tests.worlds import EAST, JUMP, TEMPLATES, WEST, build, floor, high, settle
 
 
 def crowd(compiled: bool, n: int = 7, seed: int = 1) -> World:
-    """Walkers, stones and ghosts on a floor with a few walls."""
+    """Returns a world of walkers, stones and ghosts on a floor with a few walls."""
     r = random.Random(seed)
     walls = [[r.randint(-9, 9) for _ in range(2)] for _ in range(12)]
     world = build([floor(), *([x, y, 0, x + 1, y + 1, 2, 1] for x, y in walls)], compiled=compiled)
@@ -39,7 +39,7 @@ def wishes(world: World, r: random.Random) -> dict[int, Input]:
 
 
 def disturb(world: World, r: random.Random) -> None:
-    """Anything that may happen to a world, so that it differs in entities, rows, blocks and segments."""
+    """Changes a world at random, so that it differs in entities, rows, blocks and segments."""
     for _ in range(r.randint(1, 6)):
         entities = world.entities["id"].tolist()
         match r.randrange(5):
@@ -59,7 +59,7 @@ def disturb(world: World, r: random.Random) -> None:
 
 @pytest.mark.parametrize("seed", range(12))
 def test_restored_over_a_world_that_has_diverged(compiled: bool, seed: int) -> None:
-    """The same continuation as the original: with other rows, other capacity, other segments, at any tick."""
+    """A restored world goes on like the original, also after it had other rows, another capacity and other segments."""
     r = random.Random(seed)
     world = crowd(compiled, n=r.choice((3, 9, 20)), seed=seed)
     steps(world, r.randint(1, 30), wishes(world, r))
@@ -83,7 +83,7 @@ def test_restored_over_a_world_that_has_diverged(compiled: bool, seed: int) -> N
 
 
 def test_a_restored_world_has_no_ghost_of_its_past(compiled: bool) -> None:
-    """More entities than the other has room for, and the same segments: their cells are emptied all the same."""
+    """The other world has fewer rows than are needed, and the same segments. Its cells are emptied all the same."""
     world = build([floor()], compiled=compiled)
     walker = world.spawn("box", (0, 0, 0))
     other = world.copy()
@@ -121,7 +121,7 @@ def test_a_step_leaves_what_it_was_copied_from_alone(compiled: bool) -> None:
 
 
 def test_both_kernels_share_a_past() -> None:
-    """A compiled world is restored from a plain one and goes on alike."""
+    """A compiled world that is restored from a plain one goes on alike."""
     plain = crowd(False)
     steps(plain, 20, {1: EAST, 2: WEST})
     compiled = World(plain.scene, compiled=True)
@@ -133,7 +133,7 @@ def test_both_kernels_share_a_past() -> None:
 
 
 def test_rebased_to_a_tick_that_has_been_before(compiled: bool) -> None:
-    """What an older course of the same ticks changed is forgotten: the new course reports its own changes."""
+    """Changes that an earlier run of these ticks made are forgotten. The new run reports its own changes."""
     world = build([floor()], compiled=compiled)
     entity = world.spawn("box", (0, 0, 0))
     steps(world, 10, {entity: EAST})
@@ -146,7 +146,7 @@ def test_rebased_to_a_tick_that_has_been_before(compiled: bool) -> None:
 
 
 def test_a_state_with_the_bookkeeping_flag_is_still_woken(compiled: bool) -> None:
-    """Whole rows hold a flag that says they are listed; a world that is told them lists them itself."""
+    """A state with the flag "listed" is put into a world that does not list it yet. The world lists it itself."""
     world = build([floor()], compiled=compiled)
     entity = world.spawn("box", (0, 0, 5))
     other = build([floor()], compiled=compiled)
@@ -171,7 +171,7 @@ def test_removed_and_told_again_in_one_tick(compiled: bool) -> None:
 
 
 def test_rows_used_again_keep_the_order_of_ids(compiled: bool) -> None:
-    """A contact is decided by the lower id, wherever its row lies."""
+    """The lower id decides a contact, wherever its row lies."""
     results = []
     for reuse in (False, True):
         world = build([floor()], compiled=compiled)
@@ -194,7 +194,8 @@ def test_rows_used_again_keep_the_order_of_ids(compiled: bool) -> None:
 
 
 def test_an_entity_at_the_edge_of_what_is_loaded_is_no_ghost(compiled: bool) -> None:
-    """Its position may be the first that is not loaded, on the high face of its box: it is met, seen and woken."""
+    """The position is the first place that is not loaded, on the high face of the box. The entity still stops others,
+    is found and is woken."""
     templates = (*TEMPLATES, Template("west of it", (0, 0, 0), (-1, 1, 1), walk_speed=3))
     world = build([floor(half=64)], compiled=compiled, templates=templates)
     entity, walker = world.spawn("west of it", (30, 0, 0)), world.spawn("box", (20, 0, 0))
@@ -212,7 +213,7 @@ def test_an_entity_at_the_edge_of_what_is_loaded_is_no_ghost(compiled: bool) -> 
 
 
 def test_entities_meet_in_the_void(compiled: bool) -> None:
-    """Below the floor nothing is loaded, and a box that lands on another still stops there."""
+    """Below the floor nothing is loaded. A box that lands on another still stops there."""
     world = build(compiled=compiled, origin=(0, 0, 0), size=(1, 1, 1), terminal_speed=4)
     lower, upper = world.spawn("stone", (8, 8, -30)), world.spawn("stone", (8, 8, -20))
     world.set_velocity(upper, (0, 0, -4))

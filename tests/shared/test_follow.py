@@ -1,4 +1,4 @@
-"""What goes on as it did is not told: a world that is told only what happens is the one that is stepped, bit by bit."""
+"""An entity that goes on as before is not sent. A world that receives only turns equals the stepped one bit by bit."""
 
 import random
 import struct
@@ -47,7 +47,7 @@ SIDE = SEGMENT * BLOCK
 
 
 class Told:
-    """A world, and another one that has nothing but what is sent of it."""
+    """A stepped world, and a second world that knows only what was sent of the first."""
 
     def __init__(self, world: World) -> None:
         self.world = world
@@ -58,7 +58,7 @@ class Told:
         self.turns = self.news = self.bytes = 0
 
     def tell(self) -> None:
-        """What the latest step has made of the world goes over the wire, segment by segment."""
+        """Sends the changes of the latest step to the other world, segment by segment, over the wire format."""
         self.turns += len(self.world.changed)
         shares, _ = self.packs.pack(())
         self.news += sum(len(share.ids) for share in shares)
@@ -93,7 +93,8 @@ def crowd(made: Scene, n: int, rng: random.Random, compiled: bool) -> World:
     ),
 )
 def test_a_crowd_that_is_told_of_is_the_crowd(name: str, rate: int, integrator: str, compiled: bool) -> None:
-    """Walls, steps, each other, blocks that come and go, throws and teleports; every tick, every bit."""
+    """Entities meet walls, steps and each other; blocks come and go; entities are thrown and placed. Every bit agrees
+    in every tick."""
     rng = random.Random(f"{name} {rate}")
     table: dict[str, Any] = load_scene(name).to_table() | {"tick_rate": rate, "integrator": integrator}
     told = Told(crowd(Scene.from_table(table), 30, rng, compiled))
@@ -135,18 +136,18 @@ def test_several_ticks_in_which_nothing_happens_are_as_good_as_one(pause: int, c
     told.tell()
     steps(told.world, pause)
     told.tell()
-    assert told.news == 3, "only that they are there"
+    assert told.news == 3, "only that they exist"
     told.check()
 
 
 def events(world: World, entity: int) -> int:
-    """What happened to an entity in the latest step."""
+    """Returns the events of an entity in the latest step."""
     row: Int64s = world.rows([entity])[0]
     return int(row[CHANGED]) & (1 << EVENT_BITS) - 1 if row[CHANGED] >> EVENT_BITS == world.tick else 0
 
 
 def test_each_thing_that_happens_is_told_once(compiled: bool) -> None:
-    """A walk against a wall, a jump over it, and off the far edge."""
+    """The entity walks against a wall, jumps over it and falls off the far edge."""
     world = build([floor(0, 8), [3, -9, 0, 4, 9, 1, 1]], compiled=compiled)
     me = world.spawn("box", (0, 0, 0))
     world.step()
@@ -160,12 +161,12 @@ def test_each_thing_that_happens_is_told_once(compiled: bool) -> None:
         told.check()
     assert [what for what in found if what][:7] == [
         TOLD,  # walks
-        STOP_X,  # at the wall
-        TOLD | LAUNCH | STOP_X,  # jumps, and is at the wall still
-        TOLD | STOP_X,  # lets go of the key
+        STOP_X,  # reaches the wall
+        TOLD | LAUNCH | STOP_X,  # jumps, still at the wall
+        TOLD | STOP_X,  # the jump key is released
         GO_X,  # is above the wall
         STOP_Z,  # lands
-        FALL | WHOLE,  # off the edge, and into the segment below
+        FALL | WHOLE,  # falls off the edge, into the segment below
     ]
 
 
@@ -196,7 +197,7 @@ def test_news_are_packed_in_the_order_of_ids_segment_by_segment(n: int, compiled
     matrix[rows, MOVE_X:CELL] = rng.integers(-127, 128, (n, 3))
     matrix[rows, BUTTONS] &= 255
     matrix[rows, CHANGED] = 7 << EVENT_BITS | rng.integers(0, 2 * WHOLE, n) * rng.integers(0, 2, n)
-    changed = np.concatenate((rows, np.flatnonzero(matrix[:, ID] == 0)[:20]))  # some are gone since they changed
+    changed = np.concatenate((rows, np.flatnonzero(matrix[:, ID] == 0)[:20]))  # rows of entities that are gone, too
     acted = set(matrix[rows[::3], ID].tolist())
     lengths = np.zeros(LENGTHS, np.int64)
     lengths[N_CHANGED] = len(changed)
@@ -230,7 +231,7 @@ def test_news_are_packed_in_the_order_of_ids_segment_by_segment(n: int, compiled
         assert sorted(ids) == [row[ID] for row in told[segment]]
 
 
-# -- what no server says -------------------------------------------------------------------------------------
+# -- what no server sends -------------------------------------------------------------------------------------
 
 
 def turn(entity: int, what: int, *rest: int) -> list[int]:
@@ -238,7 +239,7 @@ def turn(entity: int, what: int, *rest: int) -> list[int]:
 
 
 def test_a_turn_of_nobody_is_told_and_the_others_have_theirs(compiled: bool) -> None:
-    """Rows that ascend by id and rows that do not; a row that is free again, and id 0, which free rows have."""
+    """The rows ascend by id or not. Unknown ids include one whose row is free again, and id 0, which free rows have."""
     world = build(compiled=compiled)
     for entity in (9, 3, 5):
         world.put([(entity, 0, 0, 2 * entity * BLOCK, 0, 9 * BLOCK, 0, 0, 0, 0, 0, 0)])

@@ -1,6 +1,6 @@
-"""Each script must reach exactly these hashes at these ticks: compiled and plain, on every Python and machine.
+"""Scripts must reach exactly these hashes at these ticks: compiled and plain, on every Python version and machine.
 
-Regenerated only on purpose, by `scripts/regenerate_goldens.py`.
+The hashes change only on purpose, by `scripts/regenerate_goldens.py`.
 """
 
 import json

@@ -1,6 +1,6 @@
 """Hard cases of the air: jumps, falls, speed, flights and their energy (H8, H10 to H13, H27 to H29).
 
-Expectations are closed forms in exact rationals: tick h, gravity g, jump speed v0.
+The expected values are closed forms in exact rationals: tick h, gravity g, jump speed v0.
 """
 
 import math
@@ -14,12 +14,12 @@ from shared.world import World
 from tests.worlds import JUMP, TEMPLATES, build, floor, high, steps
 
 RATES = (20, 30, 32, 60, 64, 128)
-# With these a tick of every rate above moves by whole grid steps, so that no flight is rounded.
+# With these, every tick of the rates above moves by whole grid steps, so no flight is rounded.
 EXACT_GRAVITY, EXACT_JUMP = Fraction(225, 16), Fraction(15, 2)
 
 
 def flyer(compiled: bool, integrator: str, rate: int, gravity: Fraction, jump: Fraction) -> tuple[World, int]:
-    """Somebody on a floor at z = 0 who presses jump in the next tick and then no more."""
+    """Returns an entity on a floor at z = 0 that presses jump in the next tick only."""
     templates = (Template("flyer", (0, 0, 0), (1, 1, 1), walk_speed=3, jump_speed=float(jump)),)
     world = build(
         [floor()], compiled=compiled, integrator=integrator, tick_rate=rate, gravity=float(gravity),
@@ -136,7 +136,8 @@ def test_h13_no_speed_tunnels_a_wall_of_one_block(compiled: bool, speed: int, ra
 
 
 def test_h27_one_flight_at_six_tick_rates(compiled: bool) -> None:
-    """Equal at equal times, and landing where it started: the mean of the velocities is exact for a parabola."""
+    """Positions at equal times are equal, and the flight lands at its start: the mean of velocities is exact for a
+    parabola."""
     tracks = []
     for rate in RATES:
         world, entity = flyer(compiled, "mean", rate, EXACT_GRAVITY, EXACT_JUMP)
@@ -153,7 +154,8 @@ def test_h27_one_flight_at_six_tick_rates(compiled: bool) -> None:
 
 @pytest.mark.parametrize("rate", RATES)
 def test_h27_ordinary_numbers_round_by_at_most_half_a_step_a_tick(compiled: bool, rate: int) -> None:
-    """With g = 18 and v0 = 8: at 32, 64 and 128 Hz exactly the parabola, elsewhere within the rounding of the model."""
+    """With g = 18 and v0 = 8, the path at 32, 64 and 128 Hz is exactly the parabola; at other rates it is within the
+    rounding of the model."""
     world, entity = flyer(compiled, "mean", rate, Fraction(18), Fraction(8))
     world.step({entity: JUMP})
     rounded = Fraction(round(Fraction(18) / rate * SPEED), SPEED)
@@ -167,7 +169,7 @@ def test_h27_ordinary_numbers_round_by_at_most_half_a_step_a_tick(compiled: bool
 
 @pytest.mark.parametrize("rate", RATES)
 def test_h28_position_error_of_a_fall(compiled: bool, integrator: str, rate: int) -> None:
-    """Zero with the mean, -g h t / 2 with the seed's rule."""
+    """The error is zero with the mean, and -g h t / 2 with the integrator "semi"."""
     world = build(
         compiled=compiled, integrator=integrator, tick_rate=rate, gravity=float(EXACT_GRAVITY), terminal_speed=1024,
         size=(2, 2, 4), templates=TEMPLATES,

@@ -1,7 +1,7 @@
 """Hard cases of the ground: rest, walls, corners, corridors, holes, edges (H1 to H7, H9, H16 to H19, H30).
 
-Where the contract leaves room, the choice is: a diagonal hit on a corner stops y, because x moves first (H5); a box
-as wide as a hole falls in only if it is aligned with it on a tick (H7); past a corner the way is an L (H16).
+Where the contract leaves a choice, it is this: a diagonal hit on a corner stops y, because x moves first (H5). A box as
+wide as a hole falls in only if it is aligned with it on a tick (H7). Past a corner the way is an L (H16).
 """
 
 import pytest
@@ -69,7 +69,8 @@ def test_h4_sliding_along_a_wall_keeps_the_other_axis(compiled: bool) -> None:
 @pytest.mark.parametrize("east", [1, -1])
 @pytest.mark.parametrize("north", [1, -1])
 def test_h5_diagonal_hit_on_a_corner(compiled: bool, east: int, north: int) -> None:
-    """Corner meets corner exactly on a tick; x moves first and is free, and then y is stopped: in all quadrants."""
+    """The corner of the box meets the corner of the block exactly on a tick. x moves first and is free; then y is
+    stopped. This holds in all quadrants."""
     block = [0 if east > 0 else -1, 0 if north > 0 else -1, -2, 1 if east > 0 else 0, 1 if north > 0 else 0, 3, 1]
     world = build([block], compiled=compiled, gravity=0)
     side = 5 / 8
@@ -95,7 +96,8 @@ def test_h6_a_corridor_as_wide_as_the_box(compiled: bool, offset: float, passes:
 
 @pytest.mark.parametrize(("ticks", "falls"), [(32, True), (32.5, False)])
 def test_h7_a_hole_as_wide_as_the_box(compiled: bool, ticks: float, falls: bool) -> None:
-    """Falls if it is aligned with the hole on some tick, crosses if it never is: there is nothing between ticks."""
+    """The box falls if it is aligned with the hole on some tick, and crosses it otherwise. Nothing happens between
+    ticks."""
     world = build([[-9, -9, -3, 9, 9, 0, 1], [0, 0, -2, 1, 1, 0, 0]], compiled=compiled)
     entity = world.spawn("cube", (-ticks * 3 / 64, 0, 0))
     steps(world, 128, {entity: EAST})
@@ -120,7 +122,7 @@ def test_h9_the_edge_of_a_floor(compiled: bool) -> None:
 
 
 def test_h9_walking_off_the_edge(compiled: bool) -> None:
-    """The tick that clears the edge still ends on the floor's height; the flag is up one tick after."""
+    """The tick that clears the edge still ends at the height of the floor. The flag is up one tick later."""
     world = build([floor(half=8)], compiled=compiled)
     entity = world.spawn("box", (8 - 6 / 64, 0, 0))
     steps(world, 2, {entity: EAST})
@@ -153,7 +155,8 @@ def test_h9_stopped_by_a_wall_on_the_tick_that_clears_the_edge(compiled: bool) -
 
 
 def test_h16_past_a_corner_at_a_block_a_tick(compiled: bool) -> None:
-    """The true way misses the block and ends at (1, 7/4); the L-path loses 5/8 of x, less than one tick's step."""
+    """The straight way misses the block and ends at (1, 7/4). The L-shaped way loses 5/8 of x, less than the step of
+    one tick."""
     world = build([[1, 0, -2, 2, 1, 3, 1]], compiled=compiled, gravity=0)
     entity = world.spawn("stone", (0, 3 / 4, 0), (64, 64, 0))
     world.step()
@@ -210,7 +213,7 @@ def test_h18_a_floor_that_ends_on_a_segment_border(compiled: bool, top: int) -> 
 
 
 def test_h19_negative_coordinates_are_the_mirror(compiled: bool) -> None:
-    """Two worlds, one the mirror image of the other in x and y, block by block and tick by tick."""
+    """Two worlds are mirror images of each other in x and y, block by block and tick by tick."""
     templates = (Template("mirror", (-5 / 16, -5 / 16, 0), (5 / 8, 5 / 8, 7 / 4), walk_speed=3, jump_speed=8),)
     fill = [[-9, -9, -1, 9, 9, 0, 1], [3, -9, 0, 4, 5, 2, 1], [-2, 6, 0, 1, 7, 1, 1]]
     mirrored = [[-x1, -y1, z0, -x0, -y0, z1, kind] for x0, y0, z0, x1, y1, z1, kind in fill]
@@ -227,7 +230,7 @@ def test_h19_negative_coordinates_are_the_mirror(compiled: bool) -> None:
 
 
 def test_h19_a_negative_range_extends_the_other_way(compiled: bool) -> None:
-    """The seed's y: displacement 0.5, range -1 is the box from -0.5 to 0.5."""
+    """The reference engine's y: displacement 0.5 and range -1 are the box from -0.5 to 0.5."""
     one = Template("one", (-0.5, -0.5, 0), (1, 1, 1), walk_speed=3)
     other = Template("one", (-0.5, 0.5, 0), (1, -1, 1), walk_speed=3)
     hashes = []
@@ -260,7 +263,7 @@ def pressed(compiled: bool) -> tuple[World, int]:
 
 @pytest.mark.parametrize("ticks", [1000, pytest.param(100_000, marks=pytest.mark.slow)])
 def test_h30_pressed_into_a_floor_and_two_walls(compiled: bool, ticks: int) -> None:
-    """The hash over the entity is constant (that over the world also counts the tick)."""
+    """The hash over the entity is constant. The hash over the world also contains the tick."""
     world, entity = pressed(compiled)
     state = world.state(entity)
     for _ in range(ticks):

@@ -16,7 +16,8 @@ from tests.worlds import EAST, JUMP, STEP, WEST, build, floor, high, low, settle
 
 @pytest.mark.parametrize(("first", "plane"), [("east-bound", 33 / 64), ("west-bound", 31 / 64)])
 def test_h14_two_movers_head_on(compiled: bool, first: str, plane: float) -> None:
-    """A gap of one block closes by 6/64 a tick; in the eleventh, 4/64 are left: the lower id takes 3, the other 1."""
+    """A gap of one block closes by 6/64 a tick. In the eleventh tick 4/64 are left: the lower id takes 3, the
+    other 1."""
     world = build([floor()], compiled=compiled)
     spots = [(-5 / 8, EAST), (1.0, WEST)]
     if first == "west-bound":
@@ -48,7 +49,8 @@ def test_h15_a_pile_of_five(compiled: bool, integrator: str) -> None:
 
 
 def test_h15_a_pile_with_its_highest_id_below(compiled: bool) -> None:
-    """Support is asked at the start of a turn: who has his before the one below follows a tick later."""
+    """Support is checked at the start of a turn. An entity whose turn comes before that of the one below follows a tick
+    later."""
     world = build([[-4, -4, 0, 4, 4, 1, 1]], compiled=compiled)
     pile = [world.spawn("box", (0, 0, 1 + 7 / 4 * i)) for i in reversed(range(5))][::-1]
     settle(world)
@@ -142,7 +144,7 @@ def test_h26_nothing_smaller_than_a_step(compiled: bool, tiny: float) -> None:
 
 
 def busy(compiled: bool) -> World:
-    """A world in which much is going on at tick 50."""
+    """Returns a world with many moving entities at tick 50."""
     world = build([floor(), [3, -9, 0, 4, 9, 2, 1]], compiled=compiled)
     for i in range(12):
         world.spawn(
@@ -154,7 +156,8 @@ def busy(compiled: bool) -> World:
 
 
 def test_h31_restored_from_its_states_and_replayed(compiled: bool) -> None:
-    """States and blocks are all there is: another world that is told them goes on alike, asleep or awake."""
+    """States and blocks are the complete state: a world that gets them goes on alike, whether entities are asleep or
+    awake."""
     world = busy(compiled)
     other = World(world.scene, compiled=compiled)
     for index in world.blocks:
@@ -171,7 +174,7 @@ def test_h31_restored_from_its_states_and_replayed(compiled: bool) -> None:
 
 @pytest.mark.parametrize("seed", [0, *long(1, 2)])
 def test_h32_h33_the_order_of_entry_does_not_matter(compiled: bool, seed: int) -> None:
-    """Segments, blocks and entities entered in any order; blocks edited there and back."""
+    """Segments, blocks and entities are entered in any order, and blocks are edited there and back."""
     world = busy(compiled)
     order = random.Random(seed)
     other = World(world.scene, compiled=compiled)

@@ -1,4 +1,4 @@
-"""One rule for the length of a move intent, exact, on both sides."""
+"""One exact rule for the length of a direction, on both sides."""
 
 import math
 

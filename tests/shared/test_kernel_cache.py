@@ -1,4 +1,4 @@
-"""What Numba has compiled and kept on disk is used for what it was compiled of, and for nothing else."""
+"""Numba's cache on disk is used only for the sources that it was compiled from."""
 
 import shutil
 import subprocess

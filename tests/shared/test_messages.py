@@ -1,4 +1,4 @@
-"""The wire: what goes in comes out, and no bytes of a peer's do anything but that or raise `ProtocolError`."""
+"""The wire format: every message survives encoding and decoding, and any bytes are a message or a `ProtocolError`."""
 
 import contextlib
 import math
@@ -184,7 +184,7 @@ def test_a_field_too_many_or_too_few_is_refused(message: Message) -> None:
         assert_refused(msgpack.packb(parts[:7]), server=True)
         assert_refused(msgpack.packb([*parts[:8], *[PART] * 1025]), server=True)
         return
-    for wrong in (parts[:-1], [*parts, 0]):  # (of a message without fields: one without a kind)
+    for wrong in (parts[:-1], [*parts, 0]):  # (of a message without fields: without a kind)
         assert_refused(msgpack.packb(wrong))
         assert_refused(msgpack.packb(wrong), server=True)
 
@@ -234,7 +234,7 @@ def test_a_server_is_not_hurt_by_nesting_in_any_field() -> None:
 
 
 def test_a_list_cannot_claim_memory_that_its_bytes_do_not_fill() -> None:
-    # A thousand lists in each other, each said to be as long as the message: 65 MB before the first is filled.
+    # A thousand nested lists, each claiming the length of the message, would take 65 MB before the first is filled.
     for data, server in ((claims(CLIENT_MESSAGE_MAX), False), (claims(MESSAGE_MAX), True)):
         with pytest.raises(ProtocolError, match="not MessagePack"):
             (decode_from_server if server else decode_from_client)(data)
@@ -282,13 +282,13 @@ JOINED = [
     join_snapshot((9, 12, b"\x01\x02", 8, b"\x00", b"", b""), 2, msgpack.packb(PART) * 2),
     join_snapshot((TICK_MAX, -1, bytes(4), -1, bytes(256), b"", b""), 0, b""),
 ]
-"""What the short way is for."""
+"""Encoded messages that the fast decoder handles."""
 valid = st.sampled_from([encode(message) for message in FROM_CLIENT + FROM_SERVER] + JOINED * 4)
 
 
 @st.composite
 def mutated(draw: st.DrawFn) -> bytes:
-    """A valid message, cut off, with bits flipped, with bytes put in or taken out."""
+    """Returns a valid message that is cut off, or has flipped, inserted or deleted bytes."""
     data = bytearray(draw(valid))
     for _ in range(draw(st.integers(1, 4))):
         at = draw(st.integers(0, max(len(data) - 1, 0)))
@@ -312,12 +312,12 @@ def test_any_bytes_are_a_message_or_a_protocol_error(data: bytes) -> None:
     for decode in (decode_from_client, decode_from_server):
         with contextlib.suppress(ProtocolError):
             message = decode(data)
-            # What was let through is within all bounds: it can be said again, and is understood the same.
+            # A decoded message is within all bounds: it can be encoded again, and is decoded to the same.
             assert decode(encode(message)) == message
 
 
 def outcome(decode: Callable[[], Message]) -> Message | str:
-    """What comes of it: a message, or the text of the error."""
+    """Returns the decoded message, or the text of the error."""
     try:
         return decode()
     except ProtocolError as error:

@@ -1,4 +1,5 @@
-"""The world against the oracle in exact rationals, over random worlds (see `tests.twins`); a failure names its seed."""
+"""The world compared with the oracle in exact rationals, over random worlds (`tests.twins`); a failure names its
+seed."""
 
 import pytest
 
@@ -6,7 +7,7 @@ from tests.lengths import long
 from tests.twins import Twins
 
 BLOCKS = 10
-"""The seeds are dealt into so many tests, so that a failure and the time it takes are easy to find."""
+"""Number of tests that share the seeds, so that a failure and the time it takes are easy to find."""
 
 
 @pytest.mark.parametrize("block", [0, *long(1, 2)])

@@ -1,4 +1,4 @@
-"""Editing the world and finding places: refused as a whole, or one explicit push to the nearest free place."""
+"""Edits of the world and free places: an edit is refused as a whole, or pushes entities to the nearest free place."""
 
 import pytest
 
@@ -40,7 +40,7 @@ def test_touching_is_not_overlapping(compiled: bool) -> None:
 
 
 def test_a_non_solid_entity_is_in_nobodys_way(compiled: bool) -> None:
-    """A block is placed into it all the same; it is inside then, and free to leave."""
+    """A block is placed into it all the same. The entity is inside then, and free to leave."""
     world = build([floor()], compiled=compiled)
     ghost = world.spawn("ghost", (0, 0, 0))
     world.set_block(0, 0, 0, 1)
@@ -71,7 +71,7 @@ def test_pushed_to_the_nearest_free_place(
 
 
 def test_at_equal_distance_up_comes_first_then_west_east_south_north_down(compiled: bool) -> None:
-    """A cube inside a block of its size, in a shaft that is opened side by side."""
+    """A cube is inside a block of its size, in a shaft whose sides are opened one by one."""
     world = build([[-4, -4, -4, 5, 5, 5, 1]], compiled=compiled, gravity=0)
     sides = [(0, 0, -1), (0, 1, 0), (0, -1, 0), (1, 0, 0), (-1, 0, 0), (0, 0, 1)]
     with pytest.raises(OverlapError, match="nor within a block of it"):
@@ -84,7 +84,7 @@ def test_at_equal_distance_up_comes_first_then_west_east_south_north_down(compil
 
 
 def test_pushed_out_of_entities_and_past_them(compiled: bool) -> None:
-    """The nearest free place may lie against an entity, between block faces; never further than a block."""
+    """The nearest free place may touch an entity, between block faces. It is never further away than a block."""
     world = build([floor()], compiled=compiled)
     crate = world.spawn("cube", (0.25, 0, 0))
     pushed = world.spawn("box", (1, 0.1, 0), push=True)
@@ -104,7 +104,7 @@ def test_a_push_goes_no_further_than_a_block(compiled: bool) -> None:
 
 
 def test_a_block_that_pushes(compiled: bool) -> None:
-    """Asked for, a block placed into entities moves each to its nearest free place, the lower id first."""
+    """If asked to, a block placed into entities moves each to its nearest free place, the lower id first."""
     world = build([floor()], compiled=compiled)
     first, second, rider = (world.spawn("box", at) for at in ((0.75, 0, 0), (-0.5, 0.25, 0), (0.75, 0, 7 / 4)))
     settle(world)
@@ -193,7 +193,7 @@ def test_many_at_once_are_as_one_by_one(compiled: bool) -> None:
     ("spots", "error"),
     [
         ([(0, 0, 0), (3, 0, 0), (0.5, 0, 0)], r"positions\[2\] = .*no room for a 'cube'"),  # in the first one
-        ([(0, 0, 0), (6, 0, 0)], r"positions\[1\] = .*no room"),  # in one that was there
+        ([(0, 0, 0), (6, 0, 0)], r"positions\[1\] = .*no room"),  # in one that existed
         ([(0, 0, 0), (0, 0, -0.5)], r"positions\[1\] = .*no room"),  # in a block
         ([(0, 0, 0), (0, float("nan"), 3)], "positions"),
         ([(0, 0, 0), (0, 0, 1e300)], "positions"),

@@ -1,8 +1,8 @@
-"""What is true of every world, however it is made (Hypothesis; the examples are the same in every run).
+"""Properties of every world, however it was made (Hypothesis; the examples are the same in every run).
 
-Symmetry: mirroring x or y is exact, because halves are rounded away from zero. A quarter turn is not, because x
-moves before y: at a corner the two worlds may take the two different ways around it (H5, H16). It is exact wherever
-no tick moves an entity along both axes, which is what is shown here.
+Mirroring x or y is an exact symmetry, because halves are rounded away from zero. A quarter turn is not, because x moves
+before y: at a corner the two worlds may take the two different ways around it (H5, H16). It is exact wherever no tick
+moves an entity along both axes; the test covers that case.
 """
 
 from typing import NamedTuple
@@ -22,7 +22,7 @@ SIDE = 5
 TICKS = 40
 RATES = (20, 30, 32, 60, 64, 128)
 
-# Centred boxes, so that a mirrored or turned one is the same box; a tall one, a wide one, one that none meets.
+# Centred boxes, so that a mirrored or turned one is the same box: a tall one, a wide one, and one that stops nothing.
 KINDS = (
     Template("person", (-0.3, -0.3, 0), (0.6, 0.6, 1.8), walk_speed=3, jump_speed=8),
     Template("crate", (-0.5, -0.5, 0), (1, 1, 1)),
@@ -31,7 +31,7 @@ KINDS = (
 
 
 class Actor(NamedTuple):
-    """An entity and its wishes: positions in sixteenths of a block, velocities in blocks/s."""
+    """An entity and its inputs: positions in sixteenths of a block, velocities in blocks/s."""
 
     kind: int
     at: tuple[int, int, int]
@@ -40,7 +40,7 @@ class Actor(NamedTuple):
 
 
 class Play(NamedTuple):
-    """A world in small: solid blocks within +-5 of a middle, and who is there."""
+    """A small world: solid blocks within +-5 of a middle, and its entities."""
 
     blocks: list[tuple[int, int, int]]
     actors: list[Actor]
@@ -79,7 +79,7 @@ Middle = tuple[int, int, int]
 
 
 def stage(play: Play, compiled: bool, middle: Middle = (0, 0, 0), **changes: object) -> World:
-    """A closed room around a middle with the blocks of a play, and everybody in it who finds room."""
+    """Returns a closed room around a middle with the blocks of a play, and every entity of it that fits in."""
     x, y, z = middle
     fill = [
         [x - 13, y - 13, z - SIDE - 1, x + 13, y + 13, z + 13, 1],
@@ -104,7 +104,7 @@ def spawn(world: World, actor: Actor, middle: Middle = (0, 0, 0)) -> int | None:
 
 
 def wishes(world: World, play: Play, tick: int) -> dict[int, Input]:
-    """Every tenth tick everybody wishes for something else."""
+    """Returns the inputs of a tick: every tenth tick, every entity gets another one."""
     if tick % 10:
         return {}
     inputs = {}
@@ -116,7 +116,7 @@ def wishes(world: World, play: Play, tick: int) -> dict[int, Input]:
 
 
 def solid_overlaps(world: World) -> set[tuple[object, object]]:
-    """Every pair of an entity and a block or solid entity that overlap."""
+    """Returns each pair of an entity and a block or solid entity that overlap."""
     boxes = {entity: box(world, entity) for entity in world.entities["id"].tolist()}
     solid = {entity: world.scene.templates[world.state(entity)[1]].solid for entity in boxes}
     found: set[tuple[object, object]] = set()
@@ -140,7 +140,7 @@ def test_nobody_ends_inside_of_what_he_was_not_in_before(compiled: bool, play: P
     assert solid_overlaps(world) == set()
     inside: set[tuple[object, object]] = set()
     for tick in range(TICKS):
-        if tick == 20:  # terrain that falls on everybody: what they are in now they may leave, and enter nothing else
+        if tick == 20:  # terrain over everybody: entities may leave what they are in, and enter nothing else
             world.load_segment((0, 0, 0), world.blocks.segment((0, 0, -1)).reshape(-1).copy())
             inside = solid_overlaps(world)
         world.step(wishes(world, play, tick))
@@ -173,7 +173,7 @@ def test_a_mirrored_world_moves_mirrored(compiled: bool, play: Play, east: int, 
 @some
 @given(play=plays, quarter=st.booleans())
 def test_a_world_turned_by_a_quarter_moves_turned(compiled: bool, play: Play, quarter: bool) -> None:
-    """One entity that moves along one axis (and falls): it cuts no corner, so the order of axes cannot show."""
+    """One entity moves along one axis and falls. It cuts no corner, so the order of axes cannot show."""
     actor = play.actors[0]
     axis = int(quarter)
     script = [(m, 0, jump) if axis == 0 else (0, m, jump) for m, _, jump in actor.wishes]
@@ -205,7 +205,7 @@ def test_a_world_turned_by_a_quarter_moves_turned(compiled: bool, play: Play, qu
     shift=st.tuples(*[st.sampled_from([0, 1, -1, 7, 31, 32, -33, 1000, 10**6, -(10**7), (1 << 27) - 50])] * 3),
 )
 def test_translation_by_whole_blocks_changes_nothing(compiled: bool, play: Play, shift: Middle) -> None:
-    """Also across segment borders, and to the far ends of the range."""
+    """This holds across segment borders, too, and at the far ends of the range."""
     worlds = stage(play, compiled), stage(play, compiled, shift)
     x0, y0, z0 = (part * BLOCK for part in shift)
     for tick in range(TICKS):
@@ -219,7 +219,7 @@ def test_translation_by_whole_blocks_changes_nothing(compiled: bool, play: Play,
 @some
 @given(play=plays, data=st.data())
 def test_ids_decide_and_neither_order_of_entry_nor_rows(compiled: bool, play: Play, data: st.DataObject) -> None:
-    """Told in another order, in rows used before by others, blocks in another order: the same hash."""
+    """The hash is the same with inputs in another order, with reused rows, and with blocks entered in another order."""
     world = stage(play, compiled)
     empty = stage(play._replace(actors=[], blocks=[]), compiled)
     for number in range(data.draw(st.integers(0, 9))):
@@ -242,7 +242,7 @@ def test_ids_decide_and_neither_order_of_entry_nor_rows(compiled: bool, play: Pl
 @some
 @given(play=plays, data=st.data())
 def test_sleep_does_not_show(compiled: bool, play: Play, data: st.DataObject) -> None:
-    """A world in which everybody is woken for every tick has the same hash, through edits, removals and teleports."""
+    """A world whose entities are all woken in every tick has the same hash, with edits, removals and placements."""
     world, restless = stage(play, compiled), stage(play, compiled)
     for tick in range(TICKS):
         event = data.draw(st.sampled_from(["", "", "", "edit", "remove", "place"]))
@@ -273,7 +273,8 @@ def test_sleep_does_not_show(compiled: bool, play: Play, data: st.DataObject) ->
 @some
 @given(play=plays)
 def test_nothing_moves_further_than_its_speed(compiled: bool, play: Play) -> None:
-    """Per axis and tick at most the velocity (of z: the faster of the old and the new one), rounded once."""
+    """An entity moves at most by its velocity per axis and tick (for z, the faster of the old and the new one), rounded
+    once."""
     world = stage(play, compiled)
     for tick in range(TICKS):
         before = {state[0]: state for state in states(world)}
@@ -302,7 +303,8 @@ def walk(template: Template, move: int) -> int:
 def test_energy_never_rises_under_the_default_integrator(compiled: bool, play: Play, rate: int) -> None:
     """v^2 / 2 + g z of a ballistic entity, in exact whole numbers, at tick rates whose ticks are not rounded.
 
-    Nothing but blocks stops it here: what lands on a moving entity takes nothing from it, but x and y are as free.
+    Only blocks stop the entity here. Landing on a moving entity would take nothing from that entity, but would leave x
+    and y as free.
     """
     play = play._replace(
         actors=[actor._replace(kind=1) for actor in play.actors], gravity=16.0, integrator="mean", rate=rate
@@ -311,7 +313,7 @@ def test_energy_never_rises_under_the_default_integrator(compiled: bool, play: P
     g = 16 * BLOCK
 
     def energy(state: tuple[int, ...]) -> int:
-        """Twice the energy, in units of (2^-24 block) (2^-24 block) / s^2."""
+        """Returns twice the energy, in units of (2^-24 block) (2^-24 block) / s^2."""
         square = sum((part * (BLOCK // SPEED)) ** 2 for part in state[6:9])
         return square + 2 * g * state[5]
 
@@ -326,7 +328,7 @@ def test_energy_never_rises_under_the_default_integrator(compiled: bool, play: P
 @some
 @given(play=plays, at=st.integers(0, TICKS - 1), data=st.data())
 def test_a_copy_or_restore_at_any_tick_goes_on_alike(compiled: bool, play: Play, at: int, data: st.DataObject) -> None:
-    """Also into a world that has gone another way: other wishes, other entities, other blocks."""
+    """The other world has gone another way before: with other inputs, other entities and other blocks."""
     world = stage(play, compiled)
     other = stage(play._replace(actors=play.actors[::-1]), compiled)
     for tick in range(at):
@@ -349,7 +351,7 @@ def test_a_copy_or_restore_at_any_tick_goes_on_alike(compiled: bool, play: Play,
 @some
 @given(play=plays)
 def test_flags_say_what_they_mean(compiled: bool, play: Play) -> None:
-    """A sleeper has no velocity and no flag, and is supported where there is gravity: another turn changes nothing."""
+    """A sleeper has no velocity and no flag, and is supported if there is gravity. A further turn changes nothing."""
     world = stage(play, compiled)
     for tick in range(TICKS):
         world.step(wishes(world, play, tick))

@@ -1,4 +1,4 @@
-"""docs/protocol.md against the code: each example byte by byte, and each table."""
+"""docs/protocol.md compared with the code: each example byte by byte, and each table."""
 
 import inspect
 import json
@@ -24,13 +24,13 @@ DECODE = {"client": decode_from_client, "server": decode_from_server}
 
 
 def blocks(kind: str) -> list[tuple[str, str]]:
-    """The fenced blocks of a kind: what follows its name, and the text inside."""
+    """Returns the fenced blocks of a kind: the text after its name, and the text inside."""
     found: list[tuple[str, str]] = re.findall(rf"^```{kind} ?(\w*)\n(.*?)^```$", PAGE, re.MULTILINE | re.DOTALL)
     return found
 
 
 def lines(text: str) -> list[tuple[bytes, str]]:
-    """Bytes and note of each line; bytes without a note belong to the line before."""
+    """Yields bytes and note of each line. Bytes without a note belong to the line before."""
     found: list[tuple[bytes, str]] = []
     for line in text.splitlines():
         digits, _, note = line.partition("   ")
@@ -43,7 +43,7 @@ def lines(text: str) -> list[tuple[bytes, str]]:
 
 
 def table(*heads: str) -> list[list[str]]:
-    """The cells of every row of the one table that begins so."""
+    """Yields the cells of each row of the one table that begins with these headings."""
     pattern = re.escape("| " + " | ".join(heads)) + r".*\n\|[-|]+\n((?:\|.*\n)+)"
     (found,) = re.findall(pattern, PAGE)
     return [[cell.strip() for cell in re.split(r"(?<!\\)\|", row.strip("|"))] for row in found.splitlines()]
@@ -54,7 +54,7 @@ def message(text: str, side: str) -> Message:
 
 
 def again(decoded: Message) -> bytes:
-    """As the peer sends it."""
+    """Returns a message encoded as its sender does."""
     if isinstance(decoded, Snapshot):
         return join_snapshot(decoded[:7], len(decoded.segments), b"".join(map(msgpack.packb, decoded.segments)))
     return encode(decoded)

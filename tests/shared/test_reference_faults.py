@@ -1,4 +1,4 @@
-"""The faults of the reference engine, open (1 to 13) and fixed, as far as they are physics: none of them is here."""
+"""Faults of the reference engine's physics, open (1 to 13) and fixed. The product has none of them."""
 
 import random
 
@@ -45,7 +45,8 @@ def test_2_no_ghost_walls_at_seams(compiled: bool) -> None:
 
 @pytest.mark.parametrize("spot", [(1, 0, 0), (-5 / 8, 0, 0), (0, 1, 0), (0, -5 / 8, 0), (1, 1, 0), (-5 / 8, -5 / 8, 0)])
 def test_3_edges_and_corners_do_not_support(compiled: bool, spot: tuple[float, float, float]) -> None:
-    """Neither those of a block (0 to 1) nor those of an entity as wide; one grid step further in, both do."""
+    """The edges of a block (0 to 1) do not support, nor those of an equally wide entity; one grid step further in, both
+    do."""
     x, y, z = spot
     inward = [(STEP if part < 0 else -STEP) if part else 0 for part in (x, y)]
     world = build([[0, 0, -1, 1, 1, 0, 1], [5, 5, -1, 6, 6, 0, 1]], compiled=compiled)
@@ -62,7 +63,7 @@ def test_3_edges_and_corners_do_not_support(compiled: bool, spot: tuple[float, f
 
 
 def test_4_an_embedded_entity_is_not_thrown(compiled: bool) -> None:
-    """It may leave at its own speed, and no block that it was in stops it before the next one does."""
+    """The entity may leave at its own speed. The block that it was in does not stop it; the next one does."""
     world = build([[-8, -8, -8, 8, 8, 8, 1]], compiled=compiled)
     entity = world.spawn("box", (12, 0, 0))
     state = list(world.state(entity))
@@ -93,7 +94,7 @@ def test_5_fractional_boxes_slide_on_walls_at_segment_borders(compiled: bool, fa
 
 
 def test_6_a_long_tick_does_not_tunnel(compiled: bool) -> None:
-    """A tick of 0.2 s at the terminal speed is 3.2 blocks, and there is no wall time that could make it more."""
+    """A tick of 0.2 s at the terminal speed is 3.2 blocks. Ticks cannot get longer, because the step reads no clock."""
     world = build([floor()], compiled=compiled, tick_rate=5, gravity=18)
     entity = world.spawn("box", (0, 0, 20))
     settle(world)
@@ -111,7 +112,7 @@ def test_7_jump_and_move_in_one_tick(compiled: bool) -> None:
 
 @pytest.mark.parametrize("border", [0, 32, -32])
 def test_8_a_block_removed_under_a_sleeper_of_the_next_segment(compiled: bool, border: int) -> None:
-    """The position lies in one segment; all that holds the box, and then goes, in the other."""
+    """The position lies in one segment. The block that holds the box, and is removed, lies in the other."""
     world = build([[border - 1, 0, -1, border, 1, 0, 1]], compiled=compiled, **around(border, 0, 0))
     entity = world.spawn("person", (border + 0.1, 0.5, 0))
     settle(world)
@@ -164,7 +165,7 @@ def test_11_what_is_not_loaded_is_solid(compiled: bool) -> None:
 
 
 def test_12_a_row_used_again_has_no_past(compiled: bool) -> None:
-    """Somebody who takes the place of one who was jumping does exactly as the first in a new world."""
+    """An entity in the row of one that was jumping behaves exactly like the first entity of a new world."""
     world = build([floor()], compiled=compiled)
     first = world.spawn("box", (0, 0, 0))
     steps(world, 10, {first: RUN_AND_JUMP})
@@ -184,7 +185,7 @@ def test_13_a_move_that_is_no_number(bad: float) -> None:
             make_input(x, y)
 
 
-# -- the faults it has fixed -------------------------------------------------------------------------------------
+# -- faults that are fixed -------------------------------------------------------------------------------------------
 
 
 def test_the_terminal_velocity_points_down(compiled: bool) -> None:

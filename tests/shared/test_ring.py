@@ -1,4 +1,4 @@
-"""A ring forgets by tick, and by nothing else."""
+"""A ring forgets values by tick only."""
 
 from hypothesis import given
 from hypothesis import strategies as st

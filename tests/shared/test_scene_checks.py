@@ -138,7 +138,7 @@ def test_rounding_is_away_from_zero_at_halves() -> None:
     ("x", "y"), [(127, 127), (-127, 127), (1000, 1), (127, 1), (89, 91), (10**9, -(10**9)), (0, 200)]
 )
 def test_a_wish_is_shortened_to_a_length_of_127(x: int, y: int) -> None:
-    """Never longer, and by less than one in each part; the same in all four quadrants."""
+    """The result is never longer, and shorter by less than one in each part; it is symmetric in all four quadrants."""
     short = clamp(Input(x, y, 5))
     assert short.buttons == 5
     assert short.move_x**2 + short.move_y**2 <= MOVE_MAX**2

@@ -1,4 +1,4 @@
-"""One segment's part: lossless for any legal state, and refused for anything that could harm a world."""
+"""A segment's part in a snapshot: lossless for any legal state, and refused if it could harm a world."""
 
 import hashlib
 import random
@@ -36,7 +36,7 @@ FAR = (1 << 23) - 1
 SPEED_EXTREME = 1 << 30
 State = tuple[int, ...]
 HEADS = b"\x01\0\0\0" + bytes([TOLD | STOP_Y])
-"""One entity that was told another wish and stopped: 7 bytes of tails."""
+"""Part of an entity that got another input and stopped: 7 bytes of tails."""
 
 
 def sent(
@@ -46,7 +46,7 @@ def sent(
     gone: list[int] | None = None,
     edits: list[tuple[int, int]] | None = None,
 ) -> tuple[DecodedDelta, list[State]]:
-    """What a peer makes of a part."""
+    """Returns a part as a peer decodes it."""
     rows = np.array(states, np.int64).reshape(-1, CELL)
     part = msgpack.unpackb(encode_part(segment, ago, rows, gone or [], edits or [], check=9))
     parts, decoded, _ = decode_parts([part], 255)
@@ -63,7 +63,7 @@ def state_in(segment: Cell, inside: int, velocity: int, move: int, entity: int =
 
 
 def part_of(**fields: Any) -> list[Any]:
-    """A legal part, with some fields changed."""
+    """Returns a legal part with some fields changed."""
     row = encode_rows(np.array([state_in((0, 0, 0), 5, 6, 7)], np.int64))
     values: dict[str, Any] = {"x": 0, "y": 0, "z": 0, "ago": 1, "heads": HEADS, "tails": bytes(7), "rows": row}
     values |= {"gone": b"\x01\0\0\0", "check": 0, "edits": b"\0\0\x01", "attributes": [1, {"name": "Ann"}]}
@@ -71,7 +71,7 @@ def part_of(**fields: Any) -> list[Any]:
 
 
 def row_with(column: int, value: int) -> bytes:
-    """A packed row in which one field has a value that no state has."""
+    """Returns a packed row in which one field has a value that no state has."""
     packed = np.frombuffer(part_of()[6], ROW).copy()
     packed[FIELDS[column]] = value
     return packed.tobytes()
@@ -272,7 +272,7 @@ def test_a_segment_is_packed_and_unpacked_without_loss(seed: int) -> None:
         b"", b"\0" * 40, b"not zlib at all",
         zlib.compress(bytes(BLOCKS - 1)), zlib.compress(bytes(BLOCKS + 1)), zlib.compress(b""),
         zlib.compress(bytes(BLOCKS))[:-1], zlib.compress(bytes(BLOCKS)) + b"\0",
-        zlib.compress(bytes(16 << 20)),  # 16 KB that would be 16 MB
+        zlib.compress(bytes(16 << 20)),  # 16 KB that would unpack to 16 MB
         zlib.compress(zlib.compress(bytes(BLOCKS))),
         bytes(PACKED_MAX + 1),
     ],

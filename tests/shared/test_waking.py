@@ -1,4 +1,4 @@
-"""Who sleeps costs nothing, and whatever takes its support away wakes it: each event, and nobody else."""
+"""A sleeping entity costs nothing. Any event that takes its support away wakes it, and wakes no other entity."""
 
 import random
 
@@ -15,7 +15,7 @@ SUPPORT = ("removed", "teleported", "shrunk", "made a ghost", "written elsewhere
 
 
 def take_away(world: World, below: int, how: str) -> None:
-    """Ends the support that an entity gives to what stands on it."""
+    """Ends the support that an entity gives to the entities on top of it."""
     if how == "removed":
         world.remove(below)
     elif how == "teleported":
@@ -94,7 +94,7 @@ def test_a_block_placed_or_replaced_wakes_nobody(compiled: bool) -> None:
 
 
 def test_a_segment_that_comes_wakes_what_hung_over_it(compiled: bool) -> None:
-    """The position is in one segment, and all that holds the box is another that is not loaded yet."""
+    """The position is in one segment. The blocks that hold the box are in another one, which is not loaded yet."""
     world = World(scene([floor(half=40)]), compiled=compiled)
     world.load_terrain([(0, 0, -1), (0, 0, 0), (-1, 0, 0)])
     beside = world.spawn("person", (0.2, 8, 0))
@@ -118,7 +118,7 @@ def test_a_segment_replaced_wakes_what_stood_on_it(compiled: bool) -> None:
 
 
 def test_a_segment_unloaded_below_the_floor_wakes_what_stood_in_it(compiled: bool) -> None:
-    """Below the scene's lowest z, what is not loaded is void."""
+    """Below the scene's lowest z, a segment that is not loaded is void."""
     world = build(compiled=compiled, origin=(0, 0, 0), size=(1, 1, 1))
     world.load_segment((0, 0, -1), np.ones(32**3, np.uint8))
     entity = world.spawn("box", (8, 8, 0))
@@ -130,7 +130,7 @@ def test_a_segment_unloaded_below_the_floor_wakes_what_stood_in_it(compiled: boo
 
 @pytest.mark.parametrize("border", [0, 32, -32])
 def test_support_across_a_segment_border(compiled: bool, border: int) -> None:
-    """Rider and supporter have their positions in different segments, and cells."""
+    """Rider and supporter have their positions in different segments, and in different cells."""
     templates = (*TEMPLATES, Template("sign", (-3, 0, 0), (2, 2, 2)))
     world = build([floor(x=border)], compiled=compiled, templates=templates, **around(border, 0, 0))
     sign, rider = world.spawn("sign", (border + 1, 0, 0)), world.spawn("box", (border - 2, 1, 2))
@@ -160,7 +160,7 @@ def test_a_sleeper_has_no_turn_and_is_no_news(compiled: bool) -> None:
 
 
 def test_a_hundred_thousand_sleepers(compiled: bool) -> None:
-    """None has a turn; each is still an obstacle, and is woken alone when its block goes."""
+    """No sleeper has a turn. Each is still an obstacle, and is woken alone when its block is removed."""
     world = World(scene(origin=(0, 0, 0), size=(10, 10, 1), templates=TEMPLATES), compiled=compiled)
     kinds = np.zeros((32, 32, 32), np.uint8)
     kinds[0] = 1
@@ -191,7 +191,7 @@ def test_a_hundred_thousand_sleepers(compiled: bool) -> None:
 
 
 def test_no_gravity_nothing_to_keep_awake(compiled: bool) -> None:
-    """Without gravity a throw raises no flag, so what it flies against puts it to sleep."""
+    """Without gravity a throw raises no flag, so the entity sleeps after it has hit an obstacle."""
     world = build([[-9, -9, 4, 9, 9, 5, 1]], compiled=compiled, gravity=0)
     entity = world.spawn("stone", (0, 0, 0), (0, 0, 9))
     world.set_velocity(entity, (0, 0, 8))

@@ -1,4 +1,4 @@
-"""H31: a world restored from its wire bytes goes on as the world itself."""
+"""H31: a world that is restored from its wire bytes goes on like the original."""
 
 import random
 
@@ -14,7 +14,7 @@ from tests.lengths import long
 
 
 def wired(world: World) -> World:
-    """Another world, made of nothing but the bytes that a snapshot and its terrain have."""
+    """Returns another world, made only from the bytes of a snapshot and its terrain."""
     other = World(world.scene, compiled=world.compiled)
     segments = []
     for segment in world.blocks:

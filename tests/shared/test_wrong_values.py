@@ -1,4 +1,4 @@
-"""A world and a scene are given wrong values: each is refused by name, and nothing has been done."""
+"""Wrong values for a world or a scene: each is refused by name, and nothing has changed."""
 
 import functools
 import itertools
@@ -25,9 +25,9 @@ STATE = (1, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0)
 Act = Callable[[World], Any]
 
 WHOLE: list[Any] = [1.5, NAN, INF, "1", None, True, np.True_, np.float64(1), [1], np.array([1, 2]), 10**5000, b"1"]
-"""None of them is a whole number."""
+"""Values that are not whole numbers."""
 NUMBER: list[Any] = [NAN, INF, -INF, "1", None, True, np.True_, [1.0], np.array([1.0]), 1j, 10**400, np.float32(NAN)]
-"""None of them is a finite number."""
+"""Values that are not finite numbers."""
 THREE: list[Any] = [
     None,
     5,
@@ -40,13 +40,13 @@ THREE: list[Any] = [
     np.array(5),
     iter((1, 2, 3)),
 ]
-"""None of them has three numbers."""
+"""Values that are not three numbers."""
 TEMPLATE: list[Any] = [None, 0, "", "no such", b"box", ["box"], True, np.str_("no such")]
 ENTITY: list[Any] = [1.0, "1", None, True, (1,), np.float64(1), np.True_, [1]]
 
 
 def world_with_two(*, compiled: bool) -> RecordedWorld:
-    """A floor, and two boxes on it, of which the second has been removed."""
+    """Returns a world with a floor and two boxes on it; the second one has been removed."""
     world = RecordedWorld(scene([floor(0)]), compiled=compiled)
     world.load_terrain()
     for x in (0, 4):
@@ -67,7 +67,7 @@ class Calls(Observer):
 
 
 def refused(world: RecordedWorld, act: Act, error: type[Exception], said: str) -> None:
-    """Does what is to be refused; neither the world nor a recording of it has changed then."""
+    """Runs an act that must be refused, and checks that neither the world nor a recording of it has changed."""
     pen = Calls()
     before = (world.state_hash(), world.tick, world.next_id, len(world), dict(world.editing), set(world.placing))
     world.attach(pen)
@@ -79,7 +79,7 @@ def refused(world: RecordedWorld, act: Act, error: type[Exception], said: str) -
 
 
 def field(name: str, act: Callable[[World, Any], Any], wrong: list[Any]) -> list[Any]:
-    """Cases of one argument: the act, and how the error begins."""
+    """Returns the cases of one argument: the act, and the beginning of the error."""
     return [
         pytest.param(lambda world, bad=bad: act(world, bad), name, id=f"{name}-{number}")
         for number, bad in enumerate(wrong)
