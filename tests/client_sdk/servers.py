@@ -1,4 +1,4 @@
-"""Other ends for a client: the real server as a process, and scripted ones that misbehave on demand."""
+"""Servers for tests of clients: the real one as a process, and scripted ones that misbehave."""
 
 import contextlib
 import socket
@@ -20,7 +20,7 @@ ROOT = Path(__file__).resolve().parents[2]
 def real_server(
     *flags: str, program: Sequence[str] = (sys.executable, "-m", "server"), folder: Path = ROOT
 ) -> Iterator[str]:
-    """The URL of a server process, which has to end well."""
+    """Yields the URL of a server process. It must end with exit code 0."""
     command = [*program, "--host", "127.0.0.1", "--port", "0", "--log-level", "warning", *flags]
     with subprocess.Popen(command, cwd=folder, stdout=subprocess.PIPE, text=True) as process:
         try:
@@ -36,13 +36,13 @@ def real_server(
 
 
 class Peer:
-    """A server's side of a WebSocket, without a socket: what `Connection` talks to."""
+    """The server's side of a WebSocket without a socket, for tests of `Connection`."""
 
     def __init__(self) -> None:
         self.protocol = ServerProtocol(max_size=None)
 
     def receive(self, data: bytes) -> list[Event]:
-        """What these bytes say; a request for a WebSocket is granted."""
+        """Takes bytes of the client and returns the events in them. A request for a WebSocket is accepted."""
         if data:
             self.protocol.receive_data(data)
         events = self.protocol.events_received()
@@ -57,7 +57,7 @@ class Peer:
 
 @contextlib.contextmanager
 def scripted_server(script: Callable[[socket.socket], object]) -> Iterator[str]:
-    """The URL of a server that does `script` with its first connection, then closes it."""
+    """Yields the URL of a server that runs `script` with its first connection and then closes it."""
     failed: list[BaseException] = []
 
     def serve() -> None:
@@ -79,7 +79,7 @@ def scripted_server(script: Callable[[socket.socket], object]) -> Iterator[str]:
 
 
 def accept(sock: socket.socket) -> Peer:
-    """The handshake, from a server's side."""
+    """Runs the server's side of the handshake."""
     peer = Peer()
     while not any(isinstance(event, Request) for event in peer.receive(sock.recv(65536))):
         pass
@@ -89,7 +89,7 @@ def accept(sock: socket.socket) -> Peer:
 
 @contextlib.contextmanager
 def silent_server() -> Iterator[str]:
-    """The URL of a server that accepts its first client and says nothing more, while it lasts."""
+    """Yields the URL of a server that accepts its first client and then sends nothing."""
     over = threading.Event()
 
     def script(sock: socket.socket) -> None:
@@ -104,7 +104,7 @@ def silent_server() -> Iterator[str]:
 
 
 def until_closed(sock: socket.socket, peer: Peer) -> list[Frame]:
-    """Everything that the client still sends, with the closing handshake carried out."""
+    """Returns all frames that the client still sends, and carries out the closing handshake."""
     frames: list[Frame] = []
     while data := sock.recv(65536):
         frames += [event for event in peer.receive(data) if isinstance(event, Frame)]

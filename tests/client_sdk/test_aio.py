@@ -34,7 +34,7 @@ def url() -> Iterator[str]:
 
 @pytest.fixture(params=LOOPS)
 def run(request: pytest.FixtureRequest) -> Run:
-    """Runs a coroutine in each kind of loop, for at most 30 s."""
+    """Runs a coroutine for at most 30 s; the test runs once with each kind of event loop."""
 
     def limited(coroutine: Coroutine[Any, Any, None]) -> None:
         factory = pytest.importorskip("uvloop").new_event_loop if request.param == "uvloop" else None

@@ -1,4 +1,4 @@
-"""Policies in a world of their own: no client, no server."""
+"""Policies in a world of their own, without a client and without a server."""
 
 import random
 from collections.abc import Mapping
@@ -86,7 +86,7 @@ def test_a_bot_that_is_not_in_a_world_yet_wishes_nothing() -> None:
 
 
 class Attentive(Wander):
-    """Writes down what it is told of."""
+    """A policy that keeps the attributes that it is given."""
 
     heard: Mapping[int, Mapping[str, Any]] | None = None
 

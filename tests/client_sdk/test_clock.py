@@ -1,4 +1,4 @@
-"""The server's clock, the timeline and the lead, to the number."""
+"""The server's clock, the timeline and the lead, with exact figures."""
 
 import random
 from collections.abc import Callable, Iterator
@@ -29,7 +29,7 @@ SAFETY = 0.03
 
 
 def clock_at(phase: float = 100.0, rtt_s: float = 0.0, spread_s: float = 0.0) -> ServerClock:
-    """A clock that has heard enough."""
+    """Returns a clock that has enough samples to be ready."""
     clock = ServerClock()
     clock.rate = RATE
     for i in range(PINGS):
@@ -39,7 +39,7 @@ def clock_at(phase: float = 100.0, rtt_s: float = 0.0, spread_s: float = 0.0) ->
 
 
 class Loop:
-    """A lead controller and a path, without a network in between: need(i) is the phase that input i needs."""
+    """A lead controller and a link without a network in between: need(i) is the phase that input i needs."""
 
     def __init__(self, need: Callable[[int], float], lead: PricedLead | None = None, delay: int = 0) -> None:
         self.clock = clock_at()
@@ -51,7 +51,7 @@ class Loop:
         self._need, self._delay, self._reported = need, delay, 0
 
     def run(self, inputs: int) -> "Loop":
-        """Lives for so many ticks; what came in one burst is told at once, `delay` ticks later."""
+        """Runs `inputs` ticks. Inputs that arrived in one burst are reported at once, `delay` ticks later."""
         for i in range(len(self.phases), len(self.phases) + inputs):
             self.jumps += self.timeline.steer(self.lead, self.clock, i / RATE)
             self.phases.append(self.timeline.phase)
@@ -64,7 +64,7 @@ class Loop:
         return self
 
     def speeds(self) -> Iterator[float]:
-        """By how much the timeline was off real time, tick by tick."""
+        """Yields the change of the phase in each tick."""
         return (after - before for before, after in pairwise(self.phases))
 
 
@@ -101,7 +101,7 @@ def test_the_phase_is_exact_where_both_ways_take_the_same() -> None:
 
 def test_pings_that_stood_in_a_queue_do_not_count() -> None:
     clock = clock_at(phase=50.0, rtt_s=0.0625)
-    for i in range(8):  # half a second, all of it on one way
+    for i in range(8):  # half a second, all of it in one direction
         clock.answered(10.0 + i, RATE * (10.0 + i + 0.03125) + 50.0, 10.5 + i)
     assert clock.phase == pytest.approx(50.0)
     assert clock.rtt_s == 0.0625
@@ -153,7 +153,7 @@ def test_a_timeline_tells_of_jumps_only() -> None:
     to.phase = JUMP
     assert not timeline.steer(to, clock, 1.0)
     to.phase = 2.5 * JUMP
-    assert timeline.steer(to, clock, 0.5)  # a clock that goes back is no time at all
+    assert timeline.steer(to, clock, 0.5)  # a clock that goes back counts as a clock that stands
     assert timeline.phase == 2.5 * JUMP
 
 
@@ -164,7 +164,7 @@ def test_it_starts_on_the_safe_side() -> None:
     lead = PricedLead()
     assert lead.start(clock_at(phase=100.0, rtt_s=0.25), 9.0) == 100 + 0.125 * RATE + 2
     assert lead.start(clock_at(phase=100.0, rtt_s=0.25, spread_s=0.5), 9.0) == 100 + 0.625 * RATE + 2
-    # A program that was busy while it joined is not ahead of all that it can predict, for it would send nothing then.
+    # A program that was busy while it joined must not be ahead of all that it can predict, or it would send nothing.
     assert lead.start(clock_at(phase=100.0, rtt_s=0.25, spread_s=5.0), 9.0) == 100 + 0.625 * RATE + 2
 
 
@@ -180,7 +180,7 @@ def test_it_holds_still_until_it_has_seen_enough() -> None:
 
 
 def test_its_own_corrections_cancel_however_late_it_hears_of_them() -> None:
-    """The way is gone once, at full speed: no overshoot and no ringing behind a round trip of two seconds."""
+    """The distance is covered once, at full speed: no overshoot and no ringing with a round trip of two seconds."""
     for delay in (0, 8, 64):
         loop = Loop(lambda i: 101.0 if i < 1000 else 105.0, delay=delay).run(2000)
         rise = loop.phases[1000:]
@@ -195,7 +195,7 @@ def test_one_stall_is_ignored_however_long_its_burst() -> None:
 
 
 def test_stalls_that_come_often_are_covered() -> None:
-    """Five inputs late in a hundred: 1 % late by 5, 1 % by 4, ...; to cover 1 % is worth two ticks."""
+    """Five of a hundred inputs are late: 1 % by 5 ticks, 1 % by 4, and on. Covering 1 % is worth two ticks."""
     loop = Loop(lambda i: 101.0 + max(0, 5 - i % 100)).run(8000)
     assert loop.phases[-1] == pytest.approx(106 + SAFETY, abs=0.01)
     assert max(loop.late) < 600
@@ -203,14 +203,16 @@ def test_stalls_that_come_often_are_covered() -> None:
 
 @pytest.mark.parametrize(("every", "top"), [(150, 108), (300, 101)])
 def test_stalls_are_covered_where_they_come_often_enough_to_be_worth_it(every: int, top: int) -> None:
-    """A stall of 7 inputs needs 7 ticks, and 200 ticks are what no input coming late is worth: so one in 200 inputs."""
+    """A stall of 7 inputs needs 7 ticks. No late input at all is worth 200 ticks, so the limit is one stall in 200
+    inputs."""
     loop = Loop(lambda i: 101.0 + max(0, 7 - i % every)).run(16_000)
     assert loop.phases[-1] == pytest.approx(top + SAFETY, abs=0.02)
     assert {i % every for i in loop.late if i >= 4000} == (set() if top > 101 else set(range(7)))
 
 
 def test_a_spike_is_followed_and_left_behind_at_once() -> None:
-    """A second in which all needs are 3 ticks higher: up within half a second, down again as fast, nothing learnt."""
+    """In one second all needs are 3 ticks higher: the lead is up within half a second, down again as fast, and nothing
+    is learnt."""
     loop = Loop(lambda i: 101.0 + 3 * (4000 <= i < 4032)).run(6000)
     assert 4000 <= min(loop.late) <= max(loop.late) <= 4012
     assert max(loop.phases[4000:4032]) == pytest.approx(104 + SAFETY, abs=0.02)
@@ -239,7 +241,7 @@ def test_it_rises_at_once_and_falls_slowly() -> None:
 
 
 def test_what_is_learnt_while_nothing_was_steered_is_covered_and_no_more() -> None:
-    """A frame that took ten seconds, in which every eighth input was stalled."""
+    """A frame took ten seconds, and every eighth input in it was stalled."""
     loop = Loop(lambda i: 101.0).run(1000)
     phase = loop.timeline.phase
     for i in range(1000, 1320):
@@ -256,7 +258,7 @@ def test_beyond_ten_ticks_it_jumps_both_ways() -> None:
 
 
 def test_no_stall_makes_it_jump() -> None:
-    """Not even one that is the first thing it sees."""
+    """This holds even for a stall in the very first inputs."""
     loop = Loop(lambda i: 101.0 + max(0, 7 - (i - 20)) * (i >= 20) + 8 * (i == 20)).run(3000)
     assert loop.jumps == 0
 
@@ -296,7 +298,7 @@ def test_a_change_of_the_path_for_good_is_the_path_after_a_while() -> None:
 
 
 def test_a_long_way_at_a_high_rate_is_learnt_like_any() -> None:
-    """Two seconds of round trip at 240 ticks a second: a stall may take 1,020 inputs."""
+    """The round trip is two seconds at 240 ticks a second, so a stall may take 1,020 inputs."""
     clock = ServerClock()
     clock.rate = 240.0
     for i in range(PINGS):
@@ -312,7 +314,7 @@ def test_a_long_way_at_a_high_rate_is_learnt_like_any() -> None:
 
 @pytest.mark.parametrize("slope", [0.0, 1e-3, -1e-3, 0.05])
 def test_the_base_is_that_of_its_definition_after_every_input(slope: float) -> None:
-    """Whatever is kept of the inputs before: among falling, rising and equal needs, and when a stall gets longer."""
+    """The earlier inputs do not matter: needs fall, rise or stay equal, and stalls get longer."""
     rng = random.Random(5)
     lead, clock = PricedLead(), clock_at(rtt_s=0.1)
     lead.start(clock, 0.0)

@@ -1,4 +1,4 @@
-"""A client never waits for a compiler: it plays with the plain kernel until the chosen one is there."""
+"""A client never waits for a compiler: it plays with the plain kernel until the chosen one is ready."""
 
 import subprocess
 
@@ -15,7 +15,7 @@ pytestmark = pytest.mark.skipif(not kernels.available(), reason="there is no com
 
 
 class Slow:
-    """Kernels of which Numba's is chosen, and there as soon as it has been `compiled`."""
+    """Kernels of which Numba's is chosen. It is ready once it has been `compiled`."""
 
     def __init__(self, patch: pytest.MonkeyPatch) -> None:
         self.compiled = False
@@ -26,7 +26,7 @@ class Slow:
         patch.setattr(kernels, "get", self.get)
 
     def get(self, compiled: bool | None = None) -> Kernel:
-        """The functions of a kernel that is there, as those of Numba."""
+        """Returns the functions of a ready kernel as those of Numba."""
         self.waited += compiled is not False and not self.compiled
         kernel = self._get(compiled)
         return Kernel(**(vars(kernel) | {"form": NUMBA if kernel.compiled else PLAIN}))
@@ -40,7 +40,7 @@ def slow(monkeypatch: pytest.MonkeyPatch) -> Slow:
 @pytest.mark.parametrize("away", [False, True], ids=["playing", "on the way back"])
 def test_a_client_joins_and_plays_uncompiled_and_then_goes_on_compiled(slow: Slow, away: bool) -> None:
     match = Match(load_scene("flat"), seed=3)
-    waited = slow.waited  # the server's world may
+    waited = slow.waited  # the server's world may be compiled
     core = Core("Ann", patience_s=10.0)
     player = match.join(wander, Link(0.05), core)
     match.run(5)

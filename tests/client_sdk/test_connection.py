@@ -1,4 +1,4 @@
-"""A core behind a WebSocket, against websockets' own server side; no socket anywhere."""
+"""A core behind a WebSocket, against websockets' own server side, without a socket."""
 
 import pytest
 from websockets.frames import Close, CloseCode, Frame, Opcode

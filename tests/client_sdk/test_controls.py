@@ -1,4 +1,4 @@
-"""A press counts in one input, however short it is; a button that is held counts as long as it is held."""
+"""A short press counts in exactly one input; a held button counts while it is held."""
 
 import random
 
@@ -29,7 +29,7 @@ def test_what_is_held_counts_until_it_is_released() -> None:
     assert [controls.take() for _ in range(3)] == [JUMP] * 3
     controls.set(JUMP)
     controls.set(NEUTRAL)
-    assert controls.take() == NEUTRAL, "it was down in the tick before, and is not any more"
+    assert controls.take() == NEUTRAL, "it was down in the tick before, and is up now"
 
 
 def test_a_release_and_a_press_between_two_ticks_are_a_press() -> None:

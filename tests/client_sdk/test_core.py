@@ -1,4 +1,4 @@
-"""A core in the hands of a server that lies, and of a program that misuses it, by a clock of the tests."""
+"""A core with a server that sends wrong times and a program that misuses it, by a simulated clock."""
 
 import math
 from typing import Any
@@ -28,7 +28,7 @@ WORLD.spawn("box", (16, 16, 1))
 
 
 def snapshot(tick: int, ago: int = 1) -> bytes:
-    """The world as it is, all of it or as if nothing had happened."""
+    """Returns a snapshot of the world: complete if `ago` is negative, otherwise without any change."""
     rows = WORLD.in_segment(HERE) if ago < 0 else WORLD.in_segment(HERE)[:0]
     part = msgpack.unpackb(encode_part(HERE, ago, rows))
     return encode(Snapshot(tick, -1, b"", 0, b"", b"", b"", (part,)))
@@ -40,7 +40,7 @@ def terrain(segment: tuple[int, int, int] = HERE, **changes: Any) -> bytes:
 
 
 class Served:
-    """A core that has been welcomed at tick 10, by a server that says of its time what the test wants."""
+    """A core that was welcomed at tick 10, with a server whose time is off by `off` ticks."""
 
     def __init__(self, off: float = 0.0, tick: int = 10, **options: Any) -> None:
         self.core = Core("Ann", compiled=False, **options)
@@ -58,7 +58,7 @@ class Served:
         return 10 + (self.now - NOW) * SCENE.tick_rate + self.off
 
     def live(self, seconds: float) -> list[messages.Message]:
-        """Lets time pass, then updates; what is sent. Pings are answered at once."""
+        """Lets `seconds` pass and updates. Returns the messages sent. Pings are answered at once."""
         self.now += seconds
         self.core.update(self.now)
         sent = [decode_from_client(message) for message in self.core.outgoing()]
@@ -101,7 +101,7 @@ def test_a_program_that_was_away_for_long_is_not_woken_before_something_comes() 
         due = served.core.next_update(served.now)
         assert due > served.now
         served.live(due - served.now)
-    assert wakes <= 7  # for a ping a second
+    assert wakes <= 7  # one wake-up per second for a ping
 
 
 def test_nothing_is_sent_after_the_end() -> None:

@@ -1,4 +1,5 @@
-"""Where others are drawn, to the bit: times and places here are sums of powers of two, and 100 ms are 4 ticks."""
+"""Places where other entities are drawn, to the bit: times and places are sums of powers of two, and 100 ms are 4
+ticks."""
 
 import numpy as np
 import pytest
@@ -21,13 +22,13 @@ RATE = 40.0
 
 
 def states(**blocks: float) -> Int64s:
-    """Entities a (1), b (2), c (3) at these x."""
+    """Returns states of the entities a (1), b (2) and c (3) at these x."""
     rows = [(ord(name) - 96, 0, 0, int(x * BLOCK), 0, 0, 0, 0, 0, 0, 0, 0) for name, x in sorted(blocks.items())]
     return np.array(rows, np.int64).reshape(-1, 12)
 
 
 def shown(interpolation: Interpolation, tick: float) -> dict[str, float]:
-    """x by name, when the moment shown is `tick`."""
+    """Returns the drawn x by name, with the view tick `tick`."""
     rows, places = interpolation.sample(tick + interpolation.delay_ticks)
     return {chr(96 + row[0]): place[0] for row, place in zip(rows.tolist(), places.tolist(), strict=True)}
 
@@ -67,7 +68,7 @@ def test_a_moment_before_the_oldest_snapshot_shows_the_oldest() -> None:
 
 
 def moving(blocks_per_s: float, **blocks: float) -> Int64s:
-    """As `states`, with a velocity along x."""
+    """Returns states like `states`, with a velocity along x."""
     rows = states(**blocks)
     rows[:, VX] = int(blocks_per_s * SPEED)
     return rows
@@ -113,7 +114,7 @@ def test_snapshots_of_an_empty_world_are_no_trouble() -> None:
     assert [shown(interpolation, tick) for tick in (10.5, 11.5, 13.0)] == [{}, {"a": 1}, {}]
 
 
-# -- what the rules placed -----------------------------------------------------------------------------------
+# -- entities that the rules placed ---------------------------------------------------------------------------
 
 
 def acts(*snapshots: tuple[int, Int64s, str]) -> Interpolation:
@@ -194,12 +195,12 @@ def test_a_long_delay_falls_soon_and_faster_the_longer_it_is() -> None:
 
 def test_a_step_of_the_servers_time_does_not_show_the_past_again() -> None:
     interpolation = fed((100, states(a=0)))
-    interpolation.advance(140.0, 1.0)  # it stood still, and its time seemed to go on
+    interpolation.advance(140.0, 1.0)  # the server stood still, and its time seemed to go on
     shown_before = interpolation.shown(140.0)
     interpolation.shift(-30.0)
     assert interpolation.shown(110.0) == shown_before
     delay_ticks = interpolation.delay_ticks
-    interpolation.shift(30.0)  # ahead: what is shown goes along
+    interpolation.shift(30.0)  # ahead: the view tick goes along
     assert interpolation.delay_ticks == delay_ticks
 
 

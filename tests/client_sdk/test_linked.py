@@ -1,4 +1,4 @@
-"""A core on a link of its own, by a clock of the tests, and once on a real socket."""
+"""A core on a simulated link, by a simulated clock, and once on a real socket."""
 
 import asyncio
 import math
@@ -25,7 +25,7 @@ from tests.lengths import long
 
 FAR = Link(0.125)
 SOON = 2**-20
-"""A moment, exact in binary like the other times here."""
+"""Time in seconds, exact in binary like the other times here."""
 
 
 def linked(link: str | Link | None, now: float = 16.0) -> LinkedPort:
@@ -118,7 +118,7 @@ def test_what_was_on_a_lost_line_is_gone() -> None:
     match.game.lost(player.session, match.now)  # type: ignore[arg-type]
     now = player.local
     core.port.lost(1006, "gone", now)
-    assert core.state == "playing", "it does not know yet"
+    assert core.state == "playing", "the client does not know of the loss yet"
     core.port.update(now + 1)
     assert core.state == "reconnecting"
     core.port.open(now + 1)
@@ -151,8 +151,8 @@ def test_chance_is_the_same_again() -> None:
 
     assert arrivals("wifi") == arrivals("wifi")
     assert max(arrivals("lan")) == 1 / 64
-    assert max(arrivals("wifi")) > 0.04, "its spikes"
-    assert max(arrivals("far")) > 0.25, "what is lost is sent again"
+    assert max(arrivals("wifi")) > 0.04, "spikes"
+    assert max(arrivals("far")) > 0.25, "lost packets are sent again"
 
 
 def test_no_such_link_is_told_with_those_that_there_are() -> None:

@@ -1,4 +1,4 @@
-"""A game within the program, by a clock of the tests."""
+"""A game within the program, by a simulated clock."""
 
 import pytest
 
@@ -19,7 +19,7 @@ FRAMES_PER_S = 64
 
 
 class Program:
-    """A game's loop for some clients; its time is a number."""
+    """A game's loop for some clients, with simulated time."""
 
     def __init__(self, game: Game) -> None:
         self.game = game
@@ -65,7 +65,7 @@ def test_one_plays_alone_without_a_single_correction() -> None:
     assert before is not None
     assert after is not None
     assert 5 < after.position[0] - before.position[0] < 11
-    assert program.game.world.tick == 3 * program.game.scene.tick_rate, "as many as there was time for"
+    assert program.game.world.tick == 3 * program.game.scene.tick_rate, "one input per tick that has passed"
     assert client.stats.corrections == client.stats.inputs_late == 0
 
 
@@ -136,7 +136,7 @@ def test_who_stood_still_comes_back_to_the_same_world() -> None:
     program.now += LEAP_S / 2
     program.run(5)
     assert client.playing
-    assert len(program.told(client, Disconnected)) == 1, "that was made up for"
+    assert len(program.told(client, Disconnected)) == 1, "the wait was made up for"
     assert client.stats.divergences == 0
 
 

@@ -1,4 +1,4 @@
-"""Waiting events are bounded, in order, and counted where they were dropped."""
+"""Pending events are bounded, in order, and counted where they were dropped."""
 
 import random
 
@@ -51,7 +51,7 @@ def test_the_oldest_of_too_many_are_counted_in_their_place() -> None:
     assert queue.take() == [Joined(1, FLAT, 0), EventsDropped(7), answered, *game(8, 9)]
     for event in game(*range(4)):
         queue.append(event)
-    assert queue.take() == [EventsDropped(2), *game(2, 3)], "what was taken does not count any more"
+    assert queue.take() == [EventsDropped(2), *game(2, 3)], "events that were taken do not count any more"
 
 
 def test_what_the_server_dropped_is_added_up_with_what_is_dropped_here() -> None:

@@ -28,7 +28,7 @@ def url() -> Iterator[str]:
 
 
 def play(client: Client, until: Callable[[], bool], seconds: float = 20.0) -> list[Event]:
-    """A game's loop, until something is so."""
+    """Runs a game's loop until a condition holds."""
     events: list[Event] = []
     deadline = time.monotonic() + seconds
     while not until():

@@ -1,4 +1,4 @@
-"""Two worlds of one client, in cases made by hand: what is replayed, what is counted, and what the result is."""
+"""The two worlds of one client, in cases made by hand: what is replayed, what is counted, and the result."""
 
 from collections.abc import Iterable
 from typing import Any
@@ -52,18 +52,18 @@ class Pair:
             self.server.step()
 
     def ahead(self, *wishes: Input) -> None:
-        """The client predicts these."""
+        """Steps the prediction with these inputs."""
         for input_ in wishes:
             self.client.file(self.client.predicted.tick + 1, input_)
             self.client.step()
 
     def act(self, *wishes: Input, others: Input = NEUTRAL) -> None:
-        """The server plays these."""
+        """Steps the server's world with these inputs."""
         for input_ in wishes:
             self.server.step({e: input_ if e == ME else others for e in self.server.entities["id"].tolist()})
 
     def tell(self, since: int = 0, segments: Iterable[Cell] = (HERE, BESIDE), **fields: Any) -> str:
-        """The client applies all that is there, of these segments."""
+        """Applies a snapshot of these segments to the client, with all changes."""
         parts = [
             msgpack.unpackb(encode_part(segment, since, self.server.in_segment(segment), **fields))
             for segment in segments
@@ -76,7 +76,7 @@ class Pair:
         return done
 
     def assert_agreed(self) -> None:
-        """Confirmed is the server's world, to the bit."""
+        """Checks that the confirmed world equals the server's world, to the bit."""
         assert self.client.confirmed.state_hash() == self.server.state_hash()
 
 
@@ -84,7 +84,7 @@ def snapshot(tick: int, parts: list[Any], drops: Iterable[Cell] = ()) -> Snapsho
     return Snapshot(tick, -1, b"", -1, b"", b"", np.array(list(drops), "<i4").tobytes(), tuple(parts))
 
 
-# -- the prediction stands -----------------------------------------------------------------------------------
+# -- a right prediction --------------------------------------------------------------------------------------
 
 
 def test_a_right_prediction_is_left_alone() -> None:
@@ -124,7 +124,7 @@ def test_a_rehearsal_changes_nothing() -> None:
     assert pair.client.predicted.state_hash() == before
 
 
-# -- it does not ---------------------------------------------------------------------------------------------
+# -- a wrong prediction --------------------------------------------------------------------------------------
 
 
 def test_a_wall_that_the_client_lacks_corrects_it_to_the_bit_and_is_counted() -> None:
@@ -140,7 +140,7 @@ def test_a_wall_that_the_client_lacks_corrects_it_to_the_bit_and_is_counted() ->
     assert correction.fields == ("x", "vx")
     assert correction.blocks == 10 * 3 / 64 - 3 / 8
     assert (done.replayed, done.repredicted) == (10, False)
-    # It knows nothing of the wall yet, so it walks on from there; with the edit it does not.
+    # The client does not know the wall yet, so it walks on from there; with the edit it does not.
     assert pair.client.predicted.position(ME)[0] == 17 - 5 / 8 + 10 * 3 / 64
     pair.act(EAST)
     pair.tell(edits=[(1 << 10 | 16 << 5 | 17, 4)], segments=[HERE])
@@ -153,7 +153,7 @@ def test_after_a_correction_the_replay_is_what_the_server_will_compute() -> None
     pair = Pair()
     wishes = [EAST, EAST, NORTH, EAST, NORTH, NORTH]
     pair.ahead(*wishes)
-    pair.act(NORTH)  # an input that came too late
+    pair.act(NORTH)  # an input that arrived too late
     pair.tell()
     done = pair.reconcile(late=True)
     assert done.correction.cause == "late input"
@@ -236,7 +236,7 @@ def test_who_left_for_a_segment_that_is_not_seen_is_gone_and_one_that_came_is_no
     pair.tell(segments=[HERE], gone=[2])
     assert pair.client.confirmed.entities["id"].tolist() == [1, 3]
     pair.act(NEUTRAL)
-    pair.tell(segments=[HERE, BESIDE], gone=[2])  # a word of old: in the segment beside it is there
+    pair.tell(segments=[HERE, BESIDE], gone=[2])  # an outdated part: it is in the segment beside by now
     pair.assert_agreed()
 
 
@@ -273,7 +273,7 @@ def test_a_copy_that_is_not_the_servers_is_noticed() -> None:
     pair = Pair()
     pair.act(EAST)
     assert pair.tell(segments=[HERE], check=checksum(pair.server, HERE)) == ""
-    pair.server.set_block(9, 9, 9, 1)  # and nobody says so
+    pair.server.set_block(9, 9, 9, 1)  # and nothing reports it
     pair.act(EAST)
     assert "(0, 0, 0)" in pair.tell(segments=[HERE], check=checksum(pair.server, HERE))
 

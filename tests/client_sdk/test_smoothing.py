@@ -1,4 +1,4 @@
-"""A correction is hidden for a moment, and only for a moment."""
+"""A correction is hidden for a moment only."""
 
 import pytest
 

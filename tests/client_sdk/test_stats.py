@@ -1,4 +1,4 @@
-"""What a client counts, and what a game shows of it."""
+"""Counters of a client, and their form for display."""
 
 import pytest
 
@@ -83,7 +83,7 @@ def test_marks_are_kept_as_long_as_anything_looks_back() -> None:
     for step in range(60 * 600):
         stats.measure(step / 60)
     assert len(stats._marks) <= 62
-    stats.measure(1e6)  # a program that has slept
+    stats.measure(1e6)  # a program that was suspended
     assert len(stats._marks) <= 2
     assert stats.late_share_lately == 0
 
@@ -99,7 +99,7 @@ def test_one_late_pong_is_not_the_round_trip() -> None:
 
 @pytest.mark.parametrize(("before_s", "after_s"), [(0.0, 0.3), (0.3, 0.0), *long((0.02, 0.5), (0.1, 0.12))])
 def test_the_round_trip_is_that_of_the_last_seconds(before_s: float, after_s: float) -> None:
-    """17 ms, and 17 ms for 15 s after the latency was set to 610: that was the least of the last 15 s."""
+    """The shown round trip follows a new latency within seconds. It is not the least of the clock's last 15 s."""
     match = Match(load_scene("flat"), 1)
     core = Core()
     set_link(core, Link(before_s))
@@ -118,7 +118,7 @@ def test_what_a_player_sees_of_a_bad_moment_is_over_soon_after_it() -> None:
     match.join(wander, Link(0.02), core)
     match.run(20)
     assert dict(core.stats.figures())["late inputs"] == "0.00 %"
-    set_link(core, Link(0.2))  # the inputs on the way come 200 ms later
+    set_link(core, Link(0.2))  # the inputs on the way arrive 200 ms later
     match.run(1)
     assert float(dict(core.stats.figures())["late inputs"].removesuffix(" %")) > 0
     match.run(15)

@@ -1,4 +1,4 @@
-"""A client is given wrong values: each is refused by name, and nothing has been done."""
+"""Wrong values for a client: each is refused by name, and nothing has changed."""
 
 import asyncio
 import math

@@ -1,4 +1,5 @@
-"""A match is a large knot of references in few objects: it is untied after each test, or memory grows by gigabytes."""
+"""Collects garbage after each test: a match has many reference cycles in few objects, and memory would grow by
+gigabytes."""
 
 import gc
 from collections.abc import Iterator

@@ -1,4 +1,4 @@
-"""Players that dig and place next to each other: nothing diverges, and every edit gets its verdict."""
+"""Players that dig and place beside each other: no prediction diverges, and every edit gets its verdict."""
 
 import random
 
@@ -16,7 +16,7 @@ from tests.lengths import long
 
 
 class Building:
-    """A bot as a policy of a match, until it is told to stop."""
+    """A bot as a policy of a match, until it is stopped."""
 
     def __init__(self, seed: int) -> None:
         self._bot = Bot(DigAndPlace(random.Random(seed)))
@@ -29,7 +29,8 @@ class Building:
 
 
 def ordered(player: Player) -> list[int]:
-    """The numbers of the edits that the server has heard of; they are counted where the messages come in."""
+    """Returns the numbers of the edits that arrive at the server. They are counted on the link, as they are
+    delivered."""
     numbers: list[int] = []
     receive = player.up._deliver
 
@@ -72,6 +73,6 @@ def test_builders_do_not_diverge_and_hear_of_every_edit(path: Link, scene: str, 
         assert player.core.stats.divergences == 0
         assert set(player.core.stats.corrections_by_cause) <= {"unknown edit", "other entity", "late input"}
         assert player.core.prediction is not None
-        assert not player.core.prediction._edits, "nothing is left that has not been decided"
+        assert not player.core.prediction._edits, "every edit has its verdict"
     assert verdicts.count("done") > len(verdicts) / 2
     assert set(verdicts) <= {"done", "an entity is in the way", "out of reach", "not possible there"}

@@ -1,4 +1,4 @@
-"""A lost connection, in simulated time: the client comes back by itself and goes on."""
+"""A lost connection, in simulated time: the client reconnects by itself and goes on."""
 
 import itertools
 import math
@@ -49,7 +49,7 @@ def test_who_is_cut_off_goes_on_with_the_same_entity(preset: str, seed: int) -> 
     assert len(told(player, Disconnected)) == len(told(player, Resumed)) == 3
     assert not told(player, Left)
     assert player.core.stats.divergences == 0
-    # What follows is played as before: the world that came back is the server's.
+    # Afterwards the client plays as before: its world is the server's.
     assert all(event.cause != "nondeterminism" for event in player.events if isinstance(event, Corrected))
     prediction = player.core.prediction
     assert prediction

@@ -1,4 +1,4 @@
-"""Game events arrive after the entities that they name, behind `Joined`, in order, and are counted if they are lost."""
+"""Game events arrive after the entities that they name, after `Joined`, in order, and are counted if they are lost."""
 
 import random
 from collections.abc import Iterator
@@ -29,7 +29,7 @@ def playing(match: Match, *players: Player) -> None:
 
 
 class Watched(Core):
-    """Counts the game events that name an entity which the client does not know when they arrive."""
+    """A core that counts the game events, and those that name an entity which it does not know when they arrive."""
 
     def __init__(self, **options: Any) -> None:
         super().__init__("Ann", **options)
@@ -46,11 +46,11 @@ class Watched(Core):
 
 
 class Born(Rules):
-    """Things are born all around, and an event names each of them."""
+    """Rules that spawn things in many places, and send an event that names each of them."""
 
     scene = "flat"
     crowd = 0
-    """The number of others who walk about, so that not all fits into every snapshot."""
+    """Number of other walkers. With enough of them, a snapshot has no room for everything."""
 
     def prepare(self, scene: Scene) -> Scene:
         stands: dict[str, Any] = {"walk_speed": 0, "jump_speed": 0, "solid": False}
@@ -77,7 +77,7 @@ class Born(Rules):
                 game.remove(self.things.pop(0))
 
 
-# -- known, then told ------------------------------------------------------------------------------------------
+# -- first the entity, then its event ------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -104,11 +104,11 @@ def test_an_entity_is_there_when_an_event_tells_of_it_where_not_all_fits_into_a_
         match.run(1 / 32)
         assert player.session is not None
         behind += not player.session.stream.view.complete
-    assert behind > 400, "the line is narrow enough"
+    assert behind > 400, "the link is slow enough to skip snapshots"
     assert core.named > 100
     assert core.unknown == 0
     late = match.game.world.tick - max(event.tick for event in player.events if isinstance(event, Happened))
-    assert late < 5 * 32, "they are held up, and not for long"
+    assert late < 5 * 32, "events wait, but not for long"
 
 
 def test_an_entity_is_there_when_an_event_told_while_one_was_away_speaks_of_it() -> None:
@@ -125,7 +125,7 @@ def test_an_entity_is_there_when_an_event_told_while_one_was_away_speaks_of_it()
     assert len(told) == len(set(told)) > 60
 
 
-# -- Joined, then the rest --------------------------------------------------------------------------------------
+# -- first Joined, then all other events --------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("path", long_but([Link(), PRESETS["lan"], PRESETS["thin"]], [Link(), *PRESETS.values()]))
@@ -162,11 +162,11 @@ def test_back_again_comes_before_what_was_said_meanwhile() -> None:
     assert len(events) > 10
 
 
-# -- none is lost without a word ---------------------------------------------------------------------------------
+# -- no event is lost unnoticed -----------------------------------------------------------------------------
 
 
 class Loud(Rules):
-    """Sends all players ascending numbers, `per_tick` of them in every tick."""
+    """Rules that send all players ascending numbers, `per_tick` of them in every tick."""
 
     scene = "flat"
     per_tick = 20
@@ -187,7 +187,8 @@ class Loud(Rules):
 
 
 def gaps(events: list[Event]) -> Iterator[tuple[int, int]]:
-    """Gives for each two numbers in a row how many are missing between them, and how many are reported as missing."""
+    """Yields, for each two numbers in a row, how many are missing between them and how many were reported as
+    missing."""
     last, counted = -1, 0
     for event in events:
         if isinstance(event, EventsDropped):

@@ -1,4 +1,4 @@
-"""What a player feels under every preset: why there are corrections, what survives a stall, how old snapshots are."""
+"""The effects of every preset that a player notices: causes of corrections, stalls, the age of snapshots."""
 
 import pytest
 
@@ -46,7 +46,7 @@ def test_held_keys_survive_every_stall(preset: str, seconds: float) -> None:
 
 
 def ages(preset: str, seconds: float) -> list[float]:
-    """How old (ms) the newest snapshot is at every tick, for three players who see each other."""
+    """Returns the age of the newest snapshot (ms) at every tick, for three players who see each other."""
     match = Match(load_scene("hills"), 13)
     players = [match.join(wander, PRESETS[preset]) for _ in range(3)]
     settled(match, *players)
@@ -76,7 +76,7 @@ def test_snapshots_are_as_fresh_as_the_link_delivers(
     preset: str, seconds: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     held = sorted(ages(preset, seconds))
-    monkeypatch.setattr(FlowControl, "window", lambda *_: 1 << 40)  # whatever is there is sent at once
+    monkeypatch.setattr(FlowControl, "window", lambda *_: 1 << 40)  # every snapshot is sent in its tick
     sent = sorted(ages(preset, seconds))
     p99 = int(0.99 * len(held))
     assert held[p99] <= sent[p99] + TICK_MS
@@ -114,7 +114,7 @@ def test_a_thin_link_stays_connected_and_sees_fresh_snapshots(seconds: float) ->
 
 @pytest.mark.parametrize("seconds", [8, *long(20)])
 def test_on_a_thin_link_nobody_is_starved(seconds: float) -> None:
-    """Ten players see each other; what waits longest has been told of a second ago at the most."""
+    """Ten players see each other. Even the entity that waits longest was sent within the last second."""
     match = Match(load_scene("hills"), 16)
     players = [match.join(wander, PRESETS["thin"]) for _ in range(10)]
     settled(match, *players)

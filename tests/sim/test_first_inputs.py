@@ -1,4 +1,4 @@
-"""The first inputs of a player: what goes wrong with them has a cause, too."""
+"""The first inputs of a player: every correction that they cause has a cause."""
 
 import random
 from unittest import mock
@@ -20,7 +20,8 @@ def walking(core: Core, rng: random.Random) -> Input:
 
 @pytest.mark.parametrize("seed", range(5))
 def test_first_inputs_that_come_late_are_the_cause_of_what_they_cause(seed: int) -> None:
-    """A key is held while joining, and the line stalls just as the first inputs leave: nothing stands in for them."""
+    """A key is held while joining, and the link stalls when the first inputs leave. The server has no earlier input to
+    repeat."""
     match = Match(load_scene("flat"), seed)
     player = match.join(walking, Link(0.02))
     player.core.set_input(Input(127, 0, 0))

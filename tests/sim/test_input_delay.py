@@ -1,4 +1,4 @@
-"""The input delay may change in the middle of play: the own figure walks on, and never back."""
+"""The input delay may change in the middle of play. The own figure goes on, and is never drawn further back."""
 
 import dataclasses
 from itertools import pairwise, product
@@ -14,7 +14,7 @@ CHANGES = ((3, 0, 2, 1, 3, 0), (1, 2, 3, 2, 1, 0), (3, 3, 0, 0, 3, 1))
 
 
 LINKS = ((32, 0.02), (20, 0.0), (60, 0.1), (128, 0.02))
-"""Tick rates, and the one-way delay with each."""
+"""Tick rates, and the one-way delay of the link for each."""
 
 
 @pytest.mark.parametrize(
@@ -42,7 +42,7 @@ def test_a_figure_that_walks_east_is_never_drawn_further_west(
             drawn.append(me.position[0])
     steps = [after - before for before, after in pairwise(drawn)]
     assert min(steps) >= 0
-    # The figure moves on by at most what the delay has become shorter by, and a frame.
+    # The figure moves by at most the difference of the delays and the time of a frame.
     assert max(steps) <= 3.0 * (3 + 1) / rate + 3.0 / 240
     match.run(1)
     ann.core.view(ann.local)

@@ -1,4 +1,4 @@
-"""The model of a TCP connection against what was measured, and against what TCP promises."""
+"""The model of a TCP connection compared with measurements and with the promises of TCP."""
 
 import heapq
 from collections.abc import Callable
@@ -12,7 +12,7 @@ from tests.lengths import long
 
 
 class Time:
-    """The least scheduler."""
+    """The smallest possible scheduler."""
 
     def __init__(self) -> None:
         self.now = 0.0
@@ -30,7 +30,7 @@ class Time:
 
 
 class Stream:
-    """Messages sent at a steady rate, and when each came."""
+    """Messages that are sent at a steady rate, and the time of arrival of each."""
 
     def __init__(self, path: Link, hz: float, size: int, messages: int, seed: int = 1) -> None:
         time = Time()
@@ -70,7 +70,7 @@ class Stream:
     ],
 )
 def test_head_of_line_stalls_are_as_measured(hz: int, rtt_s: float, loss: float, published: float) -> None:
-    """`reference/numbers.md`: 400-byte messages, the share more than 100 ms late, within a factor of two."""
+    """Measured with 400-byte messages: the share that is more than 100 ms late. The model is within a factor of two."""
     share = Stream(Link(rtt_s / 2, 0.0, loss), hz, 400, 60_000).share_later_than(rtt_s / 2 + 0.1)
     if published:
         assert published / 2 <= share <= published * 2

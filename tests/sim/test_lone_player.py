@@ -1,4 +1,4 @@
-"""A lone player is never corrected: whatever the network does, both sides compute the same."""
+"""A lone player is never corrected, whatever the network does, because both sides compute the same."""
 
 import random
 
@@ -15,7 +15,7 @@ from tests.lengths import long
 
 
 class Tour:
-    """Walks, jumps and presses into walls all over the place; remembers what it has done."""
+    """A policy that walks, jumps and presses into walls all over the scene, and records what it has done."""
 
     def __init__(self) -> None:
         self.cells: set[tuple[int, int]] = set()
@@ -30,7 +30,7 @@ class Tour:
         blocked = (self._input.move_x != 0 and vx == 0) or (self._input.move_y != 0 and vy == 0)
         self.pressed += blocked
         self.jumped += vz > 0
-        if x > 51 * BLOCK and y > 51 * BLOCK:  # the pit into the void is near: whom it swallows, the server puts back
+        if x > 51 * BLOCK and y > 51 * BLOCK:  # the pit into the void is near: go back
             self._input = Input(-90, -90)
         elif rng.random() < (0.1 if blocked else 0.02):
             self._input = Input(rng.randint(-127, 127), rng.randint(-127, 127), rng.choice((0, JUMP)))
@@ -118,7 +118,7 @@ def test_a_wall_that_only_the_server_has_corrects_the_client_to_the_bit() -> Non
     mine = prediction.confirmed.state(player.core.entity)
     assert mine[3] + round(0.3 * BLOCK) == x * BLOCK
     assert match.game.world.state(player.core.entity) == mine
-    # Nothing explains it, so it is an alarm; and it has mended itself: the wall has been sent.
+    # Nothing explains it, so it is an alarm. The client has recovered by itself: the wall has been sent.
     assert corrections[0].cause == "nondeterminism"
     assert stats.divergences > 0
     assert prediction.confirmed.blocks.get(x, 70, 9) == 4  # by the resynchronisation
@@ -149,7 +149,7 @@ def test_edits_are_predicted_and_undone_where_the_server_refuses() -> None:
     answers = {event.number: event for event in player.events if isinstance(event, Answered)}
     assert answers[number].done
     assert answers[far].verdict == "out of reach"
-    # A block where another player stands, which this client does not know yet: refused, and undone.
+    # The block is where another player stands, whom this client does not know yet: refused, and undone.
     match.game.world.spawn("player", (x - 2.5, y + 0.5, 8))
     refused = core.edit(x - 3, y, 8, 4)
     match.run(0.04)

@@ -1,4 +1,5 @@
-"""Entities that the rules place, remove, change or spawn are drawn only where they were, and a shot at them hits."""
+"""Entities that the rules place, remove, change or spawn are drawn only at their true places, and a shot at them
+hits."""
 
 import dataclasses
 import random
@@ -31,11 +32,11 @@ def playing(match: Match, *players: Player) -> None:
 
 
 class Acts(Rules):
-    """The rules place, change, remove and spawn things that stand in the air."""
+    """Rules that place, change, remove and spawn things in the air."""
 
     scene = "flat"
     far = 1.75
-    """The distance by which one of them is placed to and fro, in blocks."""
+    """Distance by which one of them is placed to and fro, in blocks."""
 
     def prepare(self, scene: Scene) -> Scene:
         stands: dict[str, Any] = {"walk_speed": 0, "jump_speed": 0, "solid": False}
@@ -61,10 +62,10 @@ class Acts(Rules):
             game.place(self.both, (70 + 5 * (tick % 3), 78, 8))
 
     def on_command(self, player: Shooter, name: str, data: Any) -> None:
-        """Compares all that was drawn with what lag compensation says."""
+        """Compares everything that was drawn with the result of lag compensation."""
         past, (seen, *targets) = self.game.rewound(player), data
         if past.seen != seen:
-            return  # longer ago than lag compensation reaches
+            return  # it was drawn longer ago than lag compensation reaches
         for entity, size, *place in targets:
             self.shots += 1
             x, y, z = place
@@ -75,7 +76,7 @@ class Acts(Rules):
 
 
 def shoot(match: Match, player: Player) -> None:
-    """Has a player shoot at all that its picture shows."""
+    """Makes a player shoot at everything in its view."""
     view = player.core.view(player.local)
     sizes = {"thing": 0.5, "big": 1.25}
     targets = [(figure.entity, sizes[figure.template], *figure.position) for figure in view.others]
@@ -175,7 +176,7 @@ def test_a_shot_at_what_is_drawn_after_a_pause_of_the_program_hits() -> None:
 
 
 class Seen(Rules):
-    """A thing is placed from a segment that the player sees into one that it sees only afterwards, and back."""
+    """Rules that place a thing in a segment that the player sees only afterwards, and back again."""
 
     scene = "flat"
 
@@ -209,7 +210,7 @@ def test_an_entity_that_is_placed_where_all_is_sent_anew_is_never_drawn_elsewher
 
 
 class Moved(Rules):
-    """The rules place all players to and fro, from time to time twice in a row."""
+    """Rules that place all players to and fro, sometimes in two ticks in a row."""
 
     scene = "flat"
     places: tuple[Vec, Vec] = ((64, 66, 8), (74, 66, 8))
@@ -254,7 +255,7 @@ def test_i_am_never_drawn_between_on_any_line(link: str | Link, delay: int) -> N
 
 
 class Pushed(Moved):
-    """Short ways: what would be smoothed, had it been a correction."""
+    """Rules that place all players over a short distance, which would be smoothed if it were a correction."""
 
     places = ((64, 66, 8), (65.5, 66, 8))
 
@@ -274,7 +275,7 @@ def test_a_short_way_is_no_correction_to_be_smoothed() -> None:
 
 
 class Falls(Rules):
-    """Players fall out of the world again and again, and come back at a spawn."""
+    """Rules that make players fall out of the world again and again. They come back at a spawn point."""
 
     scene = "flat"
 
@@ -297,4 +298,4 @@ def test_an_entity_that_fell_out_is_not_drawn_on_its_way_back(others: bool) -> N
         heights += [figure.position[2] for figure in view.figures if figure.entity == player.core.entity]
     assert not [height for height in heights if -39 < height < 0.5]
     assert max(heights) > 0.5
-    assert min(heights) < -39 or others, "the void is not in every sight"
+    assert min(heights) < -39 or others, "the void is not in every view"

@@ -1,4 +1,4 @@
-"""Slow programs, suspended programs, input delay and crowds: what the player feels, in defined ways."""
+"""Slow programs, suspended programs, input delay and crowds behave in defined ways."""
 
 import random
 
@@ -43,7 +43,7 @@ def test_any_frame_rate_plays(frames_per_s: int, seconds: float) -> None:
     assert stats.resyncs == 0
     assert stats.inputs_sent >= seconds * 32
     assert set(stats.corrections_by_cause) <= {"late input"}
-    # A replay comes with new terrain only.
+    # Only new terrain causes a replay.
     assert stats.repredictions <= sum(isinstance(event, SegmentLoaded) for event in player.events)
 
 
@@ -83,7 +83,7 @@ def test_a_suspended_program_begins_anew_without_a_spiral(seconds: float) -> Non
     assert [type(event) for event in player.events if isinstance(event, Resynchronised)] == [
         Resynchronised
     ] * stats.resyncs
-    # What was missed is not caught up tick by tick.
+    # The missed ticks are not caught up.
     assert stats.replayed_ticks + stats.inputs_sent - steps < 200
     assert ahead(player) < 16
     corrections = stats.corrections
@@ -97,13 +97,13 @@ def test_a_long_sleep_ends_the_connection_with_a_reason() -> None:
     match = Match(load_scene("flat"), 5)
     player = match.join(wander, Link(0.05))
     joined(match, player)
-    match.run(1)  # it is heard of
+    match.run(1)  # the loss of the connection is reported
     player.suspend(20)
     match.run(21)
     left = [event for event in player.events if isinstance(event, Left)]
     assert [event.reason for event in left] == ["no message received for 15 s"]
     assert match.game.sessions == []
-    assert len(match.game.world) == 1, "it may come back for a while"
+    assert len(match.game.world) == 1, "the client may reconnect for a while"
     match.run(match.game.limits.resume_s)
     assert len(match.game.world) == 0
 
@@ -125,7 +125,8 @@ def test_the_input_delay_changes_in_mid_play_without_a_correction() -> None:
 
 @pytest.mark.parametrize("preset", ["typical", *long("far")])
 def test_a_command_tells_what_was_drawn_when_it_was_given(preset: str) -> None:
-    """At 60 frames/s: the picture drawn last, not that of the update in between; never 100 ms beyond what is known."""
+    """At 60 frames/s, a command carries the view tick of the picture drawn last, not that of the update in between. It
+    is never 100 ms beyond what is known."""
     match = Match(load_scene("flat"), 21)
     players = [match.join(wander, PRESETS[preset]) for _ in range(2)]
     joined(match, *players)
@@ -157,7 +158,8 @@ def test_a_command_tells_what_was_drawn_when_it_was_given(preset: str) -> None:
 
 
 class Crowd:
-    """Everyone presses to the middle, jumps, and sometimes goes away: blocking each other, jumping on heads."""
+    """A policy that presses to the middle, jumps, and sometimes goes away, so that players block each other and jump on
+    heads."""
 
     def __init__(self) -> None:
         self._input = Input()

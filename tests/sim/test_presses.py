@@ -1,4 +1,4 @@
-"""Short presses of a key jump, at any frame rate and tick rate, and are not remembered for later."""
+"""A short press of a key makes the player jump, at any frame rate and tick rate, and is not kept for later."""
 
 import dataclasses
 import random
@@ -21,13 +21,13 @@ FLAT = load_scene("flat")
 
 
 class Sent(Core):
-    """Keeps the buttons of all inputs that it sends, by tick."""
+    """A core that records the buttons of all inputs that it sends, by tick."""
 
     def __init__(self) -> None:
         super().__init__("Ann")
         self.buttons: dict[int, int] = {}
         self.held: list[bytes] | None = None
-        """Messages that are held up on their way here; None: they are not."""
+        """Messages that arrived while they are held back; None: messages are not held back."""
 
     def receive(self, data: bytes, now: float) -> None:
         if self.held is None:
@@ -44,7 +44,7 @@ class Sent(Core):
 
     @property
     def presses(self) -> int:
-        """The number of times that the jump button goes down, and up again one tick later."""
+        """Number of times that the jump button goes down, and up again one tick later."""
         ticks = sorted(self.buttons)
         downs = [tick for tick in ticks if self.buttons[tick] & JUMP and not self.buttons.get(tick - 1, 0) & JUMP]
         assert all(self.buttons.get(tick + 1) == 0 for tick in downs)
@@ -52,7 +52,7 @@ class Sent(Core):
 
 
 def frames(client: Client, fps: float, seconds: float) -> Iterator[int]:
-    """Runs a game's loop, and lets the test set the input in each frame after the first 2 s."""
+    """Runs a game's loop. The test sets the input in each frame after the first 2 s."""
     for frame in range(round(fps * seconds)):
         now = frame / fps
         client.poll(now)
@@ -62,7 +62,7 @@ def frames(client: Client, fps: float, seconds: float) -> Iterator[int]:
 
 
 def launches(speeds: list[float]) -> int:
-    """The number of times that a player goes up."""
+    """Returns how many times a player goes up."""
     return sum(a <= 0 < b for a, b in pairwise(speeds))
 
 
@@ -74,7 +74,7 @@ def launches(speeds: list[float]) -> int:
     ),
 )
 def test_a_tap_jumps(fps: int, rate: int, within: bool) -> None:
-    """A tap lasts for one frame, or is over within it."""
+    """The key goes down and up in two frames in a row, or within one frame."""
     client = Loopback(Game(dataclasses.replace(FLAT, tick_rate=rate))).join("Ann")
     taps, speeds = 0, []
     for frame in frames(client, fps, 14):
@@ -103,7 +103,7 @@ def kept(core: Core, rng: random.Random) -> Input:
 
 @pytest.mark.parametrize("path", [Link(), Link(0.02), PRESETS["typical"], PRESETS["wifi"]])
 def test_a_press_at_any_time_between_two_ticks_is_in_one_input(path: Link) -> None:
-    """As with `AsyncClient`: ticks are predicted when they are due, and the input is set at any time."""
+    """Ticks are predicted when they are due and the input is set at any time, as with `AsyncClient`."""
     match = Match(FLAT, seed=1)
     core = playing(match.join(kept, path, Sent()))
     rng = random.Random(2)
@@ -175,7 +175,7 @@ def test_a_press_while_nothing_is_heard_is_not_remembered() -> None:
     core.set_input(Input(0, 0, JUMP))
     core.set_input(Input(0, 0, 0))
     match.run(1)
-    assert max(core.buttons) == last, "it waits for the server"
+    assert max(core.buttons) == last, "the client waits for the server"
     held, core.held = core.held, None
     for data in held:
         core.receive(data, player.local)

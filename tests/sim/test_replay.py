@@ -20,7 +20,7 @@ from tests.lengths import long
 
 
 def to_the_pit(core: Core, rng: random.Random) -> Input:
-    """Walks to the pit that opens into the void, and on, again and again."""
+    """Walks to the pit that opens into the void, and into it, again and again."""
     assert core.prediction is not None
     predicted = core.prediction.predicted
     if core.entity not in predicted:
@@ -32,7 +32,7 @@ def to_the_pit(core: Core, rng: random.Random) -> Input:
 
 
 def build_and_dig(core: Core, rng: random.Random) -> Input:
-    """Wanders, and now and then sets or takes a block beside itself."""
+    """Wanders, and sometimes places or removes a block beside itself."""
     assert core.prediction is not None
     if core.entity in core.prediction.predicted and rng.random() < 0.1:
         x, y, z = (int(part) for part in core.prediction.predicted.position(core.entity))
@@ -41,7 +41,7 @@ def build_and_dig(core: Core, rng: random.Random) -> Input:
 
 
 class Played:
-    """A recorded match of ten players and two more who come and go."""
+    """A recorded match of ten players and two more, who join and leave."""
 
     def __init__(self, seconds: float) -> None:
         scene = load_scene("arena")
@@ -98,7 +98,7 @@ def test_a_match_is_replayed_to_the_same_hash_at_every_tick(played: Played, comp
 
 def test_the_last_records_broken_off_at_every_byte_leave_the_ticks_before(played: Played) -> None:
     data, ends = played.data, played.ends
-    for size in range(ends[2], ends[4] + 1):  # early, where reading is quick: every byte
+    for size in range(ends[2], ends[4] + 1):  # every byte of early records, where reading is quick
         recording = Recording(io.BytesIO(data[:size]))
         ticks = [moment.world.state_hash() for moment in recording]
         whole = sum(end <= size for end in ends)

@@ -1,4 +1,4 @@
-"""What players can do after either clock stood still, at any rate: inputs are used again within two seconds."""
+"""Play after either clock stood still, at any tick rate: inputs are used again within two seconds."""
 
 import dataclasses
 from itertools import product
@@ -21,7 +21,7 @@ RATES = (1, 20, 32, 60, 128, 240)
 
 
 def at(rate: int, path: Link = NEAR, seed: int = 1) -> tuple[Match, Player]:
-    """A match at a tick rate with one player who has wandered about for 10 s."""
+    """Returns a match at a tick rate, and its one player, who has wandered for 10 s."""
     match = Match(dataclasses.replace(FLAT, tick_rate=rate), seed)
     player = match.join(wander, path)
     match.run_until(lambda: player.core.state == "playing", 30)
@@ -35,7 +35,7 @@ def queue(match: Match, player: Player) -> InputQueue:
 
 
 def used_share(match: Match, player: Player, seconds: float) -> float:
-    """Of the ticks of so many seconds, the share whose own input was there."""
+    """Runs for `seconds`. Returns the share of ticks in which the player's own input was used."""
     inputs = queue(match, player)
     before, tick = inputs.used, match.game.world.tick
     match.run(seconds)
@@ -49,13 +49,13 @@ def causes(player: Player) -> set[str]:
 
 
 def stop_server(match: Match, seconds: float) -> None:
-    """No tick for so long; then the schedule goes on with the next one, the missed ones are dropped."""
+    """Runs no tick for `seconds`. Then the schedule goes on with the next tick, and the missed ones are dropped."""
     match._started += round(seconds * match.game.scene.tick_rate)
     match.run(seconds)
 
 
 def stop_clock(match: Match, player: Player, seconds: float) -> None:
-    """The client's computer sleeps, and its monotonic clock with it."""
+    """Suspends the client's computer together with its monotonic clock."""
     player.suspend(seconds)
     match.run(seconds - 0.001)
     player.clock_start -= seconds
@@ -121,7 +121,7 @@ def test_stop_after_stop() -> None:
 
 
 def test_after_a_stop_what_is_pressed_now_is_what_counts() -> None:
-    """Inputs that were sent ahead while the server stood still are withdrawn, not played back."""
+    """Inputs that were sent ahead while the server stood still are withdrawn, so they are not used later."""
     match = Match(FLAT, 1)
     player = match.join(lambda core, rng: core.input, NEAR)
     match.run(10)

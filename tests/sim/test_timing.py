@@ -1,7 +1,7 @@
-"""What the lead must hold on every link, over seeded runs of the league, and that no rival does better.
+"""The lead controller meets its limits on every link, over seeded runs, and no rival is better.
 
-The figures are of whole runs with clocks that drift and start anywhere; `fair` leaves out what nobody can know
-beforehand (see `scripts/league.py`). The runs have no physics, so they are quick; one test holds them against matches.
+The figures are of whole runs whose clocks drift and start at any time. `fair` leaves out what no controller can know
+beforehand (`scripts/league.py`). The runs have no physics, so they are quick. One test compares them with matches.
 """
 
 import random
@@ -29,7 +29,7 @@ def played(preset: str, seed: int, minutes: float) -> lead_trial.Row:
 
 
 def above_oracle(row: lead_trial.Row) -> float:
-    """Ticks."""
+    """Returns how much later than the best constant lead a run is, in ticks."""
     return float(row["fair_latency_ms"] - row["fair_oracle_ms"]) / TICK_MS
 
 
@@ -131,7 +131,7 @@ def test_a_match_is_as_late_as_the_league_says(preset: str, most: float) -> None
 @pytest.mark.slow
 @pytest.mark.parametrize("preset", ["typical", "far"])
 def test_least_latency_at_equal_late_share(preset: str) -> None:
-    """No other rule adds less, by more than a tenth of a tick, at our late share, whatever safety it is given."""
+    """No rule adds less latency, by more than a tenth of a tick, at our late share, whatever safety it is given."""
     rows = league.run(preset, MINUTES, 21)
     assert rows[0]["on_front"]
     figures = [(row["controller"], *league.point(row), row["its_latency_ms"]) for row in rows]

@@ -1,4 +1,4 @@
-"""Two worlds that are told the same are the same, at every tick: in two processes, compiled and not, across copies."""
+"""Two worlds with the same inputs are equal at every tick: in two processes, compiled and plain, and after copies."""
 
 import os
 import random
@@ -31,7 +31,7 @@ def start(compiled: bool) -> World:
 
 
 def inputs(seed: int) -> Iterator[dict[int, Input]]:
-    """What six players press, tick by tick, some of the time into walls and into each other."""
+    """Yields the inputs of six players for each tick; some of the time they walk into walls and into each other."""
     rng = random.Random(seed)
     while True:
         yield {
@@ -57,7 +57,7 @@ def test_two_processes_of_which_numba_compiles_one_agree_at_every_tick() -> None
 
 
 def other_chain(scene: str, form: str, ticks: int) -> str:
-    """The form, and what another process makes of a scene with it."""
+    """Returns the form of the kernel in another process, and the hash of that process's run of a scene."""
     command = (sys.executable, "-m", "tests.kernels.chains", scene, str(ticks))
     environment = os.environ | {kernels.VARIABLE: form}
     return subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, check=True).stdout.strip()
