@@ -47,6 +47,7 @@ COMPLIANT = (
     "tests/readme/test_snippets.py",
     "tests/readme/test_tables.py",
     "tests/scripts/test_language.py",
+    "tests/server",
     "tests/shared",
     "tests/sim",
     "tests/tables.py",

@@ -1,4 +1,4 @@
-"""Every asynchronous test of the server runs on asyncio's own loop, and on uvloop where that is installed."""
+"""Event loops of the server's asynchronous tests: asyncio's own, and uvloop where it is installed."""
 
 import asyncio
 from collections.abc import Callable, Mapping

@@ -1,4 +1,4 @@
-"""From settings to what decides on players."""
+"""Settings that decide about players: anyone, tokens, or a function of the game."""
 
 import pytest
 

@@ -1,4 +1,4 @@
-"""The game as an environment: PettingZoo's own test, what agents see, and policies that play here and over the wire."""
+"""The game as an environment: PettingZoo's own test, observations, and policies that play here and over the wire."""
 
 import asyncio
 import random
@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 pytest.importorskip("pettingzoo", reason="needs the extra [agents]")
-with warnings.catch_warnings(action="ignore", category=DeprecationWarning):  # of its own examples
+with warnings.catch_warnings(action="ignore", category=DeprecationWarning):  # its own examples
     from pettingzoo.test import parallel_api_test, parallel_seed_test
 
 from client_sdk.async_client import AsyncClient
@@ -35,7 +35,7 @@ YARD = scene(
 
 
 class Race(Rules):
-    """The further east, the better; who falls out of the yard is out."""
+    """Rules of a race: the score is how far east a player is; a player who falls out of the yard is out."""
 
     def on_join(self, player: Player) -> None:
         self.game.set(player.entity, "score", self.game.position(player.entity)[0])
@@ -73,7 +73,7 @@ def test_what_an_agent_sees() -> None:
     for row, place in zip(mine["others"], others, strict=False):
         assert row.tolist() == [*np.subtract(place, places[0]), 0, 0, 0, 0, 1]
     assert mine["others"].shape == (OTHERS, 8)
-    assert not mine["others"][2:].any(), "there is nobody else"
+    assert not mine["others"][2:].any(), "there are no others"
     for agent, place in zip(env.agents, places, strict=True):
         x, y, z = (int(part // 1) for part in place)
         found = [
@@ -95,7 +95,8 @@ def test_what_is_not_loaded_is_told_from_air() -> None:
 
 
 def walk(env: Arena, steps: int, **actions: tuple[int, int, int]) -> tuple[dict[str, float], dict[str, bool]]:
-    """Everybody does one thing all the time; the sums of the rewards, and who is over in the end."""
+    """Runs steps with the same actions. Returns the sum of each agent's rewards, and which agents are over at the
+    end."""
     sums: dict[str, float] = dict.fromkeys(env.agents, 0.0)
     over: dict[str, bool] = {}
     for _ in range(steps):
@@ -113,11 +114,11 @@ def test_actions_move_and_attributes_reward() -> None:
     env.reset()
     start = {agent: env.world.position(env.entity(agent)) for agent in env.agents}
     sums, _ = walk(env, 32, player_1=(127, 0, 0), player_2=(-1000, 0, 1))
-    env.step({})  # the rules see the latest move only now
+    env.step({})  # the rules see the latest movement only in the next tick
     now = {agent: env.world.position(env.entity(agent)) for agent in env.agents}
     assert now["player_0"] == start["player_0"]
-    assert now["player_1"][0] - start["player_1"][0] == 3.0, "3 blocks/s for a second"
-    assert now["player_2"][0] - start["player_2"][0] == -3.0, "more than the most is the most"
+    assert now["player_1"][0] - start["player_1"][0] == 3.0, "3 blocks/s for one second"
+    assert now["player_2"][0] - start["player_2"][0] == -3.0, "longer than full speed is full speed"
     assert sums["player_0"] == 0.0
     assert sums["player_1"] == 3.0 - 3 / 32
     custom = arena(reward=lambda game, entity: float(entity))
@@ -144,7 +145,7 @@ def test_who_is_over_leaves_and_the_others_go_on_until_the_time_is_over() -> Non
 def test_commands_are_answered() -> None:
     env = arena(agents=1)
     env.reset()
-    for _ in range(8):  # edits have a pace
+    for _ in range(8):  # edits have a rate limit
         env.step({})
     near, far = env.command("player_0", "edit", [2, 0, 0, 0]), env.command("player_0", "edit", [-8, -8, 0, 5])
     infos: dict[str, Any] = {}
@@ -157,7 +158,7 @@ def test_commands_are_answered() -> None:
 
 
 def played(env: Arena, policies: dict[str, Policy], seed: int | None = None) -> tuple[bytes, dict[str, Observation]]:
-    """A whole episode; the hash of its world, and what was seen last."""
+    """Plays a whole episode. Returns the hash of its world and the last observations."""
     seen, _ = env.reset(seed=seed)
     while env.agents:
         actions = {agent: policies[agent](env.world, env.entity(agent)) for agent in env.agents}
@@ -180,7 +181,7 @@ def test_one_seed_is_one_episode_of_tag() -> None:
     env = Arena(agents=3, rules=Tag, seconds=4.0)
     first, second, third = episode(5), episode(None), episode(6)
     assert first == episode(5)
-    assert second == third, "an episode without a seed has that of the one before, plus one"
+    assert second == third, "an episode without a seed has the seed of the last one, plus one"
     assert first != second
 
 
@@ -194,7 +195,7 @@ async def test_the_same_policies_play_here_and_over_the_wire() -> None:
     assert speeds["run-and-jump"] > 1.0
 
     async def plays(url: str, policy: Policy) -> None:
-        """Until the policy has decided about a second of ticks over the wire."""
+        """Plays over the wire until the policy was asked for a second of ticks."""
         asked: set[int] = set()
         enough = asyncio.Event()
         bot = Bot(policy)

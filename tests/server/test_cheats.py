@@ -1,8 +1,8 @@
-"""Cheats: whatever a client sends, its path is one that an honest player walks who sends one input per tick, in time.
+"""Cheats: whatever a client sends, its path is the path of an honest player who sends one input per tick, in time.
 
-That is the strongest bound there is, and it is exact: from each tick's state the input that was consumed is read, and
-another game with an honest player who sends just that must be in the same state at every tick. The numbers of the
-scene bound that path in turn: per tick, per axis, and upwards.
+This bound is exact. The consumed input is read from each tick's state, and another game gets an honest player who sends
+these inputs. Both must be in the same state at every tick. The numbers of the scene bound the path: per tick, per axis,
+and upwards.
 """
 
 import itertools
@@ -32,15 +32,15 @@ State = tuple[int, ...]
 RATE = 64
 AHEAD_MAX, REPEATS_MAX = bounds(RATE).ahead, bounds(RATE).repeats
 WALK = 3 * BLOCK // RATE
-"""Grid steps that a player goes in a tick along an axis, at most: 3 blocks/s at 64 ticks/s, without a remainder."""
+"""Maximum distance of a tick along one axis, in grid steps: 3 blocks/s at 64 ticks/s, without a remainder."""
 APEX = 2 * BLOCK
-"""A jump of 8 blocks/s against 16 blocks/s^2."""
+"""Height of a jump of 8 blocks/s against 16 blocks/s^2, in grid steps."""
 HEIGHT = 7 * BLOCK // 4
 EAST, JUMP = bytes((127, 0, 0)), bytes((127, 0, 1))
 
 
 def plain(rules: Rules | None = None, limits: Limits | None = None) -> Table:
-    """A plain of 64 x 64 blocks around its spawn, where who is cut off has time to come back."""
+    """Returns a plain of 64 x 64 blocks around its spawn. A lost player has 5 s to reconnect."""
     return Table(
         limits,
         [[-32, -32, 0, 32, 32, 1, 1]],
@@ -57,12 +57,12 @@ def state(table: Table, entity: int) -> State:
 
 
 def ahead(table: Table, row: bytes, n: int = 1) -> Inputs:
-    """`n` inputs for the coming ticks."""
+    """Returns a message of `n` inputs for the coming ticks."""
     return Inputs(table.tick_number + 1, table.tick_number, row * n)
 
 
 class Cheat:
-    """Plays by whatever rules it likes, and has its path written down."""
+    """A client that sends what a test wants. Its path is recorded."""
 
     def __init__(self, table: Table) -> None:
         self.table = table
@@ -76,19 +76,19 @@ class Cheat:
             self.path.append(state(self.table, self.entity))
 
     def cut_off(self) -> None:
-        """Loses the connection and comes back with the token."""
+        """Loses the connection and reconnects with the token."""
         self.table.lose(self.link)
         self.take_over()
 
     def take_over(self) -> None:
-        """Comes back while the connection is there."""
+        """Reconnects while the old connection still exists."""
         welcome: Welcome = self.link.got(Welcome)[-1]
         self.link = self.table.connect(Hello(messages.VERSION, {}, "", resume=welcome.resume))
         self.tick()
         assert self.link.session.entity == self.entity
 
     def prove(self) -> None:
-        """The path is walked by an honest player, too, and lies within the bounds."""
+        """Checks the path: it is within the bounds, and an honest player with the same inputs walks it, too."""
         table = plain()
         honest = table.join()
         entity = honest.session.entity
@@ -106,7 +106,7 @@ class Cheat:
         assert table.game.counters.kicked == 0
 
     def walked(self) -> int:
-        """How far east, in grid steps."""
+        """Returns how far east the player has gone, in grid steps."""
         return self.path[-1][X] - self.path[0][X]
 
 
@@ -139,7 +139,7 @@ def test_inputs_from_the_past_are_not_made_up_for(cheat: Cheat) -> None:
     cheat.tick(100)
     cheat.link.say(Inputs(1, 0, EAST * INPUT_ROWS_MAX))
     cheat.tick(100)
-    assert cheat.walked() == REPEATS_MAX * WALK, "the latest to arrive is repeated, for as long as any"
+    assert cheat.walked() == REPEATS_MAX * WALK, "the newest input is repeated, as for any player"
     cheat.prove()
 
 
@@ -172,12 +172,12 @@ def test_a_lag_switch_loses_what_it_withholds(cheat: Cheat, withheld: int) -> No
     cheat.tick(1 + withheld)
     repeated = min(withheld, REPEATS_MAX)
     assert cheat.walked() == (1 + repeated) * WALK
-    for first in range(began + 2, began + 2 + withheld, INPUT_ROWS_MAX):  # all at once
+    for first in range(began + 2, began + 2 + withheld, INPUT_ROWS_MAX):  # all of them at once
         n = min(INPUT_ROWS_MAX, began + 2 + withheld - first)
         cheat.link.say(Inputs(first, began, EAST * n))
     cheat.link.say(ahead(cheat.table, EAST, 8))
     cheat.tick(8)
-    assert cheat.walked() == (1 + repeated + 8) * WALK, "only the ticks that were still to come"
+    assert cheat.walked() == (1 + repeated + 8) * WALK, "only the ticks that were still to come count"
     cheat.prove()
 
 
@@ -199,7 +199,7 @@ def test_there_is_no_jump_in_the_air(cheat: Cheat) -> None:
         cheat.tick()
         if cheat.path[-1][VZ] > cheat.path[-2][VZ]:
             jumps += 1
-            assert on_ground or cheat.path[-1][Z] == cheat.path[0][Z], "it rose faster in mid-air"
+            assert on_ground or cheat.path[-1][Z] == cheat.path[0][Z], "the player rose faster in mid-air"
     assert jumps >= 3
     cheat.prove()
 
@@ -213,7 +213,8 @@ PLACES = (0, 1, -1, (1 << 28) - 1, -(1 << 28), 1 << 28, (1 << 63) - 1, -(1 << 63
 
 
 def extremes() -> list[Message]:
-    """Of every kind that a client may send, with what is least, greatest and oddest in each field."""
+    """Returns messages of every kind that a client may send, with the least, the greatest and the oddest values in each
+    field."""
     found: list[Message] = [Resync(), Bye(0, "", -1e300), Bye(4999, "x" * 500, 1e300)]
     found += [Hello(v, {}, "n" * 32, "t" * 2048, r) for v in (0, 1, 1 << 31) for r in (b"", bytes(16), b"\xff" * 16)]
     found += [
@@ -236,7 +237,8 @@ def extremes() -> list[Message]:
 
 
 def test_no_message_of_any_kind_moves_anybody() -> None:
-    """One connection per kind: some end it. Neither the sender nor the one beside it ever leaves its bounds."""
+    """One connection per kind of message; some messages close it. Neither the sender nor the player beside it leaves
+    the bounds."""
     for kind, group in itertools.groupby(extremes(), type):
         table = plain(limits=Limits(edits_per_s=10_000))
         bystander = table.join().session.entity
@@ -252,7 +254,7 @@ def test_no_message_of_any_kind_moves_anybody() -> None:
         for before, after in itertools.pairwise(cheat.path):
             assert abs(after[X] - before[X]) <= WALK, kind
             assert abs(after[Y] - before[Y]) <= WALK, kind
-            assert cheat.path[0][Z] <= after[Z] <= cheat.path[0][Z] + HEIGHT + APEX, kind  # off the bystander's head
+            assert cheat.path[0][Z] <= after[Z] <= cheat.path[0][Z] + HEIGHT + APEX, kind  # off the bystander
 
 
 def test_each_message_of_the_server_ends_the_client_that_sends_it() -> None:
@@ -304,7 +306,7 @@ def test_nobody_is_walled_in_and_no_floor_is_pushed_up_under_anyone(cheat: Cheat
 
 
 def edit_all(table: Table, link: FakeLink, number: int, ticks: int, per_tick: int = 4) -> int:
-    """Edits far too fast; the next number."""
+    """Sends edits much faster than allowed. Returns the next number."""
     for _ in range(ticks):
         for _ in range(per_tick):
             link.say(order(number, 0, 3, number % 5 - 2, 1, number % 255 + 1))
@@ -317,7 +319,7 @@ def test_edits_that_come_too_fast_are_refused(cheat: Cheat) -> None:
     cheat.tick(4 * RATE)
     edit_all(cheat.table, cheat.link, 1, 2 * RATE)
     rate = cheat.table.game.limits.edits_per_s
-    assert done(cheat.link) == 2 * rate + 2 * rate - 1, "the burst, and two seconds of edits but for the last tick's"
+    assert done(cheat.link) == 2 * rate + 2 * rate - 1, "the burst, and two seconds of edits without the last tick's"
 
 
 def test_coming_back_gives_no_edits(cheat: Cheat) -> None:
@@ -392,7 +394,7 @@ def test_what_waits_for_who_never_reads_is_bounded_over_any_number_of_returns(ch
     for _ in range(6):
         cheat.link.waiting = 1 << 20
         for _ in range(40):
-            cheat.link.say(*[order(1, 0, 3, 0, 1, 5)] * 8)  # done once; asked again and again
+            cheat.link.say(*[order(1, 0, 3, 0, 1, 5)] * 8)  # carried out once, and asked for again and again
             cheat.table.tick()
         longest = max(longest, len(player.verdicts))
         cheat.table.lose(cheat.link)
@@ -400,14 +402,14 @@ def test_what_waits_for_who_never_reads_is_bounded_over_any_number_of_returns(ch
         cheat.link.waiting = 1 << 20
         cheat.table.tick()
         assert cheat.link.session.entity == cheat.entity
-    assert longest < 2 * 40 * 8, "the last connection's, and what is kept of the one before"
+    assert longest < 2 * 40 * 8, "the verdicts of the last connection, and those kept of the one before"
 
 
-# -- what was seen -------------------------------------------------------------------------------------------
+# -- the view tick -------------------------------------------------------------------------------------------
 
 
 class Asking(Rules):
-    """Looks where the others were when a player says it saw them."""
+    """Rules that look up how far back lag compensation goes for the view tick of a command."""
 
     def __init__(self) -> None:
         self.granted: list[float] = []
@@ -452,7 +454,7 @@ def test_any_schedule_comes_to_an_honest_path(schedule: list[tuple[str, int, byt
             case "inputs":
                 cheat.link.say(Inputs(max(0, cheat.table.tick_number + number), -1, rows))
                 if number % 2:
-                    continue  # more in the same tick
+                    continue  # more messages in the same tick
             case "wait":
                 cheat.tick(number)
             case "restart":

@@ -1,4 +1,4 @@
-"""What `check` asks; that it does is in tests/e2e/test_server_process.py."""
+"""The address that the health check asks. tests/e2e/test_server_process.py runs the check itself."""
 
 import pytest
 

@@ -1,4 +1,4 @@
-"""Edits that somebody has chosen so that a digest stays as it is: each of them counts, wherever equality decides."""
+"""Edits chosen so that the former digest stays the same: each of them counts wherever worlds are compared."""
 
 from collections.abc import Iterable
 from pathlib import Path
@@ -26,15 +26,15 @@ MANY = 40
 
 
 def collision(cells: Iterable[tuple[int, int, int]], n: int) -> list[Edit]:
-    """Exactly `n` edits of blocks in the air of segment (0, 0, 0) that leave its former digest unchanged.
+    """Returns exactly `n` edits of air blocks in segment (0, 0, 0) that leave its former digest unchanged.
 
-    One block's part of that digest depends on its place and kind alone, and the parts are joined by exclusive-or. So it
-    is a system of 64 linear equations over bits: of any 65 parts some cancel out.
+    The digest of a segment was the exclusive-or of one part per block, which depends only on the block's place and
+    kind. So the edits solve a system of 64 linear equations over bits: of any 65 parts, some cancel out.
     """
     places = list(cells)
     for kind in range(1, 256):
         edits = [Edit(x, y, z, kind) for x, y, z in places]
-        basis: dict[int, tuple[int, int]] = {}  # by the highest bit: a sum of parts, and whose it is as bits
+        basis: dict[int, tuple[int, int]] = {}  # by the highest bit: a sum of parts, and the set of its parts as bits
         for number, edit in enumerate(edits):
             kinds = np.zeros(32768, np.uint8)
             kinds[offset_of(*edit[:3])] = kind
@@ -50,7 +50,8 @@ def collision(cells: Iterable[tuple[int, int, int]], n: int) -> list[Edit]:
 
 
 def air(radius: int) -> list[tuple[int, int, int]]:
-    """Blocks above a floor at z = 0, around (16, 16) and within reach from there, but for the column itself."""
+    """Returns blocks above a floor at z = 0, within reach of (16, 16), without the column itself and those beside
+    it."""
     span = range(16 - radius, 17 + radius)
     return [(x, y, z) for z in range(2, 5) for y in span for x in span if max(abs(x - 16), abs(y - 16)) > 1]
 
@@ -108,7 +109,7 @@ def test_a_checkpoint_holds_whatever_was_touched() -> None:
 def test_what_was_answered_is_there_after_a_checkpoint_and_a_restart(tmp_path: Path, restart: str) -> None:
     table = Stored(tmp_path / "data")
     link = table.join()
-    table.tick(64)  # who has just joined may not edit yet
+    table.tick(64)  # a player who has just joined may not edit yet
     for number, edit in enumerate(CHOSEN):
         link.say(order(number, table.tick_number + 1, *edit))
         table.tick(16)

@@ -1,4 +1,4 @@
-"""A wall clock may jump (set by hand, by the network, by daylight saving): nothing that plays looks at one."""
+"""Nothing in the product uses a wall clock, which may jump, except for the expiry of tokens."""
 
 import ast
 from pathlib import Path
@@ -7,9 +7,9 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
 WALL = {"time", "time_ns", "localtime", "gmtime", "ctime", "asctime", "strftime"}
-"""Of the module time: all that tell what a wall clock shows."""
+"""Functions of the module `time` that read a wall clock."""
 ALLOWED = {"server/auth/tokens.py"}
-"""How long a token is good for is said in the world's time; it is looked at when somebody comes in, and only then."""
+"""Files that may read a wall clock: the expiry of a token is a wall-clock time, and is checked only at a join."""
 SOURCES = sorted(
     path.relative_to(ROOT).as_posix()
     for part in ("shared", "server", "client_sdk")
@@ -18,7 +18,7 @@ SOURCES = sorted(
 
 
 def wall_clocks(source: str) -> list[str]:
-    """What a module uses of wall clocks."""
+    """Returns the uses of wall clocks in a module."""
     found = []
     for node in ast.walk(ast.parse(source)):
         match node:

@@ -1,4 +1,4 @@
-"""What clients order: carried out in its tick, bounded, answered."""
+"""Commands of clients: carried out in their tick, bounded, answered."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -20,7 +20,7 @@ def table() -> Table:
 
 
 def builder(table: Table) -> FakeLink:
-    """A client that has been there long enough to have some edits free."""
+    """Returns a client that has been connected long enough to be allowed some edits."""
     link = table.join()
     table.tick(64)
     return link
@@ -83,11 +83,11 @@ def test_commands_are_bounded_in_number_and_rate() -> None:
     table.tick(3)
     assert sorted(verdicts(link)) == list(range(1, 9))
     assert [verdicts(link)[n] for n in range(5, 9)] == [messages.TOO_MANY] * 4
-    assert sum(verdict == messages.DONE for verdict in verdicts(link).values()) == 2  # two seconds' worth at once
+    assert sum(verdict == messages.DONE for verdict in verdicts(link).values()) == 2  # two seconds of edits at once
 
 
 class Disk:
-    """Where a world is said to be saved."""
+    """A stand-in for the store that saves a world."""
 
     def __init__(self) -> None:
         self.kept: Any = None
@@ -104,10 +104,10 @@ def test_a_verdict_is_told_when_its_tick_is_on_disk() -> None:
     disk.durable_tick = table.tick_number
     table.tick(3)
     assert table.game.world.blocks.get(18, 16, 1) == 5
-    link.say(order(1, 0, 18, 16, 1, 5))  # asked again
+    link.say(order(1, 0, 18, 16, 1, 5))  # sent again
     table.tick()
     assert verdicts(link) == {}
-    told = [note[1:] for note in table.game.keep() if note[0] == "answered"]  # a checkpoint now would hold them
+    told = [note[1:] for note in table.game.keep() if note[0] == "answered"]  # a checkpoint made now would hold them
     assert told == [[link.session.entity, 1, messages.DONE], [link.session.entity, 2, messages.OUT_OF_REACH]]
     disk.durable_tick += 1
     table.tick()
@@ -121,7 +121,7 @@ def test_a_client_is_let_in_when_its_token_is_on_disk_or_nothing_can_be_saved() 
     first = table.join()
     table.tick(10)
     assert first.sent == []
-    assert first.closings == [], "it is not the client that has stalled"
+    assert first.closings == [], "the client has not stalled"
     disk.durable_tick = 1
     table.tick()
     assert [type(message) for message in first.sent[:2]] == [Welcome, Snapshot]

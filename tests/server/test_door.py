@@ -1,4 +1,4 @@
-"""Who is let in, by address, rate and origin, with the clock in the test's hand."""
+"""Admission: which connections are accepted, by address, rate and origin, with simulated time."""
 
 import pytest
 
@@ -12,7 +12,7 @@ HEALTH = Request("GET", "/healthz", "127.0.0.1:8765", None, upgrade=False)
 
 
 def refused(page: Page | None) -> tuple[int, str]:
-    assert page is not None, "it was let in"
+    assert page is not None, "the connection was accepted"
     return page.status, page.body.decode().rstrip("\n")
 
 
@@ -49,7 +49,7 @@ def test_all_connections_together_have_a_limit() -> None:
     assert all(door.arrive("127.0.0.1") for _ in range(3 + SPARE))
     status, text = refused(door.answer(JOIN, "127.0.0.1", 0.0))
     assert (status, text) == (503, "the server is full (3 connections)")
-    assert refused(door.answer(HEALTH, "127.0.0.1", 0.0))[0] == 200, "a full server is not a dead one"
+    assert refused(door.answer(HEALTH, "127.0.0.1", 0.0))[0] == 200, "a full server still serves pages"
     assert not door.arrive("127.0.0.1")
     assert not door.arrive("1.2.3.4")
 

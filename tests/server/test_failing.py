@@ -1,4 +1,4 @@
-"""What fails half-way leaves nothing behind: a join, a checkpoint, the record of a tick."""
+"""A join, a checkpoint or the record of a tick that fails half-way leaves nothing behind."""
 
 import logging
 import random
@@ -33,7 +33,7 @@ def fails(*args: Any, **given: Any) -> Any:
 @pytest.mark.parametrize(
     ("owner", "name", "told"),
     [
-        (GameApi, "set", []),  # ahead of `on_join`
+        (GameApi, "set", []),  # before `on_join`
         (Roster, "issue", ["join", "leave"]),
         (joining, "Welcome", ["join", "leave"]),
     ],
@@ -181,7 +181,7 @@ def test_a_tick_whose_record_fails_goes_on_and_is_made_up_for(
         return not table.store.trouble
 
     until(goes_on)
-    table.game.api.set_block(3, 3, 3, 5)  # a quiet tick might not be written at once
+    table.game.api.set_block(3, 3, 3, 5)  # a tick without changes might not be written at once
     table.tick()
     assert [record.levelno for record in caplog.records if "cannot save" in record.message] == [logging.ERROR]
     copy = Store(copied(tmp_path / "data", tmp_path / "copy"), table.game.scene, compiled=False)
@@ -191,7 +191,7 @@ def test_a_tick_whose_record_fails_goes_on_and_is_made_up_for(
 
 
 def test_the_log_never_goes_on_behind_a_gap(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A checkpoint is due while the file is still to be closed: it waits until that is open anew."""
+    """A checkpoint is due while the file still has to be closed. The checkpoint waits until the file is open again."""
     store = stored(tmp_path, keep, 5 / SCENE.tick_rate)
     rng = random.Random(4)
     hashes: dict[int, bytes] = {0: store.world.state_hash()}

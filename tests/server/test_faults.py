@@ -1,4 +1,4 @@
-"""Exceptions of our own: each costs one client, one command or one segment, is counted, and the ticks go on."""
+"""Exceptions in our own code: each costs one client, command or segment, is counted, and the ticks go on."""
 
 import logging
 from typing import Any
@@ -15,7 +15,7 @@ from tests.tables import HELLO, FakeLink, Table, order
 
 
 class BrokenLink(FakeLink):
-    """Works until it is told not to."""
+    """A link that works until it is broken."""
 
     def __init__(self, table: Table) -> None:
         super().__init__(table)
@@ -61,14 +61,14 @@ def test_a_client_that_cannot_be_served_is_let_go_and_the_others_notice_nothing(
     table.tick(20)
     before, broke, after = (len(link.got(Snapshot)) - n for link, n in zip(links, seen, strict=True))
     assert (before, after) == (20, 20)
-    assert broke <= (SAMPLE_S / table.tick_s if "outstanding" in broken else 0), "so often it is asked"
+    assert broke <= (SAMPLE_S / table.tick_s if "outstanding" in broken else 0), "`outstanding` is asked once per tick"
     assert bad.session not in table.game.sessions
     assert bad.closings == ([] if "close" in broken else [(messages.INTERNAL, "internal error")])
-    assert len(table.game.world) == 2, "its entity goes as that of any lost connection"
+    assert len(table.game.world) == 2, "its entity stays, like that of any lost connection"
     assert table.game.faults.total == len(broken)
     assert len([record for record in caplog.records if record.exc_info]) == len(broken)
     bad.broken = set()
-    table.game.lost(bad.session, table.now)  # the gateway comes to the same conclusion
+    table.game.lost(bad.session, table.now)  # the gateway reports the loss, too
     table.tick()
     assert table.game.counters.left == 1
 
@@ -109,7 +109,7 @@ def test_a_command_that_fails_is_answered_and_those_after_it_are_carried_out(
     table: Table, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     link = connect(table)
-    table.tick(16)  # two edits' worth
+    table.tick(16)  # the edits of two seconds
     link.sent.clear()
     real = edits.apply
 
@@ -144,7 +144,7 @@ def test_a_segment_that_cannot_be_encoded_is_left_out_and_comes_when_it_can(monk
     for link in links:
         assert len(link.got(Snapshot)) == 5
         assert {tuple(part[:3]) for snapshot in link.got(Snapshot) for part in snapshot.segments} == {(0, 0, 0)}
-    assert table.game.faults.total == 5, "once per tick, however many see it"
+    assert table.game.faults.total == 5, "one fault per tick, for any number of clients that see the segment"
     broken = False
     table.tick()
     for link in links:
@@ -156,7 +156,7 @@ def test_nobody_is_blamed_for_the_time_that_the_server_was_away() -> None:
     table = Table(Limits(silence_s=5.0, stalled_s=5.0, hello_s=5.0))
     link, late = table.join(), table.connect()
     table.now += 60.0
-    table.game.tick(table.now - 60.0, table.now)  # as the ticker does after having been suspended
+    table.game.tick(table.now - 60.0, table.now)  # as the ticker does after the process was suspended
     table.tick(32)
     assert link.closings == late.closings == []
     link.say(Ping(1.0))
@@ -173,7 +173,7 @@ def test_who_has_gone_on_while_the_server_was_away_is_not_taken_for_a_flood() ->
         table.now += 20.0
 
         def say_all(table: Table = table, link: FakeLink = link, tick: int = table.tick_number) -> None:
-            for n in range(20 * table.game.scene.tick_rate):  # what has waited in the kernel meanwhile
+            for n in range(20 * table.game.scene.tick_rate):  # messages that waited in the kernel
                 link.say(Inputs(tick + 1 + n, tick, bytes(3)))
 
         if not ticks_first:
@@ -190,7 +190,7 @@ def test_who_has_gone_on_while_the_server_was_away_is_not_taken_for_a_flood() ->
 def test_who_was_to_come_back_while_the_server_was_away_still_may() -> None:
     table = Table(resume_s=15.0)
     link = table.join()
-    link.say(Inputs(table.tick_number + 1, table.tick_number, bytes(3)))  # it has got its welcome
+    link.say(Inputs(table.tick_number + 1, table.tick_number, bytes(3)))  # the client has got its welcome
     table.lose(link)
     rate = table.game.scene.tick_rate
     table.tick(5 * rate)

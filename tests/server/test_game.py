@@ -1,4 +1,4 @@
-"""The tick: who comes and goes, slow links, any client; it goes on."""
+"""The tick: joins, leaves, slow links and clients that send anything."""
 
 import random
 from typing import Any
@@ -93,7 +93,7 @@ def test_a_session_that_ends_in_the_middle_of_a_tick_costs_the_others_nothing() 
     links = [table.connect(HELLO, calls_back=True) for _ in range(3)] + [table.connect(calls_back=True)] * 1
     table.tick(80)
     assert [code for link in links for code, _ in link.closings] == [4005, 4005, 4005, 4006]
-    # All in one and the same tick, though each took itself off the list.
+    # All of them fail in the same tick, and each removes itself from the list.
     assert len({len(link.got(Snapshot)) for link in links[:3]}) == 1
     assert (table.game.sessions, len(table.game.world)) == ([], 0)
 
@@ -248,7 +248,7 @@ def test_nothing_that_clients_do_raises_or_stops_the_tick(acts: list[tuple[str, 
 
 
 def play(seed: int) -> list[bytes]:
-    """A short game of eight who walk, dig, leave and come; its hashes."""
+    """Plays a short game of eight clients who walk, dig, leave and join. Returns its hashes."""
     rng = random.Random(seed)
     table = Table(size=(2, 2, 1), fill=[[0, 0, 0, 64, 64, 2, 1]], spawns=((30.0, 30.0, 2.0), (34.0, 34.0, 2.0)))
     links: list[FakeLink] = []

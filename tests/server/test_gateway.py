@@ -1,4 +1,4 @@
-"""The gateway over real loopback sockets, with a game that only takes notes, and peers that know no manners."""
+"""The gateway over real loopback sockets, with a game that only takes notes, and with misbehaving peers."""
 
 import asyncio
 import json
@@ -36,7 +36,7 @@ HANDSHAKE_S = 3.0
 
 
 class Notes:
-    """A game that writes down what it is told, and raises when a message says so."""
+    """A game that records what it gets, and raises if a message says so."""
 
     def __init__(self) -> None:
         self.opened: list[Connection] = []
@@ -91,7 +91,7 @@ class Peer:
             return first, await self.reader.readexactly(length)
 
     async def end(self) -> bytes:
-        """Everything up to the end of the stream, by FIN or by RST."""
+        """Returns all bytes up to the end of the stream, by FIN or RST."""
         chunks = []
         async with asyncio.timeout(TIME_OUT_S):
             try:
@@ -102,7 +102,7 @@ class Peer:
         return b"".join(chunks)
 
     async def closed_with(self, code: int) -> str:
-        """The reason in the close frame with this code, after which the stream ends; whatever comes before it."""
+        """Skips frames up to the close frame, which must have this code and end the stream. Returns its reason."""
         while True:
             first, data = await self.frame()
             if first == 0x88:
@@ -112,7 +112,7 @@ class Peer:
         return data[2:].decode()
 
     def reset(self) -> None:
-        """Goes without a goodbye."""
+        """Disconnects without a closing handshake."""
         self.writer.transport.abort()
 
 
@@ -145,7 +145,7 @@ class Bench:
                 await asyncio.sleep(0.001)
 
     async def all_gone(self) -> None:
-        """Every connection has ended, and the game has been told of each exactly once."""
+        """Waits until all connections have ended, and checks that each was reported to the game exactly once."""
         async with asyncio.timeout(TIME_OUT_S):
             await self.gateway.drained()
         assert sorted(self.notes.lost_sessions) == list(range(1, len(self.notes.opened) + 1))
@@ -166,7 +166,7 @@ MASK = b"\x5a\xc3\x0f\x99"
 
 
 def masked(opcode: Opcode, data: bytes, *, fin: bool = True) -> bytes:
-    """A client's frame; its mask is no secret here, so that tests are named alike every time."""
+    """Returns a client's frame. Its mask is constant, so that the names of tests are the same in every run."""
     plain = Frame(opcode, data, fin).serialize(mask=False)
     head = bytearray(plain[: len(plain) - len(data)])
     head[1] |= 0x80
@@ -261,7 +261,7 @@ async def test_a_broken_protocol_is_answered_with_its_code(
     peer = await bench.client()
     peer.write(binary(b"before"), stream, binary(b"after"))
     closing = asyncio.ensure_future(peer.closed_with(code))
-    if code == 1003:  # an ordinary closing handshake: it is the peer's turn
+    if code == 1003:  # after an ordinary closing handshake, the peer closes the connection
         await bench.until(lambda: len(bench.notes.lost_sessions) == 1)
         peer.write(masked(Opcode.CLOSE, struct.pack("!H", code)))
     await closing
@@ -277,7 +277,7 @@ async def test_the_peer_closes_after_a_last_message(bench: Bench) -> None:
     peer.write(binary(b"last"), masked(Opcode.CLOSE, struct.pack("!H", 1000) + b"enough"))
     assert await peer.closed_with(1000) == "enough"
     assert bench.notes.messages == [b"last"]
-    assert bench.notes.lost_sessions == [1], "before the peer has hung up"
+    assert bench.notes.lost_sessions == [1], "before the peer has disconnected"
     peer.writer.close()
     await bench.all_gone()
 
@@ -405,7 +405,7 @@ async def test_a_peer_that_does_not_finish_closing_is_aborted(bench: Bench, monk
     monkeypatch.setattr(module, "CLOSE_S", 0.05)
     peer = await bench.client()
     bench.notes.opened[0].close(1000, "")
-    peer.write(*[masked(Opcode.PING, b"")] * 3)  # signs of life gain it nothing
+    peer.write(*[masked(Opcode.PING, b"")] * 3)  # pings do not extend the time
     await bench.all_gone()
 
 
@@ -415,7 +415,7 @@ async def test_a_peer_that_neither_reads_nor_hangs_up_is_aborted(bench: Bench, m
     link = bench.notes.opened[0]
     for _ in range(200):
         link.send(bytes(65_000))
-    peer.writer.write_eof()  # half-open: our side still has 13 MB to write
+    peer.writer.write_eof()  # half-open: 13 MB are still to be written by us
     await bench.all_gone()
 
 
@@ -428,7 +428,7 @@ async def test_outstanding_counts_what_the_peer_has_not_taken(bench: Bench) -> N
     sent = 200 * 65_004
     assert link._transport is not None
     if sys.platform == "linux":
-        # All that the peer's kernel has not taken; its receive buffer holds some 6 MB at most.
+        # The bytes that the peer's kernel has not received. Its receive buffer holds at most some 6 MB.
         assert (link.outstanding() or 0) > link._transport.get_write_buffer_size() > 0
     assert sent - (8 << 20) < (link.outstanding() or 0) <= sent
     total = 0
@@ -492,7 +492,7 @@ async def test_what_comes_after_the_end_is_not_parsed_and_too_much_of_it_ends_in
 
 
 class Wire(asyncio.Transport):
-    """Where a connection writes when there is no socket."""
+    """A transport that keeps what is written, without a socket."""
 
     def __init__(self) -> None:
         self.socket = socket.socket()
@@ -527,13 +527,13 @@ DATA = st.builds(
 CONTROL = st.builds(masked, st.sampled_from([Opcode.PING, Opcode.PONG, Opcode.CLOSE]), st.binary(max_size=6))
 ODD = st.one_of(
     st.binary(max_size=12),
-    st.integers(CLIENT_MESSAGE_MAX - 1, CLIENT_MESSAGE_MAX + 1),  # the length of a message, for short reports
+    st.integers(CLIENT_MESSAGE_MAX - 1, CLIENT_MESSAGE_MAX + 1),  # the length of a message, to keep reports short
     st.sampled_from([b"\x82\xff\0\0\0\0\0\0\0\x03keysabc", b"\x82\xfe\0\x03keysabc", b"\x82\x03abc"]),
 )
 
 
 def outcome(chunks: list[bytes], *, plain: bool) -> tuple[list[bytes], list[int], bytes]:
-    """What the game received and was told, and what was written, for a stream in these pieces."""
+    """Runs a connection with these chunks. Returns what the game received, what it lost, and what was written."""
     notes, wire, loop = Notes(), Wire(), asyncio.new_event_loop()
     connection = Connection(Gateway(notes), loop)
     connection.connection_made(wire)
@@ -560,7 +560,7 @@ def test_cut_here_or_parsed_by_websockets_comes_to_the_same(frames: list[bytes |
 
 
 async def get(bench: Bench, target: str, method: str = "GET", host: str = "Host: 127.0.0.1") -> tuple[int, str, str]:
-    """Status, content type and body."""
+    """Returns status, content type and body of a page."""
     peer = await bench.connect(f"{method} {target} HTTP/1.1\r\n{host}\r\n\r\n".encode())
     head, _, body = (await peer.end()).decode().partition("\r\n\r\n")
     headers = dict(line.split(": ", 1) for line in head.splitlines()[1:])

@@ -1,4 +1,4 @@
-"""How clients come in, and the limits that end them."""
+"""The handshake of clients, and the limits that close a connection."""
 
 import pytest
 
@@ -132,7 +132,7 @@ def test_a_full_server_refuses_and_is_not_full_any_more_when_someone_leaves() ->
     table.tick()
     assert links[2].refusal() == (messages.FULL, "the server is full (2 clients)")
     table.lose(links[0])
-    table.join()  # who was refused and has not hung up yet takes no place
+    table.join()  # a refused client that is still connected takes no place
     assert len(table.game.players) == 2
 
 
@@ -188,6 +188,6 @@ def test_a_flood_of_messages_is_closed_and_a_burst_is_not() -> None:
     for _ in range(3):
         link.say(*[Ping(0.0)] * 256)
         assert link.closings == []
-        table.tick(64)  # the allowance is back: a second's worth, at 64 ticks/s
+        table.tick(64)  # the allowance is back: one second at 64 ticks/s
     link.say(*[Ping(0.0)] * 257)
     assert link.refusal() == (messages.MALFORMED, "too many messages")

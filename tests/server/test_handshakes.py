@@ -1,4 +1,4 @@
-"""TLS over real loopback sockets: a connection counts before its handshake, and no longer than it lasts."""
+"""TLS over real loopback sockets: a connection counts from before its handshake until its end."""
 
 import asyncio
 import socket
@@ -62,7 +62,7 @@ async def until(condition: Callable[[], bool]) -> None:
 
 
 async def page(address: tuple[str, int], trust: ssl.SSLContext) -> bytes:
-    """The first line of the answer to a request."""
+    """Returns the first line of the answer to a request."""
     async with asyncio.timeout(TIME_OUT_S):
         reader, writer = await asyncio.open_connection(*address, ssl=trust)
         writer.write(b"GET /healthz HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n")

@@ -1,4 +1,4 @@
-"""Quantiles from buckets, against the exact ones."""
+"""Quantiles from buckets compared with exact ones."""
 
 import json
 import random

@@ -1,4 +1,4 @@
-"""Who sees what, by segments: taken near, let go far, nearest first."""
+"""The segments that a client sees: added when near, dropped when far, nearest first."""
 
 import random
 
@@ -16,7 +16,7 @@ def cube(centre: Cell, radius: int) -> set[Cell]:
 
 
 def moved(sees: set[Cell], centre: Cell, see: int = 1, keep: int = 2) -> tuple[list[Cell], list[Cell]]:
-    """One update, carried out."""
+    """Returns the segments after one update."""
     added, dropped = update(sees, around(centre, see, EVERYWHERE), keep)
     sees.difference_update(dropped)
     sees.update(added)

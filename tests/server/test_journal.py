@@ -1,4 +1,4 @@
-"""What a recording holds: every call, at every instant, on every kind of damage."""
+"""Recordings: all calls, at any time, with any kind of damage."""
 
 import io
 import struct
@@ -36,12 +36,12 @@ from tests import worlds
 from tests.lengths import examples
 
 FORMER = Path(__file__).parent.parent / "golden" / "former"
-"""What the program of 2db46f5 has written: a recording in format 2, and a saved world in schema version 2."""
+"""Files of the program at 2db46f5: a recording in format 2, and a saved world in schema version 2."""
 FLOOR = [worlds.floor(0)]
 
 
 def recorded(file: io.BytesIO) -> RecordedWorld:
-    """A world with a floor, two movers and a stone, being recorded from tick 3 on."""
+    """Returns a world with a floor, two movers and a stone, recorded from tick 3 on."""
     world = RecordedWorld(worlds.scene(FLOOR), compiled=False)
     world.load_terrain()
     world.set_block(5, 5, 0, 9)
@@ -49,7 +49,7 @@ def recorded(file: io.BytesIO) -> RecordedWorld:
         world.spawn("box", place)
     world.remove(3)
     worlds.steps(world, 3, {1: worlds.EAST})
-    world.spawn("stone", (8, 8, 3))  # changed ahead of the first recorded step
+    world.spawn("stone", (8, 8, 3))  # changed before the first recorded step
     world.record(file)
     return world
 
@@ -60,7 +60,7 @@ def read(data: bytes) -> tuple[list[Moment], Recording]:
 
 
 def play(world: RecordedWorld) -> list[bytes]:
-    """Every kind of call; the hash after each tick."""
+    """Makes calls of every kind. Returns the hash after each tick."""
     hashes = []
 
     def step(inputs: dict[int, Input] | None = None) -> None:
@@ -133,7 +133,7 @@ def test_held_inputs_are_written_once_and_again_after_a_teleport() -> None:
     world.step({1: worlds.EAST, 2: worlds.JUMP})
     before = len(file.getvalue())
     world.step({1: worlds.EAST, 2: worlds.JUMP})
-    assert len(file.getvalue()) - before < 25  # 12 of them the frame
+    assert len(file.getvalue()) - before < 25  # 12 of them are the frame
     world.place(1, (0, 20, 1))
     world.step({1: worlds.EAST, 2: worlds.JUMP})
     moments, _ = read(file.getvalue())
@@ -157,7 +157,7 @@ def test_notes_come_back_in_order_among_the_calls() -> None:
     assert second.calls == []
     with pytest.raises(TypeError):
         world.note(object())
-    World.step(world)  # nothing was taken down that a replay would stumble over
+    World.step(world)  # no note that a replay would reject was recorded
 
 
 def test_two_pens_write_the_same_and_each_ends_on_its_own() -> None:
@@ -181,7 +181,7 @@ def test_two_pens_write_the_same_and_each_ends_on_its_own() -> None:
     world.detach(pen)
     world.step()
     for record, found in zip(pen.records, hashes, strict=True):
-        redo(copy, record)  # compares the marks from the first tick on
+        redo(copy, record)  # a replay compares the marks from the first tick on
         assert copy.state_hash() == found
     assert [moment.world.state_hash() for moment in Recording(io.BytesIO(file.getvalue()), compiled=False)][
         1:-1
@@ -219,7 +219,7 @@ def test_a_world_that_is_not_recorded_or_no_longer_leaves_nothing_behind() -> No
 
 
 class Full:
-    """A disk that takes so many bytes."""
+    """A disk with room for `room` bytes."""
 
     def __init__(self, room: int) -> None:
         self.room = room

@@ -1,4 +1,4 @@
-"""After a restart the game goes on: the same players, with their tokens, and all that the rules have said."""
+"""After a restart the game goes on: the same players with their tokens, the same attributes and shared values."""
 
 from pathlib import Path
 from typing import Any
@@ -16,7 +16,7 @@ from tests.tables import FakeLink, Table, gone, order
 
 
 class Stored(Table):
-    """A table whose world is kept in a directory."""
+    """A table whose world is saved in a directory."""
 
     def __init__(self, directory: Path, rules: Rules | None = None) -> None:
         super().__init__(rules=rules, resume_s=2.0)
@@ -32,7 +32,7 @@ class Stored(Table):
         self.store.start(self.game.keep)
 
     def tick(self, n: int = 1) -> None:
-        """Ticks that are on disk each before the next one."""
+        """Runs ticks, and waits until each is on disk."""
         for _ in range(n):
             super().tick()
             until(lambda: self.store.durable_tick == self.game.world.tick)
@@ -42,7 +42,8 @@ class Stored(Table):
 
 
 def played(table: Stored) -> tuple[FakeLink, bytes]:
-    """Somebody joins, walks and edits, and the rules say this and that; the link and the token."""
+    """Plays until there are a player with an edit, attributes and shared values. Returns the player's link and
+    token."""
     link = table.connect(Hello(messages.VERSION, {}, "Ann"))
     table.tick(64)
     link.say(Inputs(table.tick_number + 1, table.tick_number, bytes((127, 0, 0)) * 8), order(7, 0, 18, 16, 1, 5))
@@ -58,7 +59,7 @@ def played(table: Stored) -> tuple[FakeLink, bytes]:
 
 
 def goes_on(table: Stored, before: FakeLink, token: bytes, rules: Told) -> None:
-    """All is as it was."""
+    """Checks that the game goes on as it was."""
     assert rules.told == []
     assert table.game.world.blocks.get(18, 16, 1) == 5
     link = table.connect(Hello(messages.VERSION, {}, "", resume=token))
@@ -70,7 +71,7 @@ def goes_on(table: Stored, before: FakeLink, token: bytes, rules: Told) -> None:
     table.game.api.remove(2)
     table.tick()
     assert 2 in [entity for snapshot in link.got(messages.Snapshot) for entity in gone(snapshot)]
-    # An order that had been answered is answered again, and not carried out again.
+    # A command that was answered before the restart is answered again, and not carried out again.
     link.say(order(7, 0, 18, 16, 1, 0))
     table.tick(2)
     assert table.game.world.blocks.get(18, 16, 1) == 5

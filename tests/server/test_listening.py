@@ -1,4 +1,4 @@
-"""Tests of the addresses that a server listens on, over real loopback sockets."""
+"""The addresses that a server listens on, over real loopback sockets."""
 
 import asyncio
 import errno
@@ -16,7 +16,7 @@ BACKLOG = 8
 
 
 def has_ipv6() -> bool:
-    """Whether this machine can use its IPv6 loopback address."""
+    """Returns whether this machine can use its IPv6 loopback address."""
     try:
         with socket.socket(socket.AF_INET6) as probe:
             probe.bind(("::1", 0))
@@ -47,7 +47,7 @@ def takes(host: str, port: int) -> bool:
 
 
 def named(monkeypatch: pytest.MonkeyPatch, *addresses: str) -> None:
-    """Gives every host name these addresses."""
+    """Makes every host name resolve to these addresses."""
 
     async def found(host: str | None, port: int, **_: object) -> list[tuple[Any, ...]]:
         def one(address: str) -> tuple[Any, ...]:
@@ -61,7 +61,7 @@ def named(monkeypatch: pytest.MonkeyPatch, *addresses: str) -> None:
 
 
 class Failing:
-    """`socket.create_server` that fails for IPv6 addresses first, with the given errors."""
+    """A `socket.create_server` that fails for IPv6 addresses first, with the given errors."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, errors: list[int]) -> None:
         self.errors = errors

@@ -1,4 +1,4 @@
-"""The live page: what it tells, that it is bounded, and that it asks for nothing from anywhere."""
+"""The live page: its content, its bounds, and that it loads nothing from elsewhere."""
 
 import base64
 import hashlib
@@ -30,7 +30,7 @@ def live(table: Table) -> Live:
 
 
 def entities(state: dict[str, Any]) -> dict[int, list[int]]:
-    """Template and position in hundredths of a block, by id."""
+    """Returns template and position (hundredths of a block) of the entities, by id."""
     rows = np.array(state["entities"]).reshape(-1, 5).tolist()
     return {row[0]: row[1:] for row in rows}
 
@@ -45,7 +45,7 @@ def heights(relief: Relief, number: int) -> tuple[Any, Any]:
 
 
 def top(world: World, x: int, y: int) -> tuple[int, int]:
-    """The height of a column above the lowest block, and what is there, by looking at each block."""
+    """Returns the height of a column above the lowest block and the kind of its top, by a look at each block."""
     low = world.scene.origin[2] * 32
     for z in reversed(range(low, low + world.scene.size[2] * 32)):
         if kind := world.blocks.get(x, y, z):
@@ -121,7 +121,7 @@ def test_of_a_crowd_some_are_shown_and_all_players() -> None:
     assert SHOWN_MAX / 2 < len(shown) <= 2 * SHOWN_MAX
     assert {1, late} <= shown.keys()
     assert shown.keys() <= {1, late, *crowd}
-    assert live(table).state()["entities"] == state["entities"], "the same ones again"
+    assert live(table).state()["entities"] == state["entities"], "the same entities again"
     assert state["figures"]["entities"] == len(crowd) + 2
 
 
@@ -133,7 +133,7 @@ def test_the_ground_is_what_lies_on_top() -> None:
     at = [(x, y) for y in range(TILE) for x in range(TILE)]
     assert [(int(found[y, x]), int(kinds[y, x])) for x, y in at] == [top(world, x - 32, y - 32) for x, y in at]
     world.unload_segment((0, 0, 0))
-    assert int(heights(relief, 0)[0][37, 37]) == 32, "what is not loaded is not seen, but what is below it"
+    assert int(heights(relief, 0)[0][37, 37]) == 32, "a segment that is not loaded is not shown, but the one below is"
 
 
 def test_only_the_tile_that_changed_is_another_one() -> None:

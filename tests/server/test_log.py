@@ -1,4 +1,4 @@
-"""Lines for people and for machines, and what is never in one."""
+"""Log lines for people and for machines, and secrets that no line has."""
 
 import io
 import json
@@ -61,7 +61,7 @@ def test_people_read_the_same() -> None:
     first, second = stream.getvalue().splitlines()
     assert "started" in first
     assert "scene=flat" in first
-    assert "\033" not in first, "no colours where nobody sees them"
+    assert "\033" not in first, "no colours without a terminal"
     assert "error" in second
     assert "cannot read" in second
 

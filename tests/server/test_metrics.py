@@ -1,4 +1,4 @@
-"""`/metrics` as Prometheus reads it."""
+"""The page `/metrics` as Prometheus reads it."""
 
 from typing import Any
 
@@ -11,7 +11,7 @@ from tests.tables import HELLO, Table
 
 
 def scraped(figures: dict[str, Any], **durations: Histogram) -> dict[tuple[str, str], float]:
-    """Values by the sample's name and its label."""
+    """Returns the values by the name and the label of each sample."""
     page = metrics_page(lambda: figures, lambda: durations)()
     assert page.status == 200
     families = text_string_to_metric_families(page.body.decode())
@@ -39,12 +39,12 @@ def test_a_game_in_figures() -> None:
         "used", "late", "substituted", "refused",
     }  # fmt: skip
     assert ("process_cpu_seconds_total", "") in found or ("python_gc_collections_total", "0") in found
-    assert ("sovereign_ticks_total", "") not in found, "what nobody counts is left out, not 0"
+    assert ("sovereign_ticks_total", "") not in found, "a counter without a source is left out, not 0"
 
 
 def test_every_counter_of_the_game_is_in_the_metrics() -> None:
     known = {*GAUGES, *COUNTERS, *LABELLED} | {f"inputs_{fate}" for fate in ("used", "late", "substituted", "refused")}
-    assert set(Counters.__dataclass_fields__) - known == {"refused"}, "which closed counts by code"
+    assert set(Counters.__dataclass_fields__) - known == {"refused"}, "`closed` counts by code"
 
 
 def test_durations_are_cumulative_and_add_up() -> None:

@@ -1,4 +1,4 @@
-"""A player's events: when they go, in what order, and that each is sent or counted."""
+"""A player's events: when they are sent, in what order, and that each is sent or counted."""
 
 import random
 
@@ -15,7 +15,7 @@ def happened(number: int, length: int = 0) -> bytes:
 
 
 def taken(outbox: Outbox, known: int, room: int = ALL) -> list[int | str]:
-    """The ticks of the events, and the numbers told as texts."""
+    """Returns the ticks of the taken events; a `NextHappened` is given as a text."""
     messages = map(decode_from_server, outbox.take(known, room))
     told: list[int | str] = []
     for message in messages:
@@ -55,7 +55,7 @@ def test_only_so_many_bytes_go_but_always_one_event() -> None:
 def test_the_oldest_of_too_many_are_dropped_and_the_next_ones_number_is_told() -> None:
     outbox = filled(*range(10), most=4)
     assert len(outbox) == 4
-    assert taken(outbox, 0) == ["6"], "at once, though none may go yet"
+    assert taken(outbox, 0) == ["6"], "at once, although no event may be sent yet"
     assert taken(outbox, 99) == [6, 7, 8, 9]
     assert outbox.add(10, happened(10), 4) is False
 

@@ -1,4 +1,4 @@
-"""How much may be on the way: by hand-made paths."""
+"""Flow control: the bytes that may be on the way, on links made by hand."""
 
 from server.replication.flow_control import HOLD_S_MAX, LEAST_BYTES, NARROW_S, RTT_WINDOW_S, SAMPLE_S, FlowControl
 
@@ -6,7 +6,7 @@ TICK_S = 1 / 32
 
 
 class Path:
-    """So much is on the way; None: it cannot tell."""
+    """A link on which `outstanding` bytes are on the way; None: the system cannot tell."""
 
     def __init__(self, outstanding: int | None = 0) -> None:
         self.outstanding = outstanding
@@ -21,7 +21,7 @@ class Path:
         return self.flow.window(snapshot_bytes, TICK_S, now)
 
     def stream(self, seconds: float, bytes_per_tick: int, start: float = 0.0) -> float:
-        """Sends evenly while so much is on the way; the time afterwards."""
+        """Sends evenly for some seconds while `outstanding` bytes are on the way. Returns the time afterwards."""
         now = start
         for _ in range(int(seconds / TICK_S)):
             self.flow.sent_bytes += bytes_per_tick
@@ -68,7 +68,7 @@ def test_of_a_full_path_the_width_is_no_distance() -> None:
     path = Path()
     now = path.stream(2.0, 320) + SAMPLE_S
     path.outstanding = 10**6
-    assert path.window(320, now) < path.flow.outstanding == 10**6  # full
+    assert path.window(320, now) < path.flow.outstanding == 10**6  # the link is full
     path.flow.answered(0.1, 512, now)
     assert path.flow.least_rtt_s == 0.1 - 512 / path.flow.rate
 
@@ -147,10 +147,10 @@ def test_where_the_system_cannot_tell_what_the_client_has_not_acknowledged_is_on
     path.flow.look()
     assert path.flow.outstanding == 300
     path.flow.acked(102)
-    path.flow.sent_bytes += 1000  # terrain: it counts with the next snapshot, or nothing would go any more
+    path.flow.sent_bytes += 1000  # terrain counts only with the next snapshot, or nothing would ever be sent again
     path.flow.look()
     assert path.flow.outstanding == 100
-    path.outstanding = 700  # our own buffers are full, whatever it says
+    path.outstanding = 700  # our own buffers are full, whatever the client acknowledges
     path.flow.acked(103)
     path.flow.look()
     assert path.flow.outstanding == 700

@@ -1,4 +1,4 @@
-"""Pages by path, and what a page that fails looks like."""
+"""HTTP pages by path, and the answer of a page that fails."""
 
 import json
 

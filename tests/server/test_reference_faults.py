@@ -1,4 +1,4 @@
-"""Faults of the reference engine that concern the network, as regressions: see also tests/shared for the physics."""
+"""Faults of the reference engine that concern the network; tests/shared has those of its physics."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""What changed since any tick, and that a client which is told so has exactly what the server has."""
+"""Changes since any tick: a client that applies them has exactly the server's state."""
 
 import random
 
@@ -28,7 +28,7 @@ HISTORY = bounds(64).history
 
 
 def row_of_segments() -> Scene:
-    """Seven segments in a row along x, their floor with holes into the void at either end."""
+    """Returns a scene of seven segments in a row along x. Its floor has a hole into the void at each end."""
     return scene(
         [[-60, 0, 0, 90, 32, 1, 1], [40, 8, 1, 42, 9, 3, 2]],
         origin=(-3, 0, 0),
@@ -38,7 +38,7 @@ def row_of_segments() -> Scene:
 
 
 class Recorded:
-    """A world with its log, ticking."""
+    """A world with its change log, which ticks."""
 
     def __init__(self, compiled: bool) -> None:
         self.world = World(row_of_segments(), compiled=compiled)
@@ -58,11 +58,11 @@ class Recorded:
         self.world.set_block(x, y, z, kind)
 
     def changed(self, since: int) -> set[Cell]:
-        """The segments of which there is something to tell."""
+        """Returns the segments that have changed."""
         return {segment for segment in self.world.scene.segments() if self.log.since(since)[segment]}
 
     def part(self, segment: Cell, since: int) -> tuple[list[int], list[int], list[tuple[int, int]]]:
-        """Ids of the rows, ids of the gone, edits."""
+        """Returns the ids of the rows, the ids of the gone, and the edits."""
         encoded = self.log.since(since)[segment]
         if not encoded:
             return [], [], []
@@ -75,154 +75,154 @@ class Recorded:
 
 
 @pytest.fixture
-def told(compiled: bool) -> Recorded:
+def recorded(compiled: bool) -> Recorded:
     return Recorded(compiled)
 
 
-def test_what_nothing_happened_to_is_not_mentioned(told: Recorded) -> None:
-    told.world.spawn("box", (5, 5, 1))
-    told.tick(3)
-    assert told.changed(2) == set()
-    assert told.part(HOME, 2) == ([], [], [])
-    assert told.part(HOME, 0) == ([1], [], [])
+def test_what_nothing_happened_to_is_not_mentioned(recorded: Recorded) -> None:
+    recorded.world.spawn("box", (5, 5, 1))
+    recorded.tick(3)
+    assert recorded.changed(2) == set()
+    assert recorded.part(HOME, 2) == ([], [], [])
+    assert recorded.part(HOME, 0) == ([1], [], [])
 
 
-def test_a_keyframe_is_all_that_is_there_however_long_ago_it_moved(told: Recorded) -> None:
+def test_a_keyframe_is_all_that_is_there_however_long_ago_it_moved(recorded: Recorded) -> None:
     for x in (5, 9, 40, -5):
-        told.world.spawn("box", (x, 5, 1))
-    told.tick(HISTORY + 5)
-    assert told.part(HOME, KEYFRAME) == ([1, 2], [], [])
-    assert told.part(EAST, KEYFRAME) == ([3], [], [])
-    assert told.part((2, 0, 0), KEYFRAME) == ([], [], [])
+        recorded.world.spawn("box", (x, 5, 1))
+    recorded.tick(HISTORY + 5)
+    assert recorded.part(HOME, KEYFRAME) == ([1, 2], [], [])
+    assert recorded.part(EAST, KEYFRAME) == ([3], [], [])
+    assert recorded.part((2, 0, 0), KEYFRAME) == ([], [], [])
 
 
-def test_who_crosses_a_border_is_gone_here_and_there_whole(told: Recorded) -> None:
-    told.world.spawn("box", (31, 5, 1))
-    told.tick()
-    told.world.place(1, (33, 5, 1))
-    told.tick()
-    assert told.changed(1) == {HOME, EAST}
-    assert told.part(HOME, 1) == ([], [1], [])
-    assert told.part(EAST, 1) == ([1], [], [])
-    assert told.log.segment(1) == EAST
+def test_who_crosses_a_border_is_gone_here_and_there_whole(recorded: Recorded) -> None:
+    recorded.world.spawn("box", (31, 5, 1))
+    recorded.tick()
+    recorded.world.place(1, (33, 5, 1))
+    recorded.tick()
+    assert recorded.changed(1) == {HOME, EAST}
+    assert recorded.part(HOME, 1) == ([], [1], [])
+    assert recorded.part(EAST, 1) == ([1], [], [])
+    assert recorded.log.segment(1) == EAST
 
 
-def test_who_came_back_is_not_gone(told: Recorded) -> None:
-    told.world.spawn("box", (31, 5, 1))
-    told.tick()
+def test_who_came_back_is_not_gone(recorded: Recorded) -> None:
+    recorded.world.spawn("box", (31, 5, 1))
+    recorded.tick()
     for x in (33, 31):
-        told.world.place(1, (x, 5, 1))
-        told.tick()
-    assert told.part(HOME, 1) == ([1], [], [])
-    assert told.part(EAST, 1) == ([], [1], [])
-    assert told.part(EAST, 2) == ([], [1], [])
+        recorded.world.place(1, (x, 5, 1))
+        recorded.tick()
+    assert recorded.part(HOME, 1) == ([1], [], [])
+    assert recorded.part(EAST, 1) == ([], [1], [])
+    assert recorded.part(EAST, 2) == ([], [1], [])
 
 
-def test_the_removed_are_gone_and_an_entity_never_recorded_is_not_mentioned(told: Recorded) -> None:
-    told.world.spawn("box", (5, 5, 1))
-    told.tick()
-    told.remove(1)
-    told.remove(told.world.spawn("box", (9, 5, 1)))
-    told.tick()
-    assert told.part(HOME, 1) == ([], [1], [])
-    assert told.part(HOME, 0) == ([], [1], [])
-    assert told.part(HOME, KEYFRAME) == ([], [], [])
+def test_the_removed_are_gone_and_an_entity_never_recorded_is_not_mentioned(recorded: Recorded) -> None:
+    recorded.world.spawn("box", (5, 5, 1))
+    recorded.tick()
+    recorded.remove(1)
+    recorded.remove(recorded.world.spawn("box", (9, 5, 1)))
+    recorded.tick()
+    assert recorded.part(HOME, 1) == ([], [1], [])
+    assert recorded.part(HOME, 0) == ([], [1], [])
+    assert recorded.part(HOME, KEYFRAME) == ([], [], [])
 
 
-def test_ids_are_not_used_again_but_rows_are(told: Recorded) -> None:
-    told.world.spawn("box", (5, 5, 1))
-    told.tick(3)
-    told.remove(1)
-    assert told.world.spawn("box", (5, 5, 1)) == 2
-    told.tick()
-    assert told.part(HOME, 3) == ([2], [1], [])
+def test_ids_are_not_used_again_but_rows_are(recorded: Recorded) -> None:
+    recorded.world.spawn("box", (5, 5, 1))
+    recorded.tick(3)
+    recorded.remove(1)
+    assert recorded.world.spawn("box", (5, 5, 1)) == 2
+    recorded.tick()
+    assert recorded.part(HOME, 3) == ([2], [1], [])
 
 
-def test_an_edit_is_told_as_the_block_is_now(told: Recorded) -> None:
+def test_an_edit_is_told_as_the_block_is_now(recorded: Recorded) -> None:
     at = 3 << 10 | 2 << 5 | 1
     for kind in (7, 0, 9):
-        told.edit(1, 2, 3, kind)
-        told.tick()
-    assert [told.part(HOME, since)[2] for since in (0, 1, 2, 3)] == [[(at, 9)]] * 3 + [[]]
+        recorded.edit(1, 2, 3, kind)
+        recorded.tick()
+    assert [recorded.part(HOME, since)[2] for since in (0, 1, 2, 3)] == [[(at, 9)]] * 3 + [[]]
 
 
-def test_an_edit_back_is_told_too(told: Recorded) -> None:
-    told.edit(-1, 31, 31, 5)
-    told.tick()
-    told.edit(-1, 31, 31, 0)
-    told.tick()
-    assert told.part(WEST, 1)[2] == [(31 << 10 | 31 << 5 | 31, 0)]
-    assert told.changed(1) == {WEST}
+def test_an_edit_back_is_told_too(recorded: Recorded) -> None:
+    recorded.edit(-1, 31, 31, 5)
+    recorded.tick()
+    recorded.edit(-1, 31, 31, 0)
+    recorded.tick()
+    assert recorded.part(WEST, 1)[2] == [(31 << 10 | 31 << 5 | 31, 0)]
+    assert recorded.changed(1) == {WEST}
 
 
-def test_every_change_of_a_block_in_the_world_is_told(told: Recorded) -> None:
-    told.world.fill((1, 2, 3), (3, 3, 4), 7)
-    told.world.write_blocks(WEST, [5], [9])
-    told.tick()
+def test_every_change_of_a_block_in_the_world_is_told(recorded: Recorded) -> None:
+    recorded.world.fill((1, 2, 3), (3, 3, 4), 7)
+    recorded.world.write_blocks(WEST, [5], [9])
+    recorded.tick()
     at = 3 << 10 | 2 << 5 | 1
-    assert told.part(HOME, 0)[2] == [(at, 7), (at + 1, 7)]
-    assert told.part(WEST, 0)[2] == [(5, 9)]
+    assert recorded.part(HOME, 0)[2] == [(at, 7), (at + 1, 7)]
+    assert recorded.part(WEST, 0)[2] == [(5, 9)]
 
 
-def test_an_edit_that_changes_nothing_is_not_told(told: Recorded) -> None:
-    told.edit(1, 2, 3, 7)
-    told.tick()
-    told.edit(1, 2, 3, 7)
-    told.tick()
-    assert told.changed(1) == set()
+def test_an_edit_that_changes_nothing_is_not_told(recorded: Recorded) -> None:
+    recorded.edit(1, 2, 3, 7)
+    recorded.tick()
+    recorded.edit(1, 2, 3, 7)
+    recorded.tick()
+    assert recorded.changed(1) == set()
 
 
-def test_who_was_acted_upon_is_flagged_in_every_part_that_tells_of_it(told: Recorded) -> None:
+def test_who_was_acted_upon_is_flagged_in_every_part_that_tells_of_it(recorded: Recorded) -> None:
     for x in (5, 9):
-        told.world.spawn("box", (x, 5, 1))
-    told.tick()
-    told.world.place(1, (7, 5, 3))
-    told.log.note_act(1)
-    told.tick(2)
-    assert told.log.since(2)[HOME] == b"", "it falls, as was to be expected"
+        recorded.world.spawn("box", (x, 5, 1))
+    recorded.tick()
+    recorded.world.place(1, (7, 5, 3))
+    recorded.log.note_act(1)
+    recorded.tick(2)
+    assert recorded.log.since(2)[HOME] == b"", "it falls, as expected"
     for since in (1, 0):
-        _, states, _ = decode_parts([msgpack.unpackb(told.log.since(since)[HOME])], 255)
+        _, states, _ = decode_parts([msgpack.unpackb(recorded.log.since(since)[HOME])], 255)
         assert states[states[:, FLAGS] & ACTED != 0, ID].tolist() == [1]
 
 
-def flags(told: Recorded, segment: Cell, since: int) -> dict[int, int]:
-    """The flags of the rules in a part, by entity."""
-    _, states, _ = decode_parts([msgpack.unpackb(told.log.since(since)[segment])], 255)
+def flags(recorded: Recorded, segment: Cell, since: int) -> dict[int, int]:
+    """Returns the flags of the rules in a part, by entity."""
+    _, states, _ = decode_parts([msgpack.unpackb(recorded.log.since(since)[segment])], 255)
     return dict(zip(states[:, ID].tolist(), (states[:, FLAGS] & ~FALLING).tolist(), strict=True))
 
 
-def test_who_was_placed_is_flagged_as_such_and_who_was_thrown_or_changed_is_not(told: Recorded) -> None:
+def test_who_was_placed_is_flagged_as_such_and_who_was_thrown_or_changed_is_not(recorded: Recorded) -> None:
     for x in (5, 9, 13, 17):
-        told.world.spawn("box", (x, 5, 1))
-    told.tick()
-    told.world.place(1, (7, 5, 1))
+        recorded.world.spawn("box", (x, 5, 1))
+    recorded.tick()
+    recorded.world.place(1, (7, 5, 1))
     for entity in (2, 3):
-        told.log.note_act(entity)
-    told.world.set_velocity(2, (0, 0, 5))
-    told.world.set_template(3, "ghost")
-    told.world.spawn("box", (21, 5, 1))
-    told.tick()
+        recorded.log.note_act(entity)
+    recorded.world.set_velocity(2, (0, 0, 5))
+    recorded.world.set_template(3, "ghost")
+    recorded.world.spawn("box", (21, 5, 1))
+    recorded.tick()
     acts = {1: ACTED | PLACED, 2: ACTED, 3: ACTED}
-    assert flags(told, HOME, 1) == {**acts, 5: 0}
-    told.tick()
-    assert flags(told, HOME, 1) == {**acts, 5: 0}
-    assert flags(told, HOME, 0) == {**acts, 4: 0, 5: 0}
+    assert flags(recorded, HOME, 1) == {**acts, 5: 0}
+    recorded.tick()
+    assert flags(recorded, HOME, 1) == {**acts, 5: 0}
+    assert flags(recorded, HOME, 0) == {**acts, 4: 0, 5: 0}
 
 
 def test_who_was_placed_out_of_a_segment_is_flagged_in_the_other_and_in_its_keyframe_for_a_while(
-    told: Recorded,
+    recorded: Recorded,
 ) -> None:
     for x in (5, 40):
-        told.world.spawn("stone", (x, 5, 1))
-    told.tick(2)
-    assert flags(told, EAST, KEYFRAME) == {2: 0}
-    told.world.place(1, (45, 5, 1))
-    told.tick()
+        recorded.world.spawn("stone", (x, 5, 1))
+    recorded.tick(2)
+    assert flags(recorded, EAST, KEYFRAME) == {2: 0}
+    recorded.world.place(1, (45, 5, 1))
+    recorded.tick()
     for _ in range(HISTORY):
-        assert flags(told, EAST, 2 if told.world.tick - 2 <= HISTORY else 3).get(1, 0) in (0, ACTED | PLACED)
-        assert flags(told, EAST, KEYFRAME) == {1: ACTED | PLACED, 2: 0}
-        told.tick()
-    assert flags(told, EAST, KEYFRAME) == {1: 0, 2: 0}
+        assert flags(recorded, EAST, 2 if recorded.world.tick - 2 <= HISTORY else 3).get(1, 0) in (0, ACTED | PLACED)
+        assert flags(recorded, EAST, KEYFRAME) == {1: ACTED | PLACED, 2: 0}
+        recorded.tick()
+    assert flags(recorded, EAST, KEYFRAME) == {1: 0, 2: 0}
 
 
 def test_whoever_places_an_entity_it_is_told() -> None:
@@ -241,85 +241,85 @@ def test_whoever_places_an_entity_it_is_told() -> None:
     assert world.placed == set()
 
 
-def test_history_reaches_back_as_far_as_it_says_and_not_further(told: Recorded) -> None:
-    told.world.spawn("box", (5, 5, 1))
-    told.tick(1)
-    told.world.place(1, (6, 5, 1))
-    told.tick(HISTORY)
-    assert told.changed(1) == {HOME}
-    assert told.part(HOME, 1)[0] == [1]
-    told.tick()
-    assert told.changed(2) == set()
+def test_history_reaches_back_as_far_as_it_says_and_not_further(recorded: Recorded) -> None:
+    recorded.world.spawn("box", (5, 5, 1))
+    recorded.tick(1)
+    recorded.world.place(1, (6, 5, 1))
+    recorded.tick(HISTORY)
+    assert recorded.changed(1) == {HOME}
+    assert recorded.part(HOME, 1)[0] == [1]
+    recorded.tick()
+    assert recorded.changed(2) == set()
     with pytest.raises(AssertionError, match="lost track"):
-        told.log.encode(HOME, 1)
+        recorded.log.encode(HOME, 1)
 
 
-def test_the_void_below_the_floor_has_parts_like_any_segment(told: Recorded) -> None:
-    told.world.spawn("box", (-80, 5, 0))
-    told.world.spawn("box", (5, 5, 1))
-    told.tick(20)
-    below = told.log.segment(1)
+def test_the_void_below_the_floor_has_parts_like_any_segment(recorded: Recorded) -> None:
+    recorded.world.spawn("box", (-80, 5, 0))
+    recorded.world.spawn("box", (5, 5, 1))
+    recorded.tick(20)
+    below = recorded.log.segment(1)
     assert below == (-3, 0, -1)
-    assert told.part(below, KEYFRAME) == ([1], [], [])
-    assert told.part(below, 19) == ([], [], []), "it falls on"
-    assert told.part(below, 0) == ([1], [], [])
-    told.remove(1)
-    told.tick()
-    assert told.part(below, 20) == ([], [1], [])
+    assert recorded.part(below, KEYFRAME) == ([1], [], [])
+    assert recorded.part(below, 19) == ([], [], []), "it goes on falling"
+    assert recorded.part(below, 0) == ([1], [], [])
+    recorded.remove(1)
+    recorded.tick()
+    assert recorded.part(below, 20) == ([], [1], [])
 
 
-def test_one_encoding_serves_all_who_ask_for_the_same(told: Recorded) -> None:
-    told.world.spawn("box", (5, 5, 9))
-    told.tick(2)
-    assert told.log.since(1)[HOME] is told.log.since(1)[HOME]
-    assert told.log.packed(HOME) is told.log.packed(HOME)
-    before = told.log.packed(HOME)
-    told.edit(1, 1, 1, 1)
-    after = told.log.packed(HOME)
+def test_one_encoding_serves_all_who_ask_for_the_same(recorded: Recorded) -> None:
+    recorded.world.spawn("box", (5, 5, 9))
+    recorded.tick(2)
+    assert recorded.log.since(1)[HOME] is recorded.log.since(1)[HOME]
+    assert recorded.log.packed(HOME) is recorded.log.packed(HOME)
+    before = recorded.log.packed(HOME)
+    recorded.edit(1, 1, 1, 1)
+    after = recorded.log.packed(HOME)
     assert before != after is not None
     assert unpack(after).reshape(SEGMENT, SEGMENT, SEGMENT)[1, 1, 1] == 1
 
 
-def test_what_is_seen_around_a_segment_is_joined_once_for_all_who_see_the_same(told: Recorded) -> None:
-    told.tick()
+def test_what_is_seen_around_a_segment_is_joined_once_for_all_who_see_the_same(recorded: Recorded) -> None:
+    recorded.tick()
     for x in (3, 35):
-        told.edit(x, 3, 9, 1)
-    told.tick()
-    known = told.log.since(1)
+        recorded.edit(x, 3, 9, 1)
+    recorded.tick()
+    known = recorded.log.since(1)
     all_three, both = (HOME, EAST, WEST), (HOME, WEST)
     assert known.together(all_three) == (2, known[HOME] + known[EAST])
     assert known.together(all_three)[1] is known.together(all_three)[1]
-    assert known.together(both) == (1, known[HOME]), "what one does not see is not what another sees"
+    assert known.together(both) == (1, known[HOME]), "another view is joined separately"
     assert known.together(all_three) == (2, known[HOME] + known[EAST])
 
 
-def test_a_tick_packs_few_segments_and_the_next_one_packs_on(told: Recorded) -> None:
+def test_a_tick_packs_few_segments_and_the_next_one_packs_on(recorded: Recorded) -> None:
     for i in range(PACKS_PER_TICK):
-        told.edit(1, 1, 1, i + 1)
-        assert told.log.packed(HOME) is not None
-    assert told.log.packed(EAST) is None
-    assert told.log.packed(HOME) is not None, "it is packed already"
-    told.tick()
-    assert told.log.packed(EAST) is not None
+        recorded.edit(1, 1, 1, i + 1)
+        assert recorded.log.packed(HOME) is not None
+    assert recorded.log.packed(EAST) is None
+    assert recorded.log.packed(HOME) is not None, "it is packed already"
+    recorded.tick()
+    assert recorded.log.packed(EAST) is not None
 
 
-def test_memory_is_bounded_by_history_and_by_what_exists(told: Recorded) -> None:
+def test_memory_is_bounded_by_history_and_by_what_exists(recorded: Recorded) -> None:
     for i in range(HISTORY + 50):
-        told.world.spawn("box", (5, 5, 20))
-        told.tick()
-        told.log.since(max(0, i - 3))[HOME]
-        told.remove(i + 1)
-    told.tick(HISTORY + 1)
-    assert told.log._home == {}
-    assert len(told.log._parts) == 0
-    assert not any(slot[1].changed or slot[1].gone for slot in told.log._ticks._slots if slot)
+        recorded.world.spawn("box", (5, 5, 20))
+        recorded.tick()
+        recorded.log.since(max(0, i - 3))[HOME]
+        recorded.remove(i + 1)
+    recorded.tick(HISTORY + 1)
+    assert recorded.log._home == {}
+    assert len(recorded.log._parts) == 0
+    assert not any(slot[1].changed or slot[1].gone for slot in recorded.log._ticks._slots if slot)
 
 
-# -- a client that is told, with any skips and any interest --------------------------------------------------
+# -- a client with any skips and any interest -----------------------------------------------------------------
 
 
 class Model:
-    """All that a client must do with what it is told, as plainly as possible. It is the link as well."""
+    """A client in the plainest form: it applies messages to a world. It is the server's link, too."""
 
     def __init__(self, scene: Scene) -> None:
         self.world = World(scene, compiled=False)
@@ -328,7 +328,7 @@ class Model:
         self.edits: dict[Cell, list[np.ndarray]] = {}
         self.tick = -1
         self.stuck = False
-        self.told = 0
+        self.turns = 0
 
     def outstanding(self) -> int:
         return 1 << 30 if self.stuck else 0
@@ -352,7 +352,7 @@ class Model:
         new = set(states[:, ID].tolist())
         homes = {state[ID]: home_of(state) for state in self.world.states().tolist()}
         assert snapshot.tick == self.tick + 1 or not len(turns)
-        self.told += len(turns)
+        self.turns += len(turns)
         dropped = {tuple(segment) for segment in np.frombuffer(snapshot.drops, "<i4").reshape(-1, 3).tolist()}
         for segment in dropped:
             self.blocks.pop(segment, None)
@@ -374,7 +374,7 @@ class Model:
     def terrain(self, segment: Cell, offset: int, total: int, chunk: bytes) -> None:
         if offset == 0:
             self.coming[segment] = bytearray()
-            self.edits[segment] = []  # what was told before is in what was packed now
+            self.edits[segment] = []  # earlier edits are contained in the blocks packed now
         assert len(self.coming[segment]) == offset
         self.coming[segment] += chunk
         if len(self.coming[segment]) == total:
@@ -391,8 +391,8 @@ def home_of(state: list[int]) -> Cell:
     return x, y, z
 
 
-class Told:
-    """A game in which everything changes at random, and one client with a link that stalls at random."""
+class Stalling:
+    """A game in which everything changes at random, and one client whose link stalls at random."""
 
     def __init__(self, seed: int) -> None:
         self.rng = random.Random(seed)
@@ -447,7 +447,7 @@ class Told:
         self.model.stuck = tick < self.stuck_until
 
     def check(self) -> None:
-        """The client has just what the server has in the segments it sees."""
+        """Checks that the client has exactly the server's state in the segments that it sees."""
         game, model, session = self.game, self.model, self.session
         assert model.tick == game.world.tick
         sees = session.stream.view.sees
@@ -463,22 +463,22 @@ class Told:
 
 @pytest.mark.parametrize("seed", range(6))
 def test_a_client_has_what_the_server_has_whatever_it_skipped_and_wherever_it_looked(seed: int) -> None:
-    told, checks = Told(seed), 0
-    told.tick()
+    recorded, checks = Stalling(seed), 0
+    recorded.tick()
     for _ in range(400):
-        told.stir()
-        told.stir()
-        told.stall()
-        told.tick()
-        if not told.model.stuck and told.session.stream.view.complete:
-            told.check()
+        recorded.stir()
+        recorded.stir()
+        recorded.stall()
+        recorded.tick()
+        if not recorded.model.stuck and recorded.session.stream.view.complete:
+            recorded.check()
             checks += 1
-    told.model.stuck = False
+    recorded.model.stuck = False
     for _ in range(60):
-        told.tick()
-    told.check()
-    assert told.session.stream.view.complete
+        recorded.tick()
+    recorded.check()
+    assert recorded.session.stream.view.complete
     assert checks > 50
-    assert told.model.told > 10
-    assert not told.session.stream.terrain_due
-    assert told.game.counters.snapshots_skipped > 50
+    assert recorded.model.turns > 10
+    assert not recorded.session.stream.terrain_due
+    assert recorded.game.counters.snapshots_skipped > 50

@@ -1,4 +1,5 @@
-"""Who is cut off keeps the entity for a while, and goes on with the token of the latest welcome."""
+"""A player whose connection is lost keeps the entity for a while, and reconnects with the token of the latest
+welcome."""
 
 import pytest
 
@@ -30,7 +31,7 @@ def back(table: Table, resume: bytes) -> FakeLink:
 
 
 def heard(table: Table, link: FakeLink) -> None:
-    """The client has got its welcome: it acknowledges a snapshot."""
+    """Makes the client acknowledge a snapshot, so the server knows that it has got its welcome."""
     link.say(Inputs(table.tick_number + 1, table.tick_number, bytes(3)))
 
 
@@ -43,7 +44,7 @@ def test_who_comes_back_in_time_goes_on_as_before(table: Table) -> None:
     table.lose(link)
     table.tick(40)
     place = table.game.world.position(me)
-    assert place[0] > 16.5, "the inputs that had come were carried out"
+    assert place[0] > 16.5, "the inputs that had arrived were used"
     again = back(table, token(link))
     assert again.got(Welcome)[-1].entity == me
     assert table.game.world.position(me) == place
@@ -82,13 +83,13 @@ def test_a_welcome_that_was_lost_on_its_way_costs_nothing(table: Table) -> None:
     me, first = link.session.entity, token(link)
     heard(table, link)
     table.lose(link)
-    table.lose(back(table, first))  # cut off before it heard of its new token
+    table.lose(back(table, first))  # the connection is lost before the client gets its new token
     table.tick()
     assert back(table, first).session.entity == me
 
 
 def test_a_token_that_is_shown_uses_up_those_before_it(table: Table) -> None:
-    """Though its welcome has not been acknowledged: who shows it has read it."""
+    """The client that shows it has read its welcome, even if it has not acknowledged a snapshot."""
     link = table.join()
     me, tokens = link.session.entity, [token(link)]
     for _ in range(5):
@@ -166,7 +167,7 @@ def test_only_the_latest_verdicts_are_kept(table: Table) -> None:
 
 
 def test_who_was_never_heard_of_is_kept_for_a_moment_only() -> None:
-    """Else whoever joins and goes, time and again, would fill the world with the entities of nobody."""
+    """Otherwise clients that join and disconnect again and again would fill the world with entities."""
     table = Table(resume_s=10.0)
     silent, known = table.join(), table.join()
     heard(table, known)
@@ -175,7 +176,7 @@ def test_who_was_never_heard_of_is_kept_for_a_moment_only() -> None:
     table.tick(int(UNACKNOWLEDGED_S / table.tick_s) + 1)
     assert list(table.game.players) == [known.session.entity]
     again = back(table, token(known))
-    table.lose(again)  # cut off before it was heard of over this connection, but it is known
+    table.lose(again)  # lost before its first acknowledgement over this connection, but the client is known
     table.tick(int(UNACKNOWLEDGED_S / table.tick_s) + 1)
     assert list(table.game.players) == [known.session.entity]
 
@@ -184,7 +185,7 @@ def test_who_comes_back_to_a_full_server_takes_over_the_own_place() -> None:
     table = Table(Limits(clients_max=1), resume_s=10.0)
     link = table.join()
     heard(table, link)
-    again = back(table, token(link))  # ahead of the loss
+    again = back(table, token(link))  # before the loss is noticed
     assert again.session.entity == link.session.entity
     assert link.refusal()[0] == messages.TAKEN_OVER
     assert back(table, b"").refusal()[0] == messages.FULL
@@ -201,5 +202,5 @@ def test_those_away_make_room_where_there_are_as_many_players_as_there_may_be() 
     assert list(table.game.players) == [link.session.entity for link in (links[0], links[2], newcomer)]
     assert len(table.game.world) == 3
     table.lose(links[2])
-    assert back(table, token(links[0])).session.entity == links[0].session.entity, "who comes back needs no room"
+    assert back(table, token(links[0])).session.entity == links[0].session.entity, "a return needs no room"
     assert len(table.game.players) == 3

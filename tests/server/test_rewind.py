@@ -1,4 +1,4 @@
-"""The past is what it was, to the bit; rays are exact; and a shot meets what its player aimed at."""
+"""Lag compensation: the past is exact to the bit, rays are exact, and a shot hits what its player aimed at."""
 
 import itertools
 import math
@@ -39,7 +39,7 @@ def rewinding(**changes: object) -> tuple[World, Rewind]:
 
 
 def crowd(seed: int, ticks: int, compiled: bool, each: Callable[[World, Rewind], None]) -> None:
-    """Entities that walk, come, go, change and are placed; `each` is called after every tick."""
+    """Runs a world in which entities walk, appear, vanish, change and are placed. Calls `each` after every tick."""
     rng = random.Random(seed)
     world, rewind = rewinding(tick_rate=rng.choice((30, 32, 60)), compiled=compiled)
     for _ in range(ticks):
@@ -141,14 +141,14 @@ def test_until_its_tick_is_over_an_entity_that_is_placed_and_changed_is_what_and
         world.step()
         rewind.record()
     world.place(thing, (9, 0, 0))
-    world.set_template(thing, "slab")  # 4 blocks wide
+    world.set_template(thing, "slab")  # the box is 4 blocks wide
     world.step()
     rewind.record()
     for seen, ids in ((3.5, [thing]), (4.0, [thing]), (4.75, [thing]), (5.0, [])):
         past = rewind.at(seen)
         assert past.box((0, 0, 0), (0.5, 0.5, 0.5)) == ids
         assert past.position(thing) == ((0, 0, 0) if ids else (9, 0, 0))
-        assert past.box((1, 0, 0), (9, 4, 1)) == [], "no box of the new template where it was"
+        assert past.box((1, 0, 0), (9, 4, 1)) == [], "the box of the new template was not there"
         assert past.box((12, 3, 0), (12.5, 3.5, 0.5)) == ([] if ids else [thing])
 
 
@@ -178,7 +178,7 @@ def test_a_gap_that_began_before_the_window_is_remembered_and_memory_is_bounded(
             assert rewind.at(19.5, 0, [(19, 25)]).position(thing)[0] == 0
             assert rewind.at(24.5, 0, [(17, 25)]).position(thing)[0] == 0
         assert len(rewind._undo) <= 16
-    assert len(rewind._undo) == 8, "nobody has been placed for a while"
+    assert len(rewind._undo) == 8, "nothing has been placed for a while"
 
 
 def test_the_moment_is_clamped_and_must_be_a_number() -> None:
@@ -215,7 +215,7 @@ DIRECTION = VEC.filter(any)
 
 
 def span(a: float, way: float, low: float, high: float) -> tuple[Fraction, Fraction] | None:
-    """The open interval of t in which a + t * way is between low and high; None: never."""
+    """Returns the open interval of t in which a + t * way is between low and high; None: never."""
     if way == 0:
         return (Fraction(-(10**400)), Fraction(10**400)) if low <= a < high else None
     ends = sorted((Fraction(end) - Fraction(a)) / Fraction(way) for end in (low, high))
@@ -223,7 +223,7 @@ def span(a: float, way: float, low: float, high: float) -> tuple[Fraction, Fract
 
 
 def through(ray: Ray, low: tuple[float, ...], high: tuple[float, ...]) -> Fraction | None:
-    """By brute force: where a ray enters a box that it goes through for more than a point."""
+    """Returns by brute force where a ray enters a box, or None if the ray touches it at most in a point."""
     first, last = Fraction(0), Fraction(10**400)
     for a, way, lo, hi in zip(ray.origin, ray.direction, low, high, strict=True):
         found = span(a, way, lo, hi)
@@ -247,7 +247,7 @@ def test_the_first_block_is_the_one_that_brute_force_finds(
     origin: Vec, way: Vec, length: float, rng: random.Random
 ) -> None:
     ray = Ray(origin, way, length)
-    # Reached within the length, and no more: cells further away than that need not be looked at.
+    # The cell is reached within the length. Cells further away need not be checked.
     spans = [range(math.floor(a - length) - 1, math.floor(a + length) + 2) for a in origin]
     cells: dict[Cell, Fraction] = {}
     for x, y, z in itertools.product(*spans):
@@ -356,15 +356,16 @@ def test_all_hits_are_those_of_brute_force(origin: Vec, way: Vec, seed: int) -> 
 
 
 def strafe(core: Core, rng: random.Random) -> Input:
-    """To and fro at full speed, two seconds each way."""
+    """Walks to and fro at full speed, two seconds each way."""
     assert core.prediction is not None
     return Input(0, 127 if core.prediction.predicted.tick // 64 % 2 else -127)
 
 
 class Range:
-    """A shooter on a link of 200 ms (RTT) and a strafing target: every tenth of a second a shot at where it is drawn.
+    """A shooter on a link of 200 ms (RTT) and a strafing target. Every tenth of a second, a shot at where the target is
+    drawn.
 
-    The shot says when it was fired by the shooter's own picture, and reaches the server half a round trip later.
+    The shot carries the shooter's view tick, and reaches the server half a round trip later.
     """
 
     def __init__(self, delay_s: float, seed: int, limits: Limits | None = None) -> None:
@@ -387,7 +388,7 @@ class Range:
         (drawn,) = [figure for figure in view.others if figure.entity == self.target.core.entity]
         assert view.me is not None
         eye = (view.me.position[0], view.me.position[1], view.me.position[2] + 1.6)
-        # Its flank, a hand's breadth within: aimed well, and with nothing to spare for guessing.
+        # The aim is the target's flank, a hand's breadth within: exact, and without room for an error.
         aim = (drawn.position[0], drawn.position[1] + 0.2, drawn.position[2] + 1.0)
         way = (aim[0] - eye[0], aim[1] - eye[1], aim[2] - eye[2])
         core = self.shooter.core
@@ -413,7 +414,7 @@ def test_at_200_ms_a_shot_at_what_is_drawn_hits_always_and_without_rewinding_har
     run = Range(0.1, 5)
     assert run.shots == 100
     assert run.rewound == 100
-    assert run.plain <= 15  # where the target turns round, it comes back to where it was drawn
+    assert run.plain <= 15  # where the target turns round, it returns to where it was drawn
     assert 0.19 < max(run.lags) <= 0.25
 
 

@@ -1,4 +1,4 @@
-"""A game on top: hooks, what they may do, what the players are told, and that a broken one stops nobody."""
+"""Rules of a game: hooks, what they may do, what clients get, and that failing rules stop nobody."""
 
 from typing import Any
 
@@ -19,7 +19,7 @@ from tests.worlds import scene
 
 
 class Told(Rules):
-    """Writes down what it is told."""
+    """Rules that record the calls of their hooks."""
 
     def __init__(self) -> None:
         self.told: list[tuple[Any, ...]] = []
@@ -59,7 +59,7 @@ def table(rules: Told) -> Table:
 
 
 def attributes(link: FakeLink) -> dict[int, Any]:
-    """What a client makes of all that it was told."""
+    """Returns the attributes that a client knows from all its snapshots."""
     known: dict[int, Any] = {}
     for snapshot in link.got(Snapshot):
         for part in snapshot.segments:
@@ -88,7 +88,7 @@ def test_joining_and_leaving_are_told_while_the_entity_is_there(table: Table, ru
 
 def test_commands_come_with_their_data_and_are_answered(table: Table, rules: Told) -> None:
     link = table.join()
-    table.tick(16)  # two edits' worth
+    table.tick(16)  # the edits of two seconds
     data = {"at": [1, 2.5, None], "why": "because"}
     link.say(
         Command(1, 0, 0.0, "yes", msgpack.packb(data)),
@@ -122,7 +122,7 @@ def test_contact_is_told_once_when_it_begins(table: Table, rules: Told) -> None:
     table.tick(2)
     assert not [told for told in rules.told if told[0] == "contact"]
     game.steer(a, 1, 0)
-    table.tick(40)  # walks against the other and presses on
+    table.tick(40)  # walks against the other one and goes on
     ((_, *pair, begun),) = [told for told in rules.told if told[0] == "contact"]
     assert pair == [a, b]
     assert game.position(a)[0] == 11.375
@@ -142,7 +142,7 @@ def test_a_contact_is_not_missed_in_a_tick_in_which_somebody_joins(table: Table,
     game.steer(a, 1, 0)
     while not game.touching(a):
         table.tick()
-    table.join()  # which is written ahead of the contacts of the step before
+    table.join()  # the record of the step is written before its contacts are looked for
     assert [told[:3] for told in rules.told if told[0] == "contact"] == [("contact", a, b)]
 
 
@@ -175,7 +175,7 @@ def test_what_is_said_of_an_entity_reaches_all_who_see_it_and_changes(table: Tab
     table.tick()
     assert attributes(early) == attributes(late) == {1: {"name": "Ann"}, npc: {"mood": "calm"}}
     count = len(early.got(Snapshot))
-    game.set(npc, "mood", "calm")  # no news
+    game.set(npc, "mood", "calm")  # no change
     table.tick()
     assert not any(whole(part)[10] for snapshot in early.got(Snapshot)[count:] for part in snapshot.segments)
     game.set(npc, "mood", None)
@@ -210,7 +210,7 @@ def test_what_is_said_of_a_crowd_is_spread_over_messages_and_all_of_it_arrives(
         x, y = 32 * (segment % 3), 32 * (segment // 3)
         for place in range(70):
             game.spawn("runner", (x + 3.0 + 2 * (place % 10), y + 3.0 + 2 * (place // 10), 1.0), **rich)
-    early = table.join()  # its link knows how long a message may be
+    early = table.join()  # the link checks the length of a message
     table.tick(60)
     game.set(1, "a0", "news")
     late = table.join()
@@ -255,7 +255,7 @@ def test_events_wait_for_who_is_slow_and_the_oldest_of_too_many_are_dropped_and_
     link.waiting = 0
     table.tick()
     assert not link.closings
-    assert link.got(NextHappened) == [NextHappened(7)], "five of before, and two"
+    assert link.got(NextHappened) == [NextHappened(7)], "five events from before, and two"
     assert [msgpack.unpackb(happened.payload) for happened in link.got(Happened)] == list(range(2, 7))
     assert link.sent.index(NextHappened(7)) < link.sent.index(link.got(Happened)[0])
     assert table.game.counters.events_dropped == 2
@@ -409,7 +409,7 @@ def test_rules_that_raise_are_counted_and_told_and_stop_nobody(caplog: pytest.Lo
     table.tick()
     assert len(table.game.world) == 0
     assert table.game.counters.rules_failed > 12
-    for hook in ("on_join", "no. 1 at", "no. 10 at"):  # one of each hook, and then ever fewer
+    for hook in ("on_join", "no. 1 at", "no. 10 at"):  # one failure of each hook, and then ever fewer log lines
         assert hook in caplog.text
     assert len(caplog.records) < 10
     assert "on purpose" in caplog.text

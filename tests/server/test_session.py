@@ -1,4 +1,4 @@
-"""One input per tick: what becomes of each, told exactly, whatever a client sends."""
+"""One input per tick: the status and the margin of each are exact, whatever a client sends."""
 
 import pytest
 from hypothesis import given
@@ -27,7 +27,7 @@ def filed(first: int, *wishes: Input, tick: int = 0, ahead: float = 1.0) -> Inpu
 
 
 def margins(queue: InputQueue) -> dict[int, int]:
-    """Margins by tick, counted off from the newest as a client does."""
+    """Returns the margins by tick, counted back from the newest as a client does."""
     return {queue.newest - len(queue.margins) + 1 + i: margin for i, margin in enumerate(queue.margins)}
 
 
@@ -150,7 +150,7 @@ def test_what_has_been_used_stays_used() -> None:
     queue = filed(1, EAST, EAST, EAST)
     assert [queue.take(tick) for tick in (1, 2)] == [EAST, EAST]
     queue.restart(1)
-    assert queue.take(3) == EAST, "withdrawn, so the latest to arrive is repeated"
+    assert queue.take(3) == EAST, "withdrawn, so the newest one is repeated"
     assert list(queue.statuses) == [USED, USED, REPEATED]
     queue.file(inputs(1, NORTH, NORTH, NORTH), 3, 1.0)
     assert (queue.late, queue.take(4)) == (3, NORTH)
@@ -270,7 +270,7 @@ def test_a_flood_into_the_future_holds_no_more_than_the_window() -> None:
 
 
 class Closings:
-    """A link that notes how it is closed."""
+    """A link that records how it is closed."""
 
     def __init__(self) -> None:
         self.closings: list[tuple[int, str]] = []

@@ -1,4 +1,4 @@
-"""Which source wins, and what a mistake says."""
+"""Settings: which source wins, and the text of an error."""
 
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -31,7 +31,7 @@ def test_defaults() -> None:
     defaults = parse(["--print-config"], {})
     assert isinstance(defaults, str)
     assert all(name in defaults for name in KINDS)
-    assert sum(map(len, SECTIONS.values())) == len(KINDS), "a name means one thing, wherever it stands"
+    assert sum(map(len, SECTIONS.values())) == len(KINDS), "a name has one meaning in all sources"
 
 
 def test_the_settings_tell_which_kernel_runs(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,4 +1,4 @@
-"""What goes into a client's snapshot where not everything fits."""
+"""The parts of a client's snapshot where not everything fits."""
 
 from itertools import groupby
 
@@ -16,7 +16,7 @@ HISTORY = bounds(32).history
 
 
 class Log:
-    """Stands for the change log: in every tick, every segment changes; a part is as long as it is told to be."""
+    """A stand-in for the change log: every segment changes in every tick, and the length of each part is given."""
 
     history = HISTORY
 
@@ -59,7 +59,7 @@ def test_known_is_the_tick_up_to_which_all_that_was_in_sight_has_been_sent() -> 
     sight, log = looking(), Log(dict.fromkeys(ROW, 10))
     assert sight.known == -2
     assert take(sight, log, 5, 20) == [OWN, NEAR]
-    assert sight.known == -2, "of one segment nothing is known"
+    assert sight.known == -2, "nothing is known of one segment"
     assert take(sight, log, 6, 100) == [FAR, OWN, NEAR] or sight.complete
     assert sight.known == 6
     log.sizes[FAR] = 1000
@@ -139,7 +139,7 @@ def test_who_is_too_far_behind_has_lost_track(ticks: int) -> None:
 
 def test_only_what_was_sent_and_is_seen_no_more_is_dropped() -> None:
     sight, log = looking(), Log(dict.fromkeys(ROW, 10))
-    take(sight, log, 1, 10)  # the client knows of its own segment and one more
+    take(sight, log, 1, 10)  # the client knows its own segment and one more
     sight.move(((20, 0, 0),), 2)
     assert sight.drops == [OWN, NEAR]
     assert sight.sees == {(20, 0, 0)}

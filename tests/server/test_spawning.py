@@ -1,4 +1,4 @@
-"""Where players appear: at a spawn, or beside it in a crowd, which must not make a join dear."""
+"""Spawning: players appear at a spawn point, or beside it in a crowd, at little cost."""
 
 import pytest
 
@@ -33,11 +33,11 @@ def test_a_join_into_a_crowd_tries_few_places(monkeypatch: pytest.MonkeyPatch) -
 
     monkeypatch.setattr(world, "spawn", counted)
     assert None not in [spawns.spawn() for _ in range(300)]
-    assert failed <= 300 * 2, "no more than the spawns themselves"
+    assert failed <= 300 * 2, "no more than the spawn points themselves"
 
 
 def test_a_place_is_found_above_a_crowd_that_is_somewhere_below() -> None:
-    """Somebody next to every place, but none of them in the way: such places are tried in the end."""
+    """An entity is next to every place, but not in the way. Such places are tried at last."""
     world = build([floor()], player="person", spawns=((0.0, 0.0, 12.0),))
     world.spawn("slab", (-2.0, -2.0, 12.0))
     for i, j in OFFSETS[:168]:
@@ -67,7 +67,7 @@ def test_where_a_block_is_nothing_is_tried_and_a_gap_is_found(monkeypatch: pytes
     assert tried == [(0.0, 0.0, 0.0)]
     assert spawns.spawn() is None, "it is known for this tick"
     assert len(tried) == 1
-    world.fill((-9, 9, 1), (-7, 11, 2), 0)  # at head's height
+    world.fill((-9, 9, 1), (-7, 11, 2), 0)  # at the height of the head
     world.step()
     entity = spawns.spawn()
     assert entity is not None

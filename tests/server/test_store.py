@@ -1,4 +1,4 @@
-"""A saved world: what comes back after any end, what is refused, and what happens when the disk does not play along."""
+"""A saved world: its state after any end, what is refused, and faults of the disk."""
 
 import random
 import shutil
@@ -30,7 +30,7 @@ def keep() -> object:
 
 
 def until(condition: Callable[[], bool]) -> None:
-    """Waits for the thread."""
+    """Waits for a condition that the store's thread makes true."""
     deadline = time.monotonic() + 20
     while not condition():
         assert time.monotonic() < deadline
@@ -39,7 +39,8 @@ def until(condition: Callable[[], bool]) -> None:
 
 @pytest.fixture
 def opened(tmp_path: Path) -> Iterator[Callable[..., Store]]:
-    """Opens stores in `tmp_path / "data"` (or elsewhere); those that are left open are closed in the end."""
+    """A function that opens stores in `tmp_path / "data"` or elsewhere. Stores that are left open are closed at the
+    end."""
     found: list[Store] = []
 
     def open_one(directory: Path = tmp_path / "data", *, start: bool = True, checkpoint_s: float = 60) -> Store:
@@ -55,7 +56,7 @@ def opened(tmp_path: Path) -> Iterator[Callable[..., Store]]:
 
 
 def play(store: Store, ticks: int, rng: random.Random) -> list[tuple[int, bytes]]:
-    """Movers, edits, segments and notes; the tick and the hash after each tick."""
+    """Plays with movers, edits, segments and notes. Returns the tick and the hash after each tick."""
     world, hashes = store.world, []
     for _ in range(ticks):
         if rng.random() < 0.1 and len(world) < 8:
@@ -78,15 +79,16 @@ def play(store: Store, ticks: int, rng: random.Random) -> list[tuple[int, bytes]
 
 
 def crashed(store: Store, directory: Path) -> Path:
-    """What a process that dies now, with all saved, leaves behind, in another place."""
+    """Returns a copy of the directory that a process would leave that crashes now, with everything saved."""
     until(lambda: store.durable_tick == store.world.tick)
     return copied(directory / "data", directory / f"crashed-{store.world.tick}")
 
 
 def copied(directory: Path, copy: Path) -> Path:
-    """All files of a store as they are at one moment.
+    """Copies all files of a store as they are at one moment. Returns the copy.
 
-    Not while its thread writes: one from before that and one from after it never were together, or one is gone.
+    It waits until the store's thread does not write, because files from before and after a write never existed
+    together.
     """
 
     def at_rest() -> bool:
@@ -103,7 +105,7 @@ def copied(directory: Path, copy: Path) -> Path:
 
 
 def written(directory: Path) -> dict[str, tuple[int, int]]:
-    """When each file was written last, and its size."""
+    """Returns the time of the last write and the size of each file."""
     return {path.name: (path.stat().st_mtime_ns, path.stat().st_size) for path in directory.iterdir()}
 
 
@@ -144,7 +146,7 @@ def test_what_a_restart_changes_is_in_the_log(opened: Callable[..., Store], tmp_
     ghost = store.world.spawn("box", (0, 0, 0))
     store.world.step()
     second = opened(crashed(store, tmp_path), start=False)
-    second.world.remove(ghost)  # as a game does that does not know it any more
+    second.world.remove(ghost)  # as a game does that no longer knows it
     second.start(keep)
     second.world.step()
     until(lambda: second.durable_tick == 2)
@@ -221,7 +223,7 @@ def test_what_cannot_be_used_is_refused_and_left_as_it_is(opened: Callable[..., 
     store = opened()
     play(store, 60, random.Random(1))
     good = crashed(store, tmp_path)
-    altered(good, "PRAGMA user_version")  # the log is in the one file now
+    altered(good, "PRAGMA user_version")  # the log is in the database file now
     path = str(good / "world.db")
 
     def bad(name: str, *statements: str) -> Path:
@@ -292,7 +294,7 @@ def test_a_world_belongs_to_its_game(tmp_path: Path) -> None:
     assert opens("", tmp_path / "plain")
     with pytest.raises(StoreError, match=r"was saved by a server without a game, and this is .* of the game a:B"):
         opens("a:B", tmp_path / "plain")
-    altered(tmp_path, "UPDATE world SET game = 'tags:Tag'")  # as docs/server.md says where it has another name now
+    altered(tmp_path, "UPDATE world SET game = 'tags:Tag'")  # as docs/server.md describes it for a game with a new name
     assert opens("tags:Tag")
 
 

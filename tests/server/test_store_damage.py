@@ -1,4 +1,4 @@
-"""A saved world of which a byte has changed, or a part is gone: named at once, or it makes no difference."""
+"""A saved world with a changed byte or a missing part: it is named at once, or makes no difference."""
 
 import logging
 import random
@@ -23,7 +23,7 @@ FRAME = FRAME_HEAD + PAGE
 
 @pytest.fixture(scope="module")
 def torn(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Torn]:
-    """What a server leaves behind that is killed after 60 ticks, each of which was acknowledged."""
+    """The directory of a server that was killed after 60 ticks, each of which was acknowledged."""
     directory = tmp_path_factory.mktemp("torn")
     store = Store(directory / "data", SCENE, compiled=False)
     store.start(keep)
@@ -32,7 +32,8 @@ def torn(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Torn]:
 
 
 def regions(torn: Torn, rng: random.Random) -> Iterator[int]:
-    """Places in the -wal: the head, and in frames from the first to the last each field of the head and the page."""
+    """Yields places in the -wal: the head, and for frames from the first to the last, each field of the head and the
+    page."""
     yield from range(HEAD)
     frames = (len(torn.wal) - HEAD) // FRAME
     for frame in sorted({0, 1, frames - 2, frames - 1, *rng.sample(range(frames), 8)}):
@@ -49,7 +50,7 @@ def flipped(data: bytes, at: int, rng: random.Random) -> bytes:
 
 
 def outcome(directory: Path) -> tuple[int, bytes] | str:
-    """The world in a directory, or why it was refused."""
+    """Returns tick and hash of the world in a directory, or the reason why it was refused."""
     files = {path.name: path.read_bytes() for path in directory.iterdir() if not path.name.endswith(("-shm", "lock"))}
     try:
         return found_in(directory)
@@ -100,7 +101,7 @@ def test_a_world_that_lost_its_file_is_named(torn: Torn, tmp_path: Path) -> None
 
 @pytest.mark.parametrize("every", [4, *long(1)])
 def test_a_flipped_bit_in_the_file_is_named_or_makes_no_difference(torn: Torn, tmp_path: Path, every: int) -> None:
-    """The log is in the one file here, as it is after a checkpoint."""
+    """The log is in the database file here, as it is after a checkpoint."""
     shutil.copytree(torn.good, tmp_path / "whole")
     with closing(sqlite3.connect(tmp_path / "whole" / "world.db")) as connection:
         assert connection.execute("PRAGMA wal_checkpoint(TRUNCATE)").fetchone()[0] == 0

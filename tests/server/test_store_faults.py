@@ -1,4 +1,4 @@
-"""A saved world when the disk fails: torn and garbled files, no room, no answer, and a fault of our own."""
+"""A saved world when the disk fails: torn and garbled files, no room, no answer, and a fault in our own code."""
 
 import logging
 import random
@@ -31,7 +31,7 @@ def store(tmp_path: Path) -> Iterator[Store]:
 
 
 def found_in(directory: Path) -> tuple[int, bytes]:
-    """Tick and hash of the world in a directory, which is then removed."""
+    """Returns tick and hash of the world in a directory, which is then removed."""
     again = Store(directory, SCENE, compiled=False)
     try:
         return again.world.tick, again.world.state_hash()
@@ -41,7 +41,7 @@ def found_in(directory: Path) -> tuple[int, bytes]:
 
 
 class Torn:
-    """A directory as a crash leaves it, and what was on disk when."""
+    """A directory as a crash leaves it, and the durable ticks by the size of the log."""
 
     def __init__(self, store: Store, directory: Path) -> None:
         self.hashes = {0: store.world.state_hash()}
@@ -59,11 +59,11 @@ class Torn:
         self.wal = (self.good / "world.db-wal").read_bytes()
 
     def whole(self, size: int) -> int:
-        """The newest tick that was told to be durable by the time the -wal had this size."""
+        """Returns the newest tick that was reported as durable when the -wal had this size."""
         return max(tick for end, tick, _ in self.then if end <= size)
 
     def mark(self, tick: int) -> bytes:
-        """The mark as it was after a tick."""
+        """Returns the mark as it was after a tick."""
         return next(mark for _, at, mark in self.then if at == tick)
 
 
@@ -82,7 +82,7 @@ def test_a_crash_at_any_byte_of_the_log_keeps_all_that_was_durable_by_then(store
     ends = [end + more for end, *_ in torn.then[1:] for more in (-1, 0)]
     for size in [0, 1, HEAD - 1, HEAD, *rng.sample(ends, 20), *(rng.randrange(len(torn.wal)) for _ in range(20))]:
         tick = torn.whole(size) if size >= HEAD else 0
-        behind = rng.choice((b"", bytes(5000), rng.randbytes(5000)))  # where frames were not written yet
+        behind = rng.choice((b"", bytes(5000), rng.randbytes(5000)))  # frames that were not written yet
         copy = damaged_copy(torn, tmp_path, "world.db-wal", torn.wal[:size] + (behind if size > HEAD else b""))
         promised = rng.choice((tick, rng.randrange(tick + 1)))  # after a power cut, the mark may be an older one
         (copy / "world.mark").write_bytes(torn.mark(promised))
@@ -122,7 +122,7 @@ def test_a_garbled_file_is_refused_or_makes_no_difference(store: Store, tmp_path
 
 
 class Disk:
-    """What all databases of a test are on."""
+    """The disk of all databases of a test. It can fail, hang or be full."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.error: Exception | None = None
@@ -160,7 +160,7 @@ def disk(monkeypatch: pytest.MonkeyPatch) -> Disk:
 
 
 def stepping(store: Store, rng: random.Random, condition: Callable[[], bool]) -> None:
-    """Plays until something is so."""
+    """Plays until a condition holds."""
 
     def play_on() -> bool:
         play(store, 1, rng)
@@ -173,7 +173,7 @@ FULL = sqlite3.OperationalError("database or disk is full")
 
 
 def into_trouble(store: Store, disk: Disk, rng: random.Random, error: Exception = FULL) -> tuple[int, bytes]:
-    """Plays 30 ticks that are saved, and then until it is noticed that nothing is any more; what was saved."""
+    """Plays 30 ticks that are saved, then until the store is in trouble. Returns the last saved tick and hash."""
     saved = play(store, 30, rng)[-1]
     until(lambda: store.durable_tick == 30)
     disk.error = error
@@ -192,7 +192,7 @@ def test_no_room_is_told_and_made_up_for_once_there_is_some(
     assert store.trouble == said
     assert store.stats()["save_trouble"] == said
     play(store, 50, rng)
-    assert store.durable_tick == 30  # what was told until then is all that may be told
+    assert store.durable_tick == 30  # only ticks up to this one may be reported as durable
     assert found_in(copied(tmp_path / "data", tmp_path / "then")) == saved
     disk.error = None
     stepping(store, rng, lambda: not store.trouble)

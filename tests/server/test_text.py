@@ -1,4 +1,4 @@
-"""Text that UTF-8 cannot hold (a lone surrogate) is refused at every door, by name, and leaves nothing behind."""
+"""Text that UTF-8 cannot encode (a lone surrogate) is refused everywhere, by name, and leaves nothing behind."""
 
 import asyncio
 import json
@@ -30,17 +30,17 @@ from tests.server.test_store import SCENE
 from tests.tables import Table
 
 BAD = ["\ud800", "Ann\udfff", "\udc80"]
-"""Halves of a character: high, low, and what Python makes of a byte of the command line that is not UTF-8."""
+"""Lone surrogates: a high one, a low one, and the one that stands for a byte of the command line that is not UTF-8."""
 KEY, NOW = b"k" * 32, 1_800_000_000.0
 
 
 def token(subject: str) -> str:
-    """A token that is signed with the right key; JSON can spell what UTF-8 cannot hold."""
+    """Returns a token signed with the right key. JSON can contain text that UTF-8 cannot encode."""
     return jwt.PyJWS().encode(json.dumps({"sub": subject, "exp": NOW + 60}).encode(), KEY, "HS256")
 
 
 def wanted(bad: str, field: str) -> str:
-    """What an error about a text must begin with."""
+    """Returns a pattern for the beginning of an error about a text."""
     return rf"^{field} = .*{ascii(bad)[1:-1]}.*UTF-8".replace("\\u", "\\\\u")
 
 
@@ -139,11 +139,11 @@ def test_what_a_client_asks_for(bad: str) -> None:
     for data in (bad, [bad], {"a": {bad: 1}}):
         with pytest.raises(ValueError, match=r"^say: data = .*UTF-8"):
             client.command("say", data)
-    assert client.command("say", "é\U0001f600") == 1  # no number is lost
+    assert client.command("say", "é\U0001f600") == 1  # no number was used up
 
 
 def acts(game: GameApi, bad: str) -> list[Callable[[], Any]]:
-    """All by which rules can say something."""
+    """Returns all calls by which rules can send or store a text."""
     return [
         lambda: game.set(1, bad, 1),
         lambda: game.set(1, "mood", bad),

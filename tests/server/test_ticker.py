@@ -1,4 +1,4 @@
-"""The schedule, exactly; the ticker with a clock and an alarm of the test's own; the real alarms once."""
+"""The schedule, exactly; the ticker with a simulated clock and alarm; the real alarms once."""
 
 import asyncio
 import logging
@@ -16,7 +16,7 @@ CATCH_UP_MAX = catch_up_ticks(RATE)
 
 
 def taken(schedule: Schedule, now: float) -> list[float]:
-    """The deadlines of all ticks that are due at `now`, if they took no time, in periods."""
+    """Returns the deadlines of all ticks that are due at `now`, in periods, if ticks take no time."""
     deadlines = []
     while (deadline := schedule.take(now)) is not None:
         deadlines.append(deadline * RATE)
@@ -51,7 +51,7 @@ def test_a_short_stall_is_caught_up_entirely() -> None:
 def test_a_long_stall_is_caught_up_by_four_ticks_and_the_rest_is_counted() -> None:
     schedule = Schedule(RATE, 0.0)
     assert taken(schedule, 0.0) == [0]
-    assert taken(schedule, 3.0) == [93, 94, 95, 96]  # the earliest are dropped: these tell the time
+    assert taken(schedule, 3.0) == [93, 94, 95, 96]  # the earliest are dropped; these keep the server's time
     assert schedule.deadline == 3.0 + PERIOD
     assert schedule.skipped == 96 - 4
     assert schedule.skipped_s == 92 * PERIOD

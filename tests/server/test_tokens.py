@@ -1,4 +1,4 @@
-"""Tokens: who is let in, and what the others are told."""
+"""Tokens: which are accepted, and the reason that a refused client gets."""
 
 import base64
 import json

@@ -1,4 +1,4 @@
-"""Rules that would silently do nothing are named; what changes a game does so within a tick, or is refused."""
+"""Rules that would do nothing are named. Calls that change a game happen within a tick or are refused."""
 
 import asyncio
 import functools
@@ -27,13 +27,13 @@ FLAT = load_scene("flat")
 
 
 def made(**methods: Any) -> Rules:
-    """Rules with some methods."""
+    """Returns rules with some methods."""
     rules: Rules = type("Mine", (Rules,), methods)()
     return rules
 
 
 def everywhere(rules: Rules) -> list[Callable[[], Any]]:
-    """All the ways into a game."""
+    """Returns all ways to start a game with rules."""
     return [
         lambda: Match(FLAT, 1, rules=rules),
         lambda: Game(FLAT, rules=rules, compiled=False),
@@ -143,7 +143,7 @@ class TooEarly(Rules):
 
 class Silent(Rules):
     async def on_tick(self) -> None:  # type: ignore[override]
-        """Nothing would run this."""
+        """Does nothing, because nothing awaits it."""
 
 
 @pytest.mark.parametrize(
@@ -155,7 +155,7 @@ def test_rules_that_are_loaded_by_name_are_checked(name: str, why: str) -> None:
 
 
 def behind(decorated: Callable[..., Any]) -> Callable[..., Any]:
-    """Hides what a method is, as a decorator may."""
+    """Hides the kind of a method, as a decorator may."""
 
     def wrapper(*arguments: Any) -> Any:
         return decorated(*arguments)
@@ -203,7 +203,7 @@ ACTS: dict[str, Callable[[Played], Any]] = {
 
 
 def caught(act: Callable[[], Any]) -> Callable[[], str]:
-    """A function that does something and gives the error, if it is one of turns."""
+    """Returns a function that calls `act` and returns the text of its `OutOfTurnError`; empty if there is none."""
 
     def done() -> str:
         try:
@@ -216,7 +216,7 @@ def caught(act: Callable[[], Any]) -> Callable[[], str]:
 
 
 def in_a_thread(act: Callable[[], Any]) -> str:
-    """The error of doing something in another thread."""
+    """Returns the error of a call in another thread."""
     said: list[str] = []
     thread = threading.Thread(target=lambda: said.append(caught(act)()), name="worker")
     thread.start()
@@ -225,7 +225,7 @@ def in_a_thread(act: Callable[[], Any]) -> str:
 
 
 def in_a_callback(act: Callable[[], Any]) -> str:
-    """The error of doing something in a callback of an event loop."""
+    """Returns the error of a call in a callback of an event loop."""
 
     async def run() -> str:
         said: asyncio.Future[str] = asyncio.get_running_loop().create_future()
@@ -247,7 +247,7 @@ def test_a_change_from_elsewhere_is_refused(name: str, elsewhere: Callable[[Any]
     assert said.startswith(f"{name}: called {where}")
     assert f"game.soon(game.{name}, ...)" in said
     assert marks(table) == before
-    ACTS[name](table)  # in the thread that ticks, without an event loop, the program knows where it stands
+    ACTS[name](table)  # in the thread that ticks, without an event loop, a change is allowed
 
 
 def test_the_thread_that_ticks_may_change_the_game_and_it_may_be_another_one_later() -> None:
@@ -265,7 +265,7 @@ def test_the_thread_that_ticks_may_change_the_game_and_it_may_be_another_one_lat
 
 
 class Awaits(Rules):
-    """Hooks act within a tick, whatever runs around it."""
+    """Rules whose hooks act within a tick, whatever runs around it."""
 
     def on_tick(self) -> None:
         self.game.share("tick", self.game.tick)

@@ -1,4 +1,4 @@
-"""The game in miniature ahead of the real one, and what is told of compiling."""
+"""The warm-up game before the real one, and the notice about compiling."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""A loop that stalls, and what is said about it. Nothing here depends on how fast the machine is."""
+"""A stalled event loop and the log lines about it. Nothing here depends on the speed of the machine."""
 
 import asyncio
 import threading
@@ -15,7 +15,7 @@ STALL_S = 0.02
 
 
 class Ears:
-    """What the watchdog says, from its thread."""
+    """A logger that keeps the watchdog's lines, which come from its thread."""
 
     def __init__(self) -> None:
         self.said: list[tuple[str, dict[str, Any]]] = []
@@ -27,7 +27,7 @@ class Ears:
             self._heard.notify_all()
 
     def wait_for(self, event: str) -> dict[str, Any]:
-        """Blocks whoever calls, until that has been said."""
+        """Waits until this line was logged. Returns its values."""
         with self._heard:
             assert self._heard.wait_for(lambda: self._found(event) is not None, TIME_OUT_S), self.said
             found = self._found(event)
@@ -47,7 +47,7 @@ def ears(monkeypatch: pytest.MonkeyPatch) -> Ears:
 
 @pytest.fixture
 def watch(ears: Ears) -> Iterator[Callable[..., Watchdog]]:
-    """Makes watchdogs, which end with the test. A thread that gets no CPU on a busy machine is not its subject."""
+    """A function that makes watchdogs, which end with the test. A thread without CPU time is not the subject here."""
     made: list[Watchdog] = []
 
     def make(**options: float) -> Watchdog:
@@ -81,7 +81,7 @@ async def test_stacks_are_not_repeated_but_stalls_are_counted(ears: Ears, watch:
     for n in range(3):
         pause = threading.Event()
         for _ in range(500):
-            if watchdog.stalls > n:  # on a busy machine there was a stall before this one
+            if watchdog.stalls > n:  # on a busy machine there may have been a stall before this one
                 break
             pause.wait(STALL_S)  # without a turn for the loop
         assert watchdog.stalls > n

@@ -1,4 +1,4 @@
-"""The rules' game API is given wrong values: each is refused by name, and nothing has been done."""
+"""Wrong values for the game API: each is refused by name, and nothing has changed."""
 
 import math
 from collections.abc import Callable
@@ -26,7 +26,7 @@ PLAYER, RUNNER, GONE = 1, 2, 3
 
 
 class Played(Table):
-    """A player, a runner of the rules, and something that has been removed."""
+    """A game with a player, a runner that the rules steer, and an entity that has been removed."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -42,7 +42,7 @@ class Played(Table):
 
 
 def marks(table: Played) -> tuple[Any, ...]:
-    """All that an act of the rules may change."""
+    """Returns everything that a call of the rules may change."""
     stage, kept = table.api, table.api.kept
     return (
         table.game.world.state_hash(), len(table.game.world), table.game.world.next_id, dict(stage.steered),
