@@ -1,4 +1,4 @@
-"""A real server process under test: its streams, its pages, its end."""
+"""A real server process under test: its output, its pages and its end."""
 
 import json
 import math
@@ -23,12 +23,12 @@ from shared.checks import Vec
 
 ROOT = Path(__file__).resolve().parents[2]
 START_S = 90.0
-"""Compiling the kernel for the first time takes its time."""
+"""Seconds until a server is ready. Compiling the kernel for the first time takes long."""
 END_S = 10.0
 RECOVERY_S = 2.0
-"""A player moves again within this time after a stall or a return."""
+"""Seconds within which a player moves again after a stall or a reconnect."""
 MOVING_BLOCKS = 1.0
-"""The way that a player who walks covers at least in two seconds, also on a busy machine; it is 6 blocks otherwise."""
+"""Distance that a walking player covers at least in two seconds on a busy machine; normally it is 6 blocks."""
 UPGRADE = (
     b"GET / HTTP/1.1\r\nHost: x\r\nConnection: Upgrade\r\nUpgrade: websocket\r\n"
     b"Sec-WebSocket-Version: 13\r\nSec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\n\r\n"
@@ -36,7 +36,7 @@ UPGRADE = (
 
 
 class ServerProcess:
-    """`python -m server` with its two streams read by threads."""
+    """A process of `python -m server` whose two output streams are read by threads."""
 
     def __init__(self, *arguments: str, **environment: str) -> None:
         clean = {name: value for name, value in os.environ.items() if not name.startswith("SOVEREIGN_")}
@@ -69,14 +69,15 @@ class ServerProcess:
         self.errors.extend(self.process.stderr)
 
     def address(self) -> tuple[str, int]:
-        """Waits for the line that says it is ready."""
+        """Waits until the server is ready. Returns its host and port."""
         line = self.out.get(timeout=START_S)
         found = re.fullmatch(r"listening on wss?://(\[[^]]+\]|[^:]+):(\d+)\n", line or "")
         assert found, (line, self.errors)
         return found[1].strip("[]"), int(found[2])
 
     def end(self, number: int | None = None) -> int:
-        """Its exit code, after a signal if one is given; both streams have been read to their ends."""
+        """Waits for the end, after a signal if one is given. Returns the exit code; both streams have been read to the
+        end."""
         if number is not None:
             self.process.send_signal(number)
         code = self.process.wait(END_S if number is not None else START_S)
@@ -85,12 +86,12 @@ class ServerProcess:
         return code
 
     def log(self, *, but: str = "") -> list[dict[str, Any]]:
-        """Its log so far, without the entries of one level, and without the one of a start that compiles."""
+        """Returns the log so far, without the entries of level `but` and without the notice about compiling."""
         entries = [json.loads(line) for line in self.errors]
         return [entry for entry in entries if entry["level"] != but and entry["event"] != COMPILING]
 
     def rest(self) -> list[str]:
-        """The lines on stdout that nobody has read yet."""
+        """Waits for the end of stdout. Returns the lines that have not been read yet."""
         lines = []
         while (line := self.out.get(timeout=END_S)) is not None:
             lines.append(line)
@@ -107,7 +108,7 @@ class ServerProcess:
 
 @contextmanager
 def inheriting(handler: signal.Handlers, *signals: int) -> Iterator[None]:
-    """Has the processes that are started in the block ignore these signals (SIG_IGN), or not (SIG_DFL)."""
+    """Makes processes that start in the block inherit these signals as ignored (SIG_IGN), or not (SIG_DFL)."""
     before = {number: signal.signal(number, handler) for number in signals}
     try:
         yield
@@ -126,7 +127,7 @@ def running(*arguments: str, **environment: str) -> Iterator[ServerProcess]:
 
 
 def other(*arguments: str, **environment: str) -> tuple[int, list[str]]:
-    """Exit code and output of one of the other commands."""
+    """Runs one of the other commands. Returns its exit code and output."""
     with running(*arguments, **environment) as command:
         return command.end(), command.rest()
 
@@ -149,7 +150,7 @@ def stats(address: tuple[str, int]) -> dict[str, Any]:
 
 
 class Strider:
-    """Plays a client in a game's loop: it walks in circles and jumps, all the time."""
+    """A client in a game's loop that walks in circles and jumps all the time."""
 
     def __init__(self, client: Client) -> None:
         self.client = client
@@ -157,10 +158,10 @@ class Strider:
         self._place: Vec | None = None
 
     def plays(self, seconds: float = 0.0, until: Callable[[], bool] = lambda: True) -> float:
-        """Plays for so long, and until something is true.
+        """Plays for `seconds`, and then until a condition holds.
 
         Returns:
-            The blocks that the player has walked meanwhile, as the server tells it.
+            The distance in blocks that the player has walked meanwhile, by the server's snapshots.
         """
         walked, began = 0.0, time.monotonic()
         while (now := time.monotonic()) < began + seconds or not until():

@@ -1,7 +1,7 @@
-"""Peers without manners against a running server: each is told why it has to go, and nobody else notices.
+"""Misbehaving peers and a running server: each is closed with a code and a reason, and other clients notice nothing.
 
-What the bytes of a broken protocol come to in detail is in `tests/server/test_gateway.py`, and which messages are
-refused in `tests/server/test_handshake.py`; here they meet the whole process, among them one honest client.
+`tests/server/test_gateway.py` tests the answers to broken protocols in detail, and `tests/server/test_handshake.py` the
+refused messages. Here they meet the whole process, together with one honest client.
 """
 
 import asyncio
@@ -42,7 +42,7 @@ from tests.e2e.processes import END_S, UPGRADE, running, stats
 pytestmark = pytest.mark.e2e
 
 AT_ONCE = 12
-"""So many peers at a time."""
+"""Number of peers at a time."""
 WELL_FORMED = (
     Hello(VERSION, load_scene("flat").digests, "Ann"),
     Inputs(100, 90, bytes((127, 0, 1)) * 8),
@@ -52,13 +52,13 @@ WELL_FORMED = (
 
 
 class Abuse(NamedTuple):
-    """What a peer sends after the handshake, and with which of the codes and which reason it is closed."""
+    """The bytes that a peer sends after the handshake, and the codes and the reason that it may be closed with."""
 
     stream: bytes
     codes: tuple[int, ...]
     reason: str = "."
     joins: bool = False
-    """It says hello properly, waits to be welcomed, and then misbehaves."""
+    """Whether the peer first joins properly."""
 
 
 def framed(data: bytes, opcode: Opcode = Opcode.BINARY, *, fin: bool = True) -> bytes:
@@ -67,9 +67,9 @@ def framed(data: bytes, opcode: Opcode = Opcode.BINARY, *, fin: bool = True) -> 
 
 def abuses() -> Iterator[Abuse]:
     rng = random.Random(20)
-    for _ in range(20):  # random bytes instead of frames, more of them than one message may have
+    for _ in range(20):  # random bytes instead of frames, more than one message may have
         yield Abuse(rng.randbytes(9000), (PROTOCOL, TOO_BIG, TEXT, MALFORMED, 1000, 1007))
-    for size in (0, 1, 2, 3, 7, 20, 100, 1000, CLIENT_MESSAGE_MAX):  # in well-formed frames
+    for size in (0, 1, 2, 3, 7, 20, 100, 1000, CLIENT_MESSAGE_MAX):  # random bytes in well-formed frames
         for joins in (False, True):
             yield Abuse(framed(rng.randbytes(size)), (MALFORMED,), joins=joins)
     for message in WELL_FORMED:
@@ -111,7 +111,7 @@ class Peer:
 
 
 async def misbehave(address: tuple[str, int], abuse: Abuse) -> None:
-    """Does it, and checks the answer."""
+    """Runs one abuse, and checks the answer."""
     reader, writer = await asyncio.open_connection(*address)
     try:
         peer = Peer(reader, writer)
@@ -131,7 +131,7 @@ async def misbehave(address: tuple[str, int], abuse: Abuse) -> None:
         shown = (abuse.stream[:40], code, reason)
         assert code in abuse.codes, shown
         assert re.search(abuse.reason, reason), shown
-        if code > 4000:  # the game's own refusals come as a message, too, which browsers can read more of
+        if code > 4000:  # the game's own refusals are also sent as a message, which has room for a longer reason
             bye = decode_from_server(last)
             assert isinstance(bye, Bye)
             assert (bye.code, bye.wait) == (code, -1.0)
@@ -141,7 +141,8 @@ async def misbehave(address: tuple[str, int], abuse: Abuse) -> None:
 
 
 async def storm(address: tuple[str, int], all_of: list[Abuse]) -> tuple[int, int]:
-    """Everything, with one honest client among it: how many ticks that took, and how many snapshots it has got."""
+    """Runs all abuses beside one honest client. Returns the number of ticks, and of snapshots that the client has
+    got."""
     bot = Bot(Wander(random.Random(1)))
     async with await AsyncClient.connect("ws://{}:{}".format(*address), before_update=bot) as honest:
         while honest.core.state != "playing":  # noqa: ASYNC110  # there is no event for it but those nobody reads
@@ -169,7 +170,7 @@ def test_each_is_told_why_and_nobody_else_notices() -> None:
         assert snapshots >= 0.9 * ticks
         figures = stats(address)
         assert figures["internal_errors"] == figures["ticks_failed"] == 0
-        assert figures["skipped_s"] < 1, "it went on ticking"
+        assert figures["skipped_s"] < 1, "ticks went on"
         assert figures["malformed"] > 50
         assert figures["refused"] >= 4
         assert server.end(signal.SIGTERM) == 0

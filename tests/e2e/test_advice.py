@@ -1,4 +1,4 @@
-"""What a newcomer reads when something is wrong: each mistake made for real, with both kinds of client."""
+"""The error that a newcomer reads for each mistake, made for real with both kinds of client."""
 
 import asyncio
 import socket
@@ -40,7 +40,7 @@ def secure(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
 
 
 async def said(url: str) -> str:
-    """What both clients say of an address: the same."""
+    """Returns the error of both clients for an address, which is the same."""
     with pytest.raises(ConnectError) as polling:
         await asyncio.to_thread(Client.connect, url, timeout=END_S)
     with pytest.raises(ConnectError) as aio:
@@ -109,7 +109,7 @@ async def test_nobody_vouches_for_the_server(secure: str) -> None:
     )
 
 
-# -- refused by the game; the wire is the same, so no socket is needed -----------------------------------------
+# -- refused by the game: the wire format is the same, so no socket is needed --------------------------------
 
 
 def left(game: Game, token: str = "", change: Callable[[Client], None] | None = None) -> Left:

@@ -1,4 +1,4 @@
-"""The server process dies and is started anew; its clients, in a game's loop and in an event loop, go on."""
+"""The server process dies and is started again. Its clients, in a game's loop and in an event loop, reconnect."""
 
 import asyncio
 import contextlib
@@ -25,7 +25,7 @@ COMMAND = (sys.executable, "-m", "server", "--host", "127.0.0.1", "--scene", "fl
 
 @contextlib.contextmanager
 def server(data: Path, port: int = 0) -> Iterator[tuple[subprocess.Popen[str], str]]:
-    """A server process and its URL; it is killed in the end, as by a power cut."""
+    """Yields a server process and its URL. The process is killed at the end, as by a power cut."""
     flags = ("--port", str(port), "--data", str(data))
     with subprocess.Popen([*COMMAND, *flags], cwd=ROOT, stdout=subprocess.PIPE, text=True) as process:
         try:
@@ -51,7 +51,7 @@ def test_a_client_in_a_games_loop_survives_its_server(tmp_path: Path) -> None:
         player = Strider(client)
         player.plays(until=lambda: happened(player, Joined))
         me = client.entity
-        assert player.plays(seconds=2) > MOVING_BLOCKS  # on disk by then
+        assert player.plays(seconds=2) > MOVING_BLOCKS  # on disk by now
         process.kill()
         player.plays(until=lambda: happened(player, Disconnected))
         assert client.reconnecting
@@ -114,4 +114,4 @@ async def test_a_client_in_an_event_loop_survives_its_server(tmp_path: Path) -> 
         await client.close()
         assert not any(isinstance(event, Left) for event in seen)
         gc.collect()
-        assert reported == [], "attempts that failed leave nothing that asyncio complains of"
+        assert reported == [], "failed attempts leave no exception that asyncio complains about"

@@ -1,4 +1,4 @@
-"""The first join of a client without a prebuilt kernel: it plays at once, and is compiled while it does."""
+"""The first join of a client without a prebuilt kernel: it plays at once, while its kernel is compiled."""
 
 import os
 import subprocess

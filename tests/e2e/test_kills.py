@@ -1,4 +1,4 @@
-"""The real server, killed at any instant: what a client was told had been done is in the world that comes back."""
+"""The real server, killed at any time: every edit that a client got as done is in the restored world."""
 
 import asyncio
 import contextlib
@@ -36,11 +36,11 @@ Cell = tuple[int, int, int]
 
 
 class Cells:
-    """What clients have asked for and what they were told, for each block above the plain."""
+    """The edits that clients have asked for and the verdicts that they got, for each block above the plain."""
 
     def __init__(self) -> None:
         self.asked: dict[Cell, list[int]] = {}
-        """The kinds that a block may have: the last that was told to be done (or found), and those asked for since."""
+        """Kinds that a block may have: the last one that was done (or found), and those asked for since."""
         self.done = self.refused = 0
 
     def ask(self, cell: Cell, kind: int) -> None:
@@ -55,7 +55,7 @@ class Cells:
             self.refused += 1
 
     def check(self, world: World) -> None:
-        """Compares with a world, and goes on from there."""
+        """Compares with a restored world, which is the start for further edits."""
         for cell, kinds in self.asked.items():
             found = world.blocks.get(*cell)
             assert found in kinds, f"block {cell} is {found}; could be {kinds}"
@@ -63,7 +63,7 @@ class Cells:
 
 
 class Editor:
-    """A client that does little but edit the blocks above it, in an order that tells every edit from the others."""
+    """A client that edits the blocks above it. Each of its edits differs from the others."""
 
     def __init__(self, cells: Cells, scene: Scene) -> None:
         self.cells, self.scene, self.turn = cells, scene, 0
@@ -72,11 +72,11 @@ class Editor:
         self.waiting: dict[int, tuple[Cell, int]] = {}
         self.told: list[int] = []
         self.used = 0
-        """Inputs that the server has used, over all lives."""
+        """Inputs that the server has used, over all lives of the server."""
         self.places: set[int] = set()
 
     async def play(self, address: tuple[str, int]) -> None:
-        """Until the connection ends."""
+        """Plays until the connection ends."""
         with contextlib.suppress(ConnectionClosed, OSError, asyncio.TimeoutError):
             async with connect(f"ws://{address[0]}:{address[1]}", compression=None, max_queue=None) as link:
                 await link.send(encode(Hello(VERSION, {}, "editor", resume=self.resume)))
@@ -90,7 +90,7 @@ class Editor:
                         await self.say(link, message.tick)
 
     def welcome(self, welcome: Welcome) -> None:
-        """Whoever has a token comes back to the entity that it was given for."""
+        """Takes a welcome. With a resume token, the entity must be the same as before."""
         if self.resume:
             assert welcome.entity == self.entity
             self.returns += 1
@@ -109,12 +109,12 @@ class Editor:
             self.cells.answered(*self.waiting.pop(number), verdict)
 
     def states(self, snapshot: Snapshot) -> list[list[int]]:
-        """Those of a snapshot that is the first, or follows one that has been seen."""
+        """Returns the states in a snapshot."""
         rows: list[list[int]] = decode_parts(snapshot.segments, len(self.scene.templates))[1].tolist()
         return rows
 
     async def say(self, link: ClientConnection, tick: int) -> None:
-        """An input (east and west, to keep the world busy) and now and then an edit."""
+        """Sends an input (east and west, to keep the world busy) and every third tick an edit."""
         move = 127 if tick // 16 % 2 else 129
         await link.send(encode(Inputs(tick + 2, tick, bytes((move, 0, 0)))))
         if tick % 3:
@@ -130,7 +130,7 @@ class Editor:
 
 @contextlib.asynccontextmanager
 async def editing(address: tuple[str, int], editors: list[Editor]) -> AsyncIterator[None]:
-    """Clients that edit, and that have all gone in the end."""
+    """Runs clients that edit. All have ended at the end of the block."""
     tasks = [asyncio.create_task(editor.play(address)) for editor in editors]
     try:
         yield
@@ -142,7 +142,7 @@ async def editing(address: tuple[str, int], editors: list[Editor]) -> AsyncItera
 
 
 def looked_at(data: Path, scene: Scene, copy: Path) -> tuple[World, tuple[int, str]]:
-    """The world in a directory, and its tick and hash, found by replay in this process and from a copy."""
+    """Returns the world in a directory, and its tick and hash; a copy is replayed in this process."""
     shutil.copytree(data, copy)
     store = Store(copy, scene)
     store.close()
@@ -162,7 +162,7 @@ def test_nothing_that_a_client_was_told_is_lost_in_kills(tmp_path: Path, kills: 
         environment = {f"SOVEREIGN_{name.upper()}": value for name, value in how.items()}
         server = ServerProcess("--port", "0", "--scene", "flat", "--data", str(data), **environment)
         try:
-            if life % 5 == 4:  # while it starts
+            if life % 5 == 4:  # while the server starts
                 time.sleep(rng.uniform(0.0, 0.7))
                 early += 1
                 server.process.kill()
@@ -180,15 +180,15 @@ def test_nothing_that_a_client_was_told_is_lost_in_kills(tmp_path: Path, kills: 
     assert early == kills // 5
     assert sum(editor.returns for editor in editors) > BOTS * kills // 2
     assert cells.done > 10 * kills, (cells.done, cells.refused)
-    for editor in editors:  # they walk to and fro, in every life that they see
+    for editor in editors:  # players walk to and fro, in every life that they see
         assert editor.used > kills
-        assert len(editor.places) > kills // 5, "a place is told where it turns"
+        assert len(editor.places) > kills // 5, "a place is sent where a player turns"
 
 
 async def one_life(
     server: ServerProcess, address: tuple[str, int], cells: Cells, editors: list[Editor], seconds: float, end: int
 ) -> None:
-    """Edits, and a signal so long after the first verdict."""
+    """Edits, and sends the signal `seconds` after the first verdict."""
     before = cells.done
     async with editing(address, editors):
         await asyncio.get_running_loop().run_in_executor(None, until, lambda: cells.done > before)

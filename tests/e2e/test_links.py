@@ -1,7 +1,7 @@
-"""Bad links on real sockets: a server process, a proxy, asyncio clients, beside the same in simulated time.
+"""Bad links on real sockets: a server process, a proxy and asyncio clients, compared with simulated time.
 
-All three links are measured at once, each with a server of its own, and beside each other for a few seconds. What is
-asserted holds on a busy machine: the simulation's figure, a factor, and something for the machine (`NOISE_MS`).
+All three links are measured at once for a few seconds, each with a server of its own. The limits hold on a busy
+machine: the figure of the simulation, times a factor, plus `NOISE_MS`.
 """
 
 import asyncio
@@ -31,13 +31,13 @@ pytestmark = [pytest.mark.e2e, pytest.mark.alone]
 
 CLIENTS = 5
 SETTLED_S = 3.0
-"""The figures are of the time from here on."""
+"""Seconds after the start from which figures are counted."""
 NOISE_MS = 60.0
 RATE = 32
 
 
 class Hold:
-    """Walks in one direction, whatever happens: nobody meets anybody."""
+    """A policy that walks in one direction only, so players do not meet."""
 
     def __init__(self, turn: int) -> None:
         self._input = Input(*((90, 0), (0, 90), (-90, 0), (0, -90))[turn % 4], 0)
@@ -47,7 +47,7 @@ class Hold:
 
 
 class Fidget:
-    """Wishes something else in every tick: that has to be sent, each time."""
+    """A policy that chooses another input in every tick, so each must be sent."""
 
     def __init__(self, seed: int) -> None:
         self._rng = random.Random(seed)
@@ -66,20 +66,20 @@ class Case:
 DIP_S, DIP_RATE = (4.0, 9.0), 25e3
 LINKS = {
     "typical": Case(PRESETS["typical"], 9.0, lambda turn: Wander(random.Random(turn))),
-    # Too narrow for a snapshot in every tick.
+    # The link is too slow for a snapshot in every tick.
     "dip": Case(
         replace(path(50, 2), rate=2e6, dip=(DIP_S[1], DIP_S[1] - DIP_S[0], DIP_RATE)),
         11.0,
         Fidget,
     ),
-    # From 3.8 to 4.0 s, from 5.8, and from 7.8: with what follows, just shorter than missing inputs are repeated.
+    # Outages begin at 3.8, 5.8 and 7.8 s. They are just shorter than the time for which missing inputs are repeated.
     "outage": Case(replace(path(50, 2), outage=(2.0, 0.2)), 9.0, Hold),
 }
 
 
 @dataclass
 class Seen:
-    """What one client saw: at each of its ticks, how old its newest snapshot was (ms) and whether it moved there."""
+    """The age of the newest snapshot (ms) at each tick of one client, and whether its player moved there."""
 
     bot: Bot
     clock: Callable[[], float] = time.monotonic
@@ -90,7 +90,7 @@ class Seen:
     after: Stats = field(default_factory=Stats)
     events: list[Event] = field(default_factory=list)
     rtt_s: float = 0.0
-    """The least round trip of the last pings: the path without its queues, and without a busy machine."""
+    """Least round trip of the last pings: the link without its queues and without a busy machine."""
 
     def __call__(self, core: Core) -> None:
         self.bot(core)
@@ -107,7 +107,7 @@ class Seen:
 
 
 class Figures:
-    """What all clients of one run saw."""
+    """The figures of all clients of one run."""
 
     def __init__(self, seen: list[Seen], seconds: float) -> None:
         self.seen = seen
@@ -124,7 +124,7 @@ class Figures:
         self.corrections = sum((Counter(each.after.corrections_by_cause) for each in seen), Counter[str]())
 
     def age_ms(self, q: float, start: float = SETTLED_S, end: float = 1e9) -> float:
-        """A quantile of the snapshots' ages within a time."""
+        """Returns a quantile of the snapshots' ages between two times."""
         ages = sorted(age for each in self.seen for now, age in each.ages if start <= now < end)
         return ages[min(int(q * len(ages)), len(ages) - 1)]
 
@@ -182,7 +182,7 @@ async def measured(link: Case, url: str) -> Figures:
             await asyncio.sleep(link.seconds - proxy.now)
             for client, each in zip(clients, seen, strict=True):
                 each.after = copy.deepcopy(client.stats)
-            figures = Figures(seen, link.seconds)  # before anybody leaves
+            figures = Figures(seen, link.seconds)  # before any client leaves
             await asyncio.gather(*(client.close() for client in clients))
     return figures
 
@@ -194,8 +194,8 @@ async def all_at_once(urls: dict[str, str]) -> dict[str, Figures]:
 
 @pytest.fixture(scope="module")
 def both() -> dict[str, tuple[Figures, Figures]]:
-    """Of each link: as simulated, and as measured."""
-    expected = {name: simulated(link) for name, link in LINKS.items()}  # compiles, too
+    """Returns the simulated and the measured figures of each link."""
+    expected = {name: simulated(link) for name, link in LINKS.items()}  # this compiles the kernel, too
     with real_server("--scene", "flat") as a, real_server("--scene", "flat") as b, real_server("--scene", "flat") as c:
         found = asyncio.run(all_at_once(dict(zip(LINKS, (a, b, c), strict=True))))
     for name in LINKS:
@@ -226,7 +226,7 @@ def test_in_a_dip_the_latest_wins_and_then_all_is_as_before(both: dict[str, tupl
         assert figures.skipped > 0
     hidden_ms = 8e3 * HIDDEN_BYTES * (1 + HEADER_BYTES / PACKET_BYTES) / DIP_RATE
     bound_ms = 1.5 * simulated.age_ms(1, start, end) + hidden_ms + 4 * NOISE_MS
-    assert measured.age_ms(0.99, start, end) <= bound_ms < 2000  # without skipping it is more than 2000
+    assert measured.age_ms(0.99, start, end) <= bound_ms < 2000  # without skipping, it is more than 2000
     assert measured.age_ms(0.9, end + 0.5) <= 1.5 * simulated.age_ms(0.9, end + 0.5) + NOISE_MS
 
 
@@ -237,7 +237,7 @@ def test_an_outage_is_felt_and_held_keys_survive_it(both: dict[str, tuple[Figure
         assert figures.substituted > 0
     assert not simulated.corrections
     assert simulated.moving_share == 1
-    # A busy machine may make one outage longer than inputs are repeated: then, and only then, they stand for a moment.
+    # A busy machine may make one outage longer than inputs are repeated. Only then do players stand for a moment.
     assert measured.corrections["other entity"] == 0
     assert measured.corrections["late input"] <= CLIENTS
     assert measured.moving_share >= 0.9

@@ -1,4 +1,4 @@
-"""The live page in a real browser: it draws the ground, and a bot is seen moving."""
+"""The live page in a real browser: it draws the ground, and a bot moves on it."""
 
 import asyncio
 import random
@@ -25,7 +25,7 @@ PAINTED = """(() => {
 
 
 def seen(browser: str, url: str) -> dict[str, Any]:
-    """What the page shows, until it has shown the bot in five places."""
+    """Returns the content of the page, once it has shown the bot in five places."""
     with chromium(browser) as tab:
         tab.open(url, 1200, 800)
         tab.until("have && have.every(tile => tile.version >= 0) && !repaint")
@@ -60,13 +60,13 @@ async def test_a_bot_is_seen_running() -> None:
             found = await asyncio.to_thread(seen, BROWSER, url.replace("ws:", "http:"))
             await ann.close()
             await bob.close()
-    assert found["said"] == [], "no exception, nothing that the policy forbids"
+    assert found["said"] == [], "there is no exception, and no load that the policy forbids"
     assert found["painted"] == [128 * 128, 128 * 128]
     assert found["clients"] == 2
     assert found["on_screen"]
     assert (found["markup"], found["foreign"]) == (0, 0)
     names = {(spot[0], spot[2]) for spot in found["spots"]}
-    assert names == {(name, "Bob")}, "a name is text, whatever it says"
+    assert names == {(name, "Bob")}, "a name is shown as text, whatever it contains"
     assert len({spot[1] for spot in found["spots"]}) == 5, "Ann is in another place each time"
     assert len({spot[3] for spot in found["spots"]}) == 1, "Bob stands"
 
@@ -79,4 +79,4 @@ def test_the_picture_of_the_readme_is_made_by_its_script(tmp_path: Path) -> None
     data = picture.read_bytes()
     assert data.startswith(b"\x89PNG")
     assert (int.from_bytes(data[16:20], "big"), int.from_bytes(data[20:24], "big")) == (1400, 860)
-    assert len(data) > 50_000, "there is something on it"
+    assert len(data) > 50_000, "the picture is not empty"

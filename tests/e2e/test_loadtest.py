@@ -1,4 +1,4 @@
-"""The load test as it is called: real processes, real sockets."""
+"""The load test as a command: real processes, real sockets."""
 
 import json
 import os
@@ -93,7 +93,7 @@ def test_a_broken_scene_is_one_clear_line() -> None:
 
 @pytest.fixture
 def playing(request: pytest.FixtureRequest) -> Iterator[tuple["subprocess.Popen[str]", dict[int, str]]]:
-    """A load test in the midst of it: its process, and those that it has started, with their commands."""
+    """A running load test: its process, and the processes that it has started, with their commands."""
     command = [sys.executable, "-u", "scripts/loadtest.py", "--clients", "4", "--processes", "2", "--seconds", "60"]
     with ExitStack() as stack:
         with inheriting(signal.SIG_IGN, *getattr(request, "param", ())):
@@ -120,7 +120,7 @@ def playing(request: pytest.FixtureRequest) -> Iterator[tuple["subprocess.Popen[
 @pytest.mark.parametrize(
     ("number", "playing"),
     [
-        (signal.SIGINT, (signal.SIGINT,)),  # as a script's background job
+        (signal.SIGINT, (signal.SIGINT,)),  # like a background job of a script
         *long((signal.SIGTERM, ()), (signal.SIGINT, ()), (signal.SIGTERM, (signal.SIGINT,))),
     ],
     indirect=["playing"],
@@ -143,7 +143,7 @@ def test_the_death_of_a_process_ends_it_at_once_with_nothing_left_behind(
 ) -> None:
     process, started = playing
     os.kill(next(pid for pid, command in started.items() if killed in command), signal.SIGKILL)
-    out, _ = process.communicate(timeout=20)  # of the 60 s that it was to last
+    out, _ = process.communicate(timeout=20)  # of the 60 s that it should last
     assert process.returncode == 1
     assert f"failed: {name} ended during the test with exit code -9" in out
     assert "Traceback" not in out

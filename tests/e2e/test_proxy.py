@@ -1,4 +1,4 @@
-"""The proxy keeps what it promises, with bounds that a busy machine keeps, too."""
+"""The proxy keeps its promises, with limits that hold on a busy machine, too."""
 
 import asyncio
 import socket
@@ -18,7 +18,7 @@ Ends = tuple[asyncio.StreamReader, asyncio.StreamWriter]
 
 @asynccontextmanager
 async def connected(path: Link) -> AsyncIterator[tuple[Proxy, Ends, Ends]]:
-    """A proxy and the two ends of a connection through it: the client's and the server's."""
+    """Yields a proxy and the two ends of a connection through it: the client's and the server's."""
     ends: asyncio.Queue[Ends] = asyncio.Queue()
     server = await asyncio.start_server(lambda *end: ends.put_nowait(end), "127.0.0.1", 0)
     async with asyncio.timeout(SECONDS), server, Proxy(server.sockets[0].getsockname(), path) as proxy:
@@ -61,7 +61,7 @@ async def test_a_narrow_line_takes_its_time_and_holds_the_sender_up() -> None:
         writer.write(bytes(20_000))
         await reader.readexactly(1)
         waiting = writer.transport.get_write_buffer_size()
-        assert waiting > 5_000, "the rest is still at its sender"
+        assert waiting > 5_000, "the rest still waits at its sender"
         await reader.readexactly(19_999)
         assert time.monotonic() - began >= 0.95 * 8 * 20_000 / 160e3
 

@@ -1,4 +1,4 @@
-"""The real process: what it prints, how it ends, and that rubbish from a peer leaves no trace in its log."""
+"""The real process: its output, its end, and that garbage from a peer leaves no trace in its log."""
 
 import asyncio
 import os
@@ -53,7 +53,7 @@ def joined(address: tuple[str, int]) -> Iterator[tuple[ClientConnection, Welcome
 
 
 def last_words(link: ClientConnection) -> Message:
-    """The last message before the server closes; it must close with a code."""
+    """Returns the last message before the server closes, which it must do with a code."""
     last = None
     try:
         while True:
@@ -94,7 +94,7 @@ def test_serves_and_tells_its_clients_when_it_ends() -> None:
 
 @contextmanager
 def mute(address: tuple[str, int]) -> Iterator[socket.socket]:
-    """A WebSocket client that says nothing more, not even when the server closes."""
+    """A WebSocket client that sends nothing more, not even when the server closes."""
     with socket.create_connection(address) as link:
         link.sendall(UPGRADE)
         assert link.recv(12) == b"HTTP/1.1 101"
@@ -133,11 +133,11 @@ def test_players_show_tokens_which_are_in_no_log(tmp_path: Path) -> None:
         assert server.end(signal.SIGTERM) == 0
         text = "".join(server.errors)
         assert not [part for token in (good, forged) for part in token.split(".")[1:] if part in text]
-        assert server.log(), "there is a log to look at"
+        assert server.log(), "there are log entries to check"
 
 
 def says(address: tuple[str, int], hello: Hello) -> type[Welcome] | Message:
-    """The last word of a server before it closes; `Welcome` if it is one."""
+    """Sends a hello. Returns the answer, or `Welcome` if it is one."""
     with connect(f"ws://{address[0]}:{address[1]}", compression=None, max_queue=None) as link:
         link.send(encode(hello))
         answer = decode_from_server(link.recv(END_S, decode=False))
@@ -155,7 +155,7 @@ def status(address: tuple[str, int], path: str) -> tuple[int, str]:
 def test_while_it_goes_down_it_says_so_and_nobody_comes_in() -> None:
     with running("--port", "0", "--scene", "flat", "--restart-s", "7") as server:
         address = server.address()
-        with mute(address):  # its closing is waited for
+        with mute(address):  # the server waits for the answer to its close frame
             until(lambda: status(address, "/readyz") == (200, "ready\n"))
             server.process.send_signal(signal.SIGTERM)
             until(lambda: status(address, "/readyz") == (503, "not ready: draining\n"))
@@ -187,8 +187,8 @@ def test_who_is_beyond_a_limit_is_told_so_before_the_websocket_opens() -> None:
 @pytest.mark.skipif(os.name == "nt", reason="there is no such signal")
 @pytest.mark.parametrize("rate", [32, *long(128)])
 def test_a_suspended_server_goes_on_and_so_do_its_clients(rate: int) -> None:
-    """After 3 s without a turn some ticks are made up for, the rest is given up. Nobody has to come back, and within
-    two seconds the players move again."""
+    """After 3 s without CPU time, the server catches up on some ticks and drops the others. Clients do not reconnect,
+    and within two seconds the players move again."""
     with running("--port", "0", "--scene", "flat", "--tick-rate", str(rate)) as server:
         address = server.address()
         with Client.connect("ws://{}:{}".format(*address), name="Ann") as client:
@@ -225,7 +225,7 @@ def test_a_second_signal_ends_it_at_once() -> None:
 @pytest.mark.skipif(os.name == "nt", reason="a signal ends a process there")
 @pytest.mark.parametrize("number", [signal.SIGINT, *long(signal.SIGTERM)])
 def test_a_signal_ends_it_that_its_starter_had_it_ignore(number: signal.Signals) -> None:
-    """A shell does so with SIGINT for what a script starts in the background."""
+    """A shell makes the background jobs of a script ignore SIGINT."""
     with inheriting(signal.SIG_IGN, number), running("--port", "0", "--scene", "flat") as server:
         server.address()
         assert server.end(number) == 0
@@ -278,7 +278,7 @@ def test_other_hosts(host: str) -> None:
 
 
 async def storm(address: tuple[str, int]) -> None:
-    """Rubbish of every kind, in every stage."""
+    """Sends garbage of every kind, in every state of a connection."""
     rng = random.Random(11)
 
     async def one(turn: int) -> None:
@@ -286,7 +286,7 @@ async def storm(address: tuple[str, int]) -> None:
         body = rng.randbytes(rng.choice((1, 5, 100, 9000)))
         if turn % 3 == 1:
             body = UPGRADE + body
-        elif turn % 3 == 2:  # well-formed frames of nonsense
+        elif turn % 3 == 2:  # well-formed frames with random content
             body = UPGRADE + b"\x82\xfe" + len(body[:200]).to_bytes(2, "big") + b"\0\0\0\0" + body[:200]
         writer.write(body)
         try:
@@ -306,7 +306,7 @@ def test_rubbish_leaves_no_trace_and_the_ticks_go_on() -> None:
         address = server.address()
         with joined(address):
             asyncio.run(storm(address))
-            until(lambda: stats(address)["connections"] == 2)  # the one that has joined, and the one that asks
+            until(lambda: stats(address)["connections"] == 2)  # the joined client, and the one that asks for the page
             before = stats(address)
             until(lambda: stats(address)["tick"] > before["tick"] + 5)
             assert stats(address)["internal_errors"] == 0

@@ -1,4 +1,4 @@
-"""The soak test in its smallest form: everything at once, for a quarter of a minute; and that it sees what is wrong."""
+"""The soak test in its smallest form: everything at once for a quarter of a minute, and that it detects faults."""
 
 import json
 import random
@@ -50,14 +50,14 @@ def test_an_edit_that_was_told_and_is_not_there_is_found() -> None:
     done, open_, refused = (0, 0, 1), (1, 0, 1), (2, 0, 1)
     kinds = [cells.ask(7, cell, rng) for cell in (done, open_, refused)]
     assert None not in kinds
-    assert cells.ask(8, done, rng) is None, "it is another's"
+    assert cells.ask(8, done, rng) is None, "it belongs to another client"
     cells.answered(done, kinds[0] or 0, messages.DONE)
     cells.answered(refused, kinds[2] or 0, messages.OVERLAPS)
     assert len(cells.lost(world, untouched)) == 1
     world.set_block(*done, kinds[0] or 0)
     assert cells.lost(world, untouched) == []
     world.set_block(*open_, kinds[1] or 0)
-    assert cells.lost(world, untouched) == [], "nobody was told what became of it"
+    assert cells.lost(world, untouched) == [], "no client got its verdict"
     world.set_block(*refused, 9)
     assert len(cells.lost(world, untouched)) == 1
 

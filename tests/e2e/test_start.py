@@ -1,4 +1,4 @@
-"""How a server process starts, or says in one line why not; and its other commands."""
+"""The start of a server process, or its one-line error; and its other commands."""
 
 import contextlib
 import http.client
@@ -26,7 +26,7 @@ pytestmark = pytest.mark.e2e
 
 
 def on_a_terminal(cache: Path) -> list[str]:
-    """The lines that somebody sees who starts a server, up to the one that it listens."""
+    """Returns the first word of each line on the terminal of a starting server, up to the one that it listens."""
     seen, its = os.openpty()
     command = [sys.executable, "-m", "server", "--port", "0", "--scene", "flat", "--log-level", "warning"]
     environment = {**os.environ, "NUMBA_CACHE_DIR": str(cache), kernels.VARIABLE: kernels.NUMBA}
@@ -180,7 +180,7 @@ for arguments, variables in json.load(sys.stdin):
     told.append([code, out.getvalue(), err.getvalue()])
 json.dump(told, sys.stdout)
 """
-"""Does what a process with each of these starts does, one after another."""
+"""Program that runs the given starts one after another in one process."""
 
 
 def start(*arguments: str, **variables: str) -> Start:

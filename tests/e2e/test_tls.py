@@ -1,4 +1,4 @@
-"""wss:// from end to end: a certificate made for the test, a server process, both transports of the SDK."""
+"""TLS from end to end (wss://): a certificate made for the test, a server process, both transports of the SDK."""
 
 import asyncio
 import ssl

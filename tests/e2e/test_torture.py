@@ -1,7 +1,7 @@
-"""A hostile crowd on the server's port while honest players play: these get what they got before, and nothing is left.
+"""A hostile crowd on the server's port beside honest players, who are served as before; nothing is left of the attack.
 
-What the server does with each single peer is in `test_abuse.py`. Here there are many at a time, and what counts is
-the honest players: their snapshots and the server's lateness, during an attack beside before it, in the same run.
+`test_abuse.py` tests the answer to each single peer. Here there are many at a time, and the honest players count: their
+snapshots and the server's lateness during an attack, compared with those before it in the same run.
 """
 
 import contextlib
@@ -30,12 +30,12 @@ pytestmark = [
 HONEST = 12
 WINDOW_S = 5.0
 WINDOWS = 3
-"""One of so many must be good."""
+"""Number of measured windows, one of which must be good."""
 SHARE_MIN = 0.9
-"""Of the snapshots that the worst served honest player got before."""
+"""Least share of the snapshots during an attack, of those that the worst served honest player got before."""
 GROWTH_MB_MAX = 24.0
 BUSY = re.compile("stalled|suspended|goes on")
-"""What the watchdog says on a machine that others keep busy."""
+"""Log lines of the watchdog on a machine that is busy with other work."""
 GATEWAYS = KINDS["gateway"].choices if "gateway" in KINDS else ("",)
 ATTACKS: dict[str, dict[str, Any]] = {
     "half open": {"peers": {"nothing": 100, "half_a_request": 100, "slow_loris": 100}},
@@ -46,7 +46,7 @@ ATTACKS: dict[str, dict[str, Any]] = {
 
 
 class Script:
-    """One of the scripts that take an order, commands on their input, and answer with lines of JSON."""
+    """A script that takes an order, gets commands on its input, and answers with lines of JSON."""
 
     def __init__(self, name: str, order: dict[str, Any]) -> None:
         self.process = subprocess.Popen(
@@ -63,7 +63,7 @@ class Script:
         self.process.stdin.flush()
 
     def hear(self, wanted: str, value: int | None = None) -> dict[str, Any]:
-        """The next answer that has such an entry (of at least that value)."""
+        """Returns the next answer that has this entry (with at least this value)."""
         assert self.process.stdout is not None
         for line in self.process.stdout:
             told: dict[str, Any] = json.loads(line)
@@ -78,7 +78,7 @@ class Script:
 
 @contextlib.contextmanager
 def script(name: str, order: dict[str, Any]) -> Iterator[Script]:
-    """A script at work; it has ended in the end."""
+    """Runs a script. It has ended at the end of the block."""
     made = Script(name, order)
     try:
         with made.process:
@@ -90,7 +90,7 @@ def script(name: str, order: dict[str, Any]) -> Iterator[Script]:
 
 
 def window(address: tuple[str, int], honest: Script) -> tuple[float, float]:
-    """What comes of some seconds: the worst share of the snapshots, and the p99 of the ticks' lateness in ms."""
+    """Measures some seconds. Returns the worst share of the snapshots, and the p99 of the ticks' lateness in ms."""
     before = stats(address)
     honest.tell("begin")
     time.sleep(WINDOW_S)
@@ -111,9 +111,9 @@ def storm(server: ServerProcess, attack: dict[str, Any], tick_ms: float) -> None
         share_before, late_before = window(address, honest)
         rss = stats(address)["rss_mb"]
         with script("scripts.loadgen.hostile", {"port": address[1], "seed": 1} | attack) as hostile:
-            time.sleep(1.0)  # they are at it
+            time.sleep(1.0)  # the attack has begun
             share, late = 0.0, 0.0
-            for _ in range(WINDOWS):  # others on this machine can only make it worse
+            for _ in range(WINDOWS):  # other work on this machine can only make it worse
                 share, late = window(address, honest)
                 if share >= SHARE_MIN * share_before and late <= max(tick_ms, 4 * late_before):
                     break
@@ -126,7 +126,7 @@ def storm(server: ServerProcess, attack: dict[str, Any], tick_ms: float) -> None
         )
         assert share >= SHARE_MIN * share_before
         assert late <= max(tick_ms, 4 * late_before)
-        until(lambda: stats(address)["connections"] == HONEST + 1, 4 * END_S)  # and the one that asks
+        until(lambda: stats(address)["connections"] == HONEST + 1, 4 * END_S)  # and the one that asks for the page
         assert stats(address)["clients"] == HONEST
         assert stats(address)["rss_mb"] - rss < GROWTH_MB_MAX
         figures = stats(address)
@@ -146,7 +146,8 @@ def test_honest_players_are_served_during_an_attack_and_nothing_is_left_of_it(
 
 
 def test_a_neighbour_that_takes_all_the_processor_delays_and_breaks_nothing() -> None:
-    """One busy process per core and one more: ticks come late and are made up for; then all is as it was."""
+    """One busy process per core and one more: ticks come late and are made up for. Afterwards everything is as
+    before."""
     with running("--port", "0", "--scene", "flat", "--tick-rate", "32") as server, contextlib.ExitStack() as stack:
         address = server.address()
         order = {"port": address[1], "seed": 1, "rate": 32, "joins_per_s": 100}

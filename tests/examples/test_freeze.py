@@ -1,4 +1,4 @@
-"""The game in the README, as somebody wrote it who had read nothing else."""
+"""The game in the README, played as a reader of the README would write it."""
 
 from sovereign_netcode.client_sdk.bots import Policy
 from sovereign_netcode.examples.freeze import Freeze
@@ -12,7 +12,7 @@ TYPICAL = Line(0.05, 0.01)
 
 
 def to(number: int) -> Policy:
-    """A bot that hops to the player who joined as the `number`th."""
+    """Returns a bot that hops to the player who joined as the `number`th."""
 
     def policy(world: World, me: int) -> Input:
         everybody = world.entities["id"].tolist()
@@ -25,7 +25,7 @@ def to(number: int) -> Policy:
 
 
 def heading(x: int, y: int) -> Policy:
-    """A bot that hops into one direction for ever."""
+    """Returns a bot that hops into one direction."""
     return lambda world, me: make_input(x, y, jump=True)
 
 
@@ -45,7 +45,7 @@ def test_who_is_touched_freezes_and_is_thawed_by_a_friend() -> None:
     place = game.position(bob.core.entity)
     match.run(2)
     assert game.position(bob.core.entity) == place
-    assert bob.core.input.move_x == -127, "it would if it could"
+    assert bob.core.input.move_x == -127, "the player wants to walk, but is frozen"
 
     ann.policy = bot(heading(-1, 0))
     match.run(3)

@@ -1,6 +1,6 @@
-"""The client in Node.js, written from docs/protocol.md: it plays on a real server, which has nothing to complain of.
+"""The client in Node.js, written from docs/protocol.md, plays on a real server without an error there.
 
-What it has been told of everybody's way is compared with a recording of that server.
+The positions that it was sent are compared with a recording of that server.
 """
 
 import json
@@ -34,7 +34,7 @@ def test_the_lock_pins_by_content_and_names_no_registry() -> None:
 
 @pytest.fixture
 def installed(tmp_path: Path) -> Path:
-    """A directory with the example and its two packages."""
+    """Yields a directory with the example and its two packages."""
     npm = shutil.which("npm")
     if npm is None or shutil.which("node") is None:
         pytest.skip("there is no Node.js with npm on this machine")
@@ -74,7 +74,7 @@ def test_it_joins_walks_and_knows_exactly_where_everybody_is(installed: Path) ->
     compared = 0
     for moment in replay(record):
         world = moment.world
-        if world.tick in told and not moment.ended:  # the meadow is so small that everybody is in sight
+        if world.tick in told and not moment.ended:  # the meadow is small enough that every entity is in view
             truth = {str(entity): list(world.position(entity)) for entity in world.states()[:, ID].tolist()}
             assert told[world.tick]["places"] == truth, world.tick
             compared += 1

@@ -1,4 +1,4 @@
-"""Tag, played by bots over slow links in simulated time: nobody errs, and a recording gives the same game again."""
+"""Tag, played by bots over slow links in simulated time: no rule fails, and a recording gives the same game again."""
 
 import io
 from itertools import pairwise
@@ -21,7 +21,7 @@ CAUSES = {"late input", "other entity", "server act", "unknown edit", "missing t
 
 
 def played(count: int, seconds: float, seed: int, path: Link) -> tuple[Match, list[Player], io.BytesIO]:
-    """A recorded game of so many bots."""
+    """Returns a recorded game with a number of bots."""
     match = Match(load_scene(Tag.scene), seed, rules=Tag())
     recording = io.BytesIO()
     match.game.world.record(recording)
@@ -50,9 +50,9 @@ def test_bots_play_tag_and_a_recording_gives_the_same_scores(count: int, seconds
         tagged = [event for event in player.events if isinstance(event, Happened) and event.name == "tagged"]
     assert len(tagged) >= seconds / 30, "they catch each other"
     for one, two in pairwise(tagged):
-        assert one.data["who"] == two.data["by"], "who has been tagged is it"
+        assert one.data["who"] == two.data["by"], "the tagged player is it"
         if two.tick - one.tick < game.api.ticks(Tag.safe_s):
-            assert two.data["who"] != one.data["by"], "not back at once"
+            assert two.data["who"] != one.data["by"], "not tagged back at once"
 
     recording = Recording(file)
     notes = []

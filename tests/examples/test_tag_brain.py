@@ -1,4 +1,4 @@
-"""The heads of the runners and of the bots: whom they run after, and from whom."""
+"""The decisions of runners and bots in tag: whom they run after, and from whom they run away."""
 
 import math
 

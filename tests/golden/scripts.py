@@ -1,4 +1,5 @@
-"""The runs behind `physics.json`: a scene, a script, and the hash at some ticks; no dice of any library."""
+"""The runs behind `physics.json`: a scene, a script, and the hash at some ticks; without random numbers of a
+library."""
 
 import contextlib
 from collections.abc import Callable, Iterator
@@ -13,7 +14,7 @@ MARKS = (1, 100, 500, 1000, TICKS)
 
 
 class Script(NamedTuple):
-    """A scene, how many take part, and whether the world is edited on the way."""
+    """A scene, the number of entities, and whether the world is edited on the way."""
 
     scene: Callable[[], Scene]
     entities: int
@@ -21,7 +22,7 @@ class Script(NamedTuple):
 
 
 def crowd_scene(integrator: str = "mean", tick_rate: int = 32) -> Scene:
-    """Much of everything in a pit of 64 x 64 blocks: all kinds of entities, far from the origin."""
+    """Returns a pit of 64 x 64 blocks with all kinds of entities, far from the origin."""
     templates = (
         Template("player", walk_speed=3.0, jump_speed=8.0),
         Template("crate", (-0.5, -0.5, 0), (1, 1, 1)),
@@ -50,7 +51,7 @@ SCRIPTS = {
 
 
 class Dice:
-    """A linear congruential generator: the same on every machine and Python."""
+    """A linear congruential generator, which is the same on every machine and Python version."""
 
     def __init__(self, seed: int) -> None:
         self.state = seed
@@ -61,7 +62,7 @@ class Dice:
 
 
 def run(name: str, *, compiled: bool, ticks: int = TICKS) -> Iterator[tuple[int, str]]:
-    """Plays a script; yields each mark and the hash of the whole world there."""
+    """Plays a script. Yields each mark and the hash of the whole world there."""
     script = SCRIPTS[name]
     scene = script.scene()
     world = World(scene, compiled=compiled)

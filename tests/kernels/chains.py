@@ -1,4 +1,4 @@
-"""Long runs of one world, each of whose states goes into one number: `python -m tests.kernels.chains SCENE TICKS`."""
+"""Long runs of one world whose states all go into one hash: `python -m tests.kernels.chains SCENE TICKS`."""
 
 import hashlib
 import random
@@ -17,7 +17,7 @@ PLAYERS = 6
 
 
 def chain(scene_name: str, ticks: int, *, compiled: bool) -> str:
-    """The hash of the states of every tick, and of all blocks in the end."""
+    """Returns the hash of the states of every tick, and of all blocks at the end."""
     scene = load_scene(scene_name)
     world, total, rng = World(scene, compiled=compiled), hashlib.sha256(), random.Random(7)
     world.load_terrain()
@@ -39,7 +39,7 @@ def chain(scene_name: str, ticks: int, *, compiled: bool) -> str:
 
 
 def _players(world: World, rng: random.Random) -> Iterator[int]:
-    """Players at the spawns, and near them."""
+    """Yields players at the spawn points, and near them."""
     scene = world.scene
     while len(world) < PLAYERS:
         x, y, z = rng.choice(scene.spawns)
@@ -51,7 +51,7 @@ def _players(world: World, rng: random.Random) -> Iterator[int]:
 
 
 def _dig(world: World, entity: int, rng: random.Random) -> None:
-    """Takes or puts a block near a player."""
+    """Removes or places a block near a player."""
     x, y, z = (int(part // 1) + rng.randint(-2, 2) for part in world.position(entity))
     if (x // SEGMENT, y // SEGMENT, z // SEGMENT) in world.blocks:
         try:

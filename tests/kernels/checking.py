@@ -1,6 +1,6 @@
 """A plugin of pytest (`-p tests.kernels.checking`): compiled worlds run a build of the kernel that checks every index.
 
-It is what `scripts/kernels` builds for this machine, from the same IR but for the checks. LLVM loads it into this
+`scripts/kernels` builds it for this machine from the same IR, with the checks in addition. LLVM loads it into this
 process, so no linker is needed. A function that meets an index out of bounds raises a SystemError. Set the environment
 of `scripts.kernel_build.build.BUILDING` for the process.
 """
@@ -24,7 +24,7 @@ ABI = 3
 
 
 def loaded() -> tuple[ModuleType, Any]:
-    """The Python module of the checked kernel, and what it lives in."""
+    """Returns the Python module of the checked kernel, and the engine that owns its memory."""
     llvm.initialize_native_target()
     llvm.initialize_native_asmprinter()
     names = {**exports.functions(), "built_from": exports.NUMBER}
@@ -46,5 +46,5 @@ kernels._kernels[FORM] = kernels.kernel_of(MODULE, FORM)
 
 few, many = np.zeros(12, np.int64), np.zeros(24, np.int64)
 with contextlib.suppress(SystemError):
-    kernels.get(True).alike(few, 2, many, 2, 1, 1, few)  # two states, where one has room
+    kernels.get(True).alike(few, 2, many, 2, 1, 1, few)  # two states in an array with room for one
     raise AssertionError("indices are not checked")

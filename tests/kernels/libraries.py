@@ -1,4 +1,4 @@
-"""Reads of a library what it is for, what it needs and what it gives: ELF, PE, Mach-O and WebAssembly."""
+"""Reads a library's machine, imports and exports: ELF, PE, Mach-O and WebAssembly."""
 
 import struct
 from typing import NamedTuple
@@ -17,7 +17,7 @@ def _text(data: bytes, at: int) -> str:
 
 
 def elf(data: bytes) -> Library:
-    """A shared object of a 64-bit, little-endian ELF machine (62: x86-64, 183: AArch64)."""
+    """Reads a shared object of a 64-bit, little-endian ELF machine (62: x86-64, 183: AArch64)."""
     assert data[:6] == b"\x7fELF\2\1"
     (machine,) = struct.unpack_from("<H", data, 18)
     (sections_at,) = struct.unpack_from("<Q", data, 40)
@@ -36,7 +36,7 @@ def elf(data: bytes) -> Library:
 
 
 def pe(data: bytes) -> Library:
-    """A DLL for 64-bit Windows (0x8664: x86-64); its imports with the library that they come from."""
+    """Reads a DLL for 64-bit Windows (0x8664: x86-64). Imports have the name of their library."""
     (at,) = struct.unpack_from("<I", data, 60)
     assert data[at : at + 4] == b"PE\0\0"
     machine, count = struct.unpack_from("<HH", data, at + 4)
@@ -68,7 +68,7 @@ def pe(data: bytes) -> Library:
 
 
 def macho(data: bytes) -> Library:
-    """A signed library for 64-bit macOS (0x100000C: Apple's arm64)."""
+    """Reads a signed library for 64-bit macOS (0x100000C: Apple's arm64)."""
     magic, machine, _, _, count = struct.unpack_from("<5I", data)
     assert magic == 0xFEEDFACF
     at, signed = 32, False
@@ -88,7 +88,7 @@ def macho(data: bytes) -> Library:
 
 
 def wasm(data: bytes) -> Library:
-    """A WebAssembly module; imports and exports as KIND:NAME."""
+    """Reads a WebAssembly module. Imports and exports have the form KIND:NAME."""
     assert data[:8] == b"\0asm\1\0\0\0"
     at = 8
     imports, exports = set[str](), set[str]()

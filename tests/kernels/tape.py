@@ -1,7 +1,7 @@
-"""Records every call of a kernel, so that another machine can make them again: `replay.mjs` does, in WebAssembly.
+"""Records every call of a kernel on a tape, so that another machine can repeat it: `replay.mjs` does so in WebAssembly.
 
-A tape holds, for each call, what has changed in the arrays since the last one, the arguments, the result, and what the
-call has changed. So a replay compares every word of every array after every call, bookkeeping included.
+For each call, a tape holds the changes in the arrays since the last call, the arguments, the result, and the changes
+that the call made. So a replay compares every word of every array after every call, bookkeeping included.
 
     R                                             all arrays are forgotten
     A  u32 array  u32 bytes  u8 unit              a new array, all zero
@@ -23,11 +23,11 @@ from shared import exports
 from shared.kernels import Kernel
 
 BYTES_MAX = 256 << 20
-"""All arrays are forgotten when they take more than that."""
+"""Bytes of all recorded arrays. When they exceed it, all arrays are forgotten."""
 
 
 class Tape:
-    """Written to a file, call by call.
+    """A tape in a file, written call by call.
 
     Args:
         kernel: makes the calls.
@@ -41,7 +41,7 @@ class Tape:
         self.calls: dict[str, int] = dict.fromkeys(exports.functions(), 0)
 
     def kernel(self) -> Kernel:
-        """The kernel, recorded."""
+        """Returns the kernel with recording."""
         functions = {
             name: self._recorded(i, name, kinds) for i, (name, kinds) in enumerate(exports.functions().items())
         }
@@ -81,7 +81,7 @@ class Tape:
         return call
 
     def _array(self, given: Any) -> tuple[int, np.ndarray[Any, Any], np.ndarray[Any, Any]]:
-        """The number of an array, its units as they are, and as they were after the latest call."""
+        """Returns the number of an array, its units as they are now, and as they were after the latest call."""
         raw = np.frombuffer(given, np.uint8) if len(given) else np.zeros(0, np.uint8)
         unit = next(size for size in (8, 4, 1) if len(raw) % size == 0)
         now = raw.view(f"<u{unit}")
@@ -95,7 +95,7 @@ class Tape:
 
 
 def _changes(array: int, now: np.ndarray[Any, Any], shadow: np.ndarray[Any, Any]) -> bytes:
-    """What is not as it was; from then on it is."""
+    """Returns the packed changes of an array since the last time."""
     at = np.flatnonzero(now != shadow)
     if not len(at):
         return b""

@@ -1,4 +1,4 @@
-"""Which kernel runs, and that a prebuilt one that is not of these sources never does."""
+"""The choice of a kernel: a prebuilt one that was not built from these sources never runs."""
 
 import ast
 import platform
@@ -20,7 +20,8 @@ WHAT = "from shared import kernels; print([kernels.chosen(), kernels.trouble(), 
 
 
 def chosen(root: Path, *flags: str, program: str = WHAT, **environment: str) -> list[str]:
-    """What another process chooses in a copy of the sources: the form, why it is not the prebuilt one, what it got."""
+    """Returns the choice of another process in a copy of the sources: the form, the trouble with the prebuilt one, and
+    the loaded form."""
     done = subprocess.run(
         (sys.executable, *flags, "-c", program), cwd=root, env=environment, capture_output=True, text=True, check=True
     )
@@ -143,7 +144,7 @@ def test_arguments_that_are_none_are_refused_and_nothing_is_kept() -> None:
     frozen.flags.writeable = False
     nothing = (numbers, numbers, numbers, numbers)
     wrong: list[tuple[str, tuple[object, ...], type[Exception]]] = [
-        ("recall", nothing, TypeError),  # too few
+        ("recall", nothing, TypeError),  # too few elements
         ("recall", (*nothing, 0, 0), TypeError),
         ("recall", (*nothing, 0.5), TypeError),
         ("recall", (*nothing, 1 << 63), OverflowError),

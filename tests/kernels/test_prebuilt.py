@@ -1,4 +1,4 @@
-"""The prebuilt kernels are there for every platform, made from the sources as they are, and need what they should."""
+"""The prebuilt kernels exist for every platform, are built from the current sources, and need only what they should."""
 
 import hashlib
 import json
@@ -20,7 +20,7 @@ PYTHON = {
     "PyBuffer_Release", "PyErr_BadArgument", "PyErr_BadInternalCall", "PyErr_Occurred", "PyLong_AsLongLong",
     "PyLong_FromLongLong", "PyModuleDef_Init", "PyObject_GetBuffer",
 }  # fmt: skip
-"""All of it is in the stable ABI of CPython 3.11."""
+"""Functions of Python that the libraries import; all are in the stable ABI of CPython 3.11."""
 INIT = {"PyInit_sovereign_kernel"}
 FUNCTIONS = {f"function:{name}" for name in (*exports.functions(), "built_from")}
 AGAIN = ("linux-x86_64.so", "kernel.wasm")
@@ -80,7 +80,8 @@ def test_a_library_needs_python_or_a_memory_and_nothing_else(
 @pytest.mark.slow
 @pytest.mark.skipif(not kernels.numba_installed(), reason="Numba is not installed")
 def test_a_second_build_gives_the_same_bytes(tmp_path: Path) -> None:
-    """Up to the linker, which `scripts/kernels --check` includes: it is no part of the environment of the tests."""
+    """The bytes are compared before the linker runs. `scripts/kernels --check` includes the linker, which the tests'
+    environment lacks."""
     build = (sys.executable, "-m", "scripts.kernel_build.build", str(tmp_path), "--objects", *AGAIN)
     subprocess.run(build, cwd=tmp_path, env=os.environ | {"PYTHONHASHSEED": "7"}, check=True)
     again, made = json.loads((tmp_path / kernels.MANIFEST).read_text("utf-8")), manifest()

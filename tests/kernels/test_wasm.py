@@ -1,4 +1,4 @@
-"""The kernel in WebAssembly makes every call, in Node.js, as it was made here, to the same results and bytes."""
+"""The kernel in WebAssembly repeats every recorded call in Node.js with the same results and bytes."""
 
 import contextlib
 import os
@@ -44,7 +44,7 @@ pytestmark = [
 
 @contextlib.contextmanager
 def recorded(path: Path, kernel: Kernel | None = None) -> Iterator[Tape]:
-    """Has all compiled worlds that are made meanwhile record their calls (of `kernel`, if it is given)."""
+    """Makes all compiled worlds of the block record their calls, with `kernel` if it is given."""
     kernel = kernel or kernels.get(True)
     with path.open("wb", 1 << 20) as file, pytest.MonkeyPatch.context() as patch:
         tape = Tape(kernel, file)
@@ -53,7 +53,7 @@ def recorded(path: Path, kernel: Kernel | None = None) -> Iterator[Tape]:
 
 
 def replayed(path: Path) -> str:
-    """What the kernel in WebAssembly makes of a tape."""
+    """Returns the output of a tape's replay with the kernel in WebAssembly."""
     assert NODE is not None
     wasm = kernels.LIBRARIES / "kernel.wasm"
     signatures = (f"{name}:{kinds}" for name, kinds in exports.functions().items())

@@ -1,4 +1,4 @@
-"""The former name of `sovereign_netcode.playtest`: reports of faults from outside the project import it."""
+"""The former name of `sovereign_netcode.playtest`, kept for fault reports from outside the project."""
 
 from sovereign_netcode.playtest.match import Link as Path
 from sovereign_netcode.playtest.match import Match, Player, Policy, bot, wander

@@ -36,7 +36,7 @@ def environment(place: Path, wheel: Path, *packages: str) -> Path:
 
 
 def required(*packages: str) -> set[str]:
-    """Distributions and all that they require."""
+    """Returns distributions and all that they require."""
     found: set[str] = set()
     waiting = list(packages)
     while waiting:
@@ -52,7 +52,7 @@ def required(*packages: str) -> set[str]:
 
 
 def installed(package: str) -> bool:
-    """Whether a distribution is installed: one for another system or Python is not."""
+    """Returns whether a distribution is installed. One for another system or Python is not."""
     try:
         importlib.metadata.distribution(package)
     except importlib.metadata.PackageNotFoundError:
@@ -61,7 +61,7 @@ def installed(package: str) -> bool:
 
 
 def top_level(package: str) -> Iterator[Path]:
-    """The files and folders of a distribution in `site-packages`."""
+    """Returns the files and folders of a distribution in `site-packages`."""
     for path in importlib.metadata.files(package) or ():
         if path.parts[0] not in ("..", "__pycache__"):
             yield Path(str(path.locate())).parents[len(path.parts) - 1] / path.parts[0]

@@ -1,4 +1,4 @@
-"""The imports of the product's sources as the wheel has them (hatch_build.py)."""
+"""The imports of the product's sources in the wheel (hatch_build.py)."""
 
 import ast
 from pathlib import Path
@@ -92,7 +92,7 @@ def test_a_source_of_the_product_differs_in_names_only(file: Path) -> None:
 
 
 def imported(source: str) -> list[str]:
-    """The absolute names of all modules that a source imports."""
+    """Returns the absolute names of all modules that a source imports."""
     names = []
     for node in ast.walk(ast.parse(source)):
         if isinstance(node, ast.Import):

@@ -1,4 +1,4 @@
-"""No wheel is built with prebuilt kernels that are not those of its sources."""
+"""No wheel is built with prebuilt kernels of other sources."""
 
 import shutil
 from pathlib import Path

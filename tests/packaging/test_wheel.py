@@ -32,7 +32,7 @@ PACKAGES = (
     *("prometheus-client", "pyjwt", "structlog", "uvloop", "pettingzoo", "pygame-ce", "rich"),
     *("mypy", "pytest"),
 )
-"""What the package requires with all its extras but Numba, which is for other platforms; and tools of users."""
+"""Requirements of the package with all its extras, without Numba, which is for other platforms; and tools of users."""
 DIST_INFO = f"sovereign_netcode-{tomllib.loads((ROOT / 'pyproject.toml').read_text())['project']['version']}.dist-info"
 """Folder of the metadata in the wheel."""
 COMMANDS = ("loadtest", "new-game", "play", "replay", "server")
@@ -53,7 +53,7 @@ class Installed(NamedTuple):
         return run(self.folder, str(self.python.parent / name), *arguments)
 
     def served(self, *flags: str) -> AbstractContextManager[str]:
-        """The URL of an installed server in the user's folder."""
+        """Yields the URL of an installed server in the user's folder."""
         return real_server(*flags, program=(str(self.python.parent / "sovereign-server"),), folder=self.folder)
 
 
@@ -79,7 +79,7 @@ def installed(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Installe
     (folder / "server.py").write_text("NAME = 'my server'\n", "utf-8")
     (folder / "client_sdk.py").write_text("NAME = 'my client'\n", "utf-8")
     (folder / "shared" / "__init__.py").write_text("NAME = 'my shared'\n", "utf-8")
-    # The pages and what runs their programs, which is no part of the package.
+    # the pages, and the code that runs their programs, which is not part of the package
     shutil.copytree(ROOT / "tests" / "readme", folder / "tests" / "readme")
     shutil.copytree(ROOT / "docs", folder / "docs")
     shutil.copy(ROOT / "README.md", folder)
@@ -87,7 +87,7 @@ def installed(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Installe
 
 
 def names(wheel: Path) -> set[str]:
-    """All files of a wheel but its metadata, relative to the package."""
+    """Returns all files of a wheel except its metadata, relative to the package."""
     with zipfile.ZipFile(wheel) as archive:
         files = {Path(name) for name in archive.namelist()}
     assert {file.parts[0] for file in files} == {"sovereign_netcode", DIST_INFO}
@@ -95,7 +95,7 @@ def names(wheel: Path) -> set[str]:
 
 
 def known_to_git(*places: str) -> set[str]:
-    """All files that git has or would take."""
+    """Returns all files that git has or would take."""
     command = ("git", "ls-files", "-z", "--cached", "--others", "--exclude-standard", "--", *places)
     listed = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True).stdout
     return {name for name in listed.split("\0") if name and (ROOT / name).exists()}

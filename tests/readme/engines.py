@@ -1,4 +1,5 @@
-"""Engines without a window, and the least that stands in for those that are not installed; and what they show."""
+"""Engines without a window, minimal stand-ins for engines that are not installed, and a look at the figures they
+show."""
 
 import importlib
 import importlib.util
@@ -15,7 +16,7 @@ Point = tuple[float, float]
 Standing = tuple[Callable[[], list[Point]], Callable[[], object]]
 """Functions of a stand-in: one returns where figures are shown, one presses and releases the space bar at once."""
 FIGURE_PIXELS = 5
-"""A figure is at least so many pixels wide; the lines on the ground are narrower."""
+"""Least width of a figure in pixels; the lines on the ground are narrower."""
 
 
 def module(name: str, **names: Any) -> ModuleType:
@@ -30,13 +31,13 @@ def module(name: str, **names: Any) -> ModuleType:
 
 
 def ever(frame: Callable[[], object]) -> None:
-    """An engine's loop: whoever has had enough raises."""
+    """Runs an engine's loop. It ends by an exception."""
     while True:
         frame()
 
 
 class Thing:
-    """Takes every call and every attribute."""
+    """An object that accepts every call and every attribute."""
 
     def __init__(self, *args: Any, **more: Any) -> None:
         pass
@@ -48,7 +49,7 @@ class Thing:
 
 
 class Flat:
-    """The circles that a stand-in for an engine in two dimensions has drawn since it cleared its window."""
+    """Circles that a stand-in for a 2D engine has drawn since it cleared its window."""
 
     circles: ClassVar[list[Point]] = []
     size = (0, 0)
@@ -63,13 +64,13 @@ class Flat:
 
     @classmethod
     def lit(cls) -> list[Point]:
-        """The middles of circles, in heights of the window, from its middle."""
+        """Returns the centres of circles, in heights of the window, from its middle."""
         width, height = cls.size
         return [(x / height - width / height / 2, y / height - 0.5) for x, y in cls.circles]
 
 
 class Body(Thing):
-    """A body of a stand-in for an engine in three dimensions; x east, y north, z up."""
+    """A body of a stand-in for a 3D engine; x east, y north, z up."""
 
     bodies: ClassVar[list["Body"]] = []
     camera: "Body"
@@ -88,7 +89,7 @@ class Body(Thing):
     def lit(cls) -> list[Point]:
         """Returns where the camera, which looks straight down, sees the bodies."""
         (x, y, z), seen = cls.camera.at, [body.at for body in cls.bodies if body is not cls.camera]
-        assert all(z > above for _, _, above in seen), "the camera is above all"
+        assert all(z > above for _, _, above in seen), "the camera is above all bodies"
         return [((east - x) / (z - above), (north - y) / (z - above)) for east, north, above in seen]
 
 
@@ -226,7 +227,7 @@ def shown(engine: str) -> list[Point]:
     for axis in (0, 1):
         lit = np.logical_and.reduce([np.roll(lit, by, axis) for by in range(FIGURE_PIXELS)])
     height, width = lit.shape
-    back = (FIGURE_PIXELS - 1) / 2  # the mark of a figure's pixels is its last one
+    back = (FIGURE_PIXELS - 1) / 2  # a figure's pixels are marked at their last one
     return [
         ((x - back + 0.5 - width / 2) / height, 0.5 - (y - back + 0.5) / height) for y, x in np.argwhere(lit).tolist()
     ]

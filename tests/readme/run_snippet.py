@@ -1,9 +1,9 @@
 """Runs a program of the pages until its player has walked: `python -m tests.readme.run_snippet HEADING`.
 
-Loops, in an engine or bare, play in a game within this process, in the scene that a server plays by default, with
-company. They play at 30 frames per second by their own clock, however long a frame takes; the other programs play on
-the server whose address is the second argument. An engine's keys are held by nobody, so the wish is looked at and
-another one takes its place. What an engine shows in the end must be the figures that are there, and in their places.
+A program with a loop plays in a game within this process, in the default scene, with company. It plays at 30 frames per
+second of simulated time. The other programs play on the server whose address is the second argument. The keys of an
+engine are not pressed, so the program's input is checked and then replaced by another one. At the end the engine must
+show exactly the figures of the game, in their places.
 """
 
 import asyncio
@@ -23,22 +23,22 @@ from tests.readme import engines
 from tests.readme.pages import programs
 
 LOOPS = ("A client", "In your game's loop")
-"""The programs that are a bare loop and walk east. The others are run by an engine, whose keys are not pressed."""
+"""Programs that are a bare loop and walk east. The others are run by an engine, whose keys are not pressed."""
 URL = "ws://127.0.0.1:8765"
 FAR_BLOCKS = 3.0
 COMPANY = ((9, 0), (0, 6))
 NEAR = 0.07
-"""The own figure is shown at most this far from the middle, in heights of the window."""
+"""Maximum distance of the own figure from the middle, in heights of the window."""
 FRAMES_MAX = 3000
 TAP_FRAME = 10
 
 
 class EnoughError(Exception):
-    """The player has got somewhere."""
+    """Ends a program: its player has walked far enough."""
 
 
 class Company(Rules):
-    """Puts one who stands still to the east of each player, and one to the north."""
+    """Rules that put a standing entity to the east of each player, and one to the north."""
 
     def on_join(self, player: Player) -> None:
         x, y, z = self.game.position(player.entity)
@@ -49,12 +49,12 @@ class Company(Rules):
 def in_this_process(
     input_: tuple[float, float], done: Callable[[View], None], tap: Callable[[], object] | None = None
 ) -> None:
-    """Makes `Client` one of a game within this process.
+    """Makes `Client` connect to a game within this process.
 
     Args:
-        input_: the direction that the program is to set.
-        done: called once the player has walked, with what the program has drawn last.
-        tap: presses and releases the space bar between two frames; the program has to set a jump for it, once.
+        input_: the direction that the program must set.
+        done: called with the last view that the program has drawn, once the player has walked.
+        tap: presses and releases the space bar between two frames; the program must then set a jump once.
     """
     frames = itertools.count()
     now = [0.0]
@@ -99,7 +99,7 @@ def in_this_process(
 
 
 def compare(lit: list[engines.Point], view: View) -> None:
-    """Fails unless something is lit where each figure is, and nowhere else: the own one in the middle, north up."""
+    """Fails unless something is shown exactly where each figure is: the own one in the middle, north up."""
     assert view.me is not None
     x, y, _ = view.me.position
     ways = [math.atan2(other.position[1] - y, other.position[0] - x) for other in view.others]
@@ -116,7 +116,7 @@ def compare(lit: list[engines.Point], view: View) -> None:
 
 
 def on_a_server(url: str) -> None:
-    """Lets `AsyncClient` connect there, and leave once its player has walked."""
+    """Lets `AsyncClient` connect to a server, and leave once its player has walked."""
     connect = AsyncClient.connect
     tasks = []
 

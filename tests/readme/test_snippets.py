@@ -1,7 +1,7 @@
-"""The programs in the README and docs/, all run as they stand there.
+"""All programs in the README and docs/ run as they are printed.
 
-pygame-ce is installed for the tests and runs without a display. The other engines are used where they are installed
-(they are heavy: 12 to 200 MB); elsewhere the least that has the shape of their loop stands in for them.
+pygame-ce is installed for the tests and runs without a display. The other engines are heavy (12 to 200 MB) and are used
+where they are installed; elsewhere a stand-in with the same kind of loop takes their place.
 """
 
 import dataclasses
@@ -89,7 +89,7 @@ def test_agents() -> None:
 
 
 def test_the_smallest_game() -> None:
-    """Bots play it; two that touch get a point each."""
+    """Bots play it. Two players that touch each other get a point each."""
     rules = alone("A game")["Bounce"]()
     match = Match(load_scene(rules.scene), seed=1, rules=rules)
     match.join(bot(Follow(Random(1))))

@@ -1,4 +1,4 @@
-"""Tables in the pages have a row for each thing that the code has, and for nothing else."""
+"""Tables in the pages have a row for each thing in the code, and no other rows."""
 
 import inspect
 import re

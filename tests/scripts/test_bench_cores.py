@@ -1,4 +1,4 @@
-"""The benchmarks of bytes and of memory, in short, and what they promise."""
+"""Short runs of the benchmarks of bytes and of memory, and their promises."""
 
 import itertools
 import tracemalloc
@@ -24,7 +24,7 @@ def test_nothing_stays_of_clients_entities_and_segments_that_are_gone(rounds: in
         after = memory.churn(rounds)
     finally:
         tracemalloc.stop()
-    # 20 clients, 100 entities and a segment take 300,000 bytes; what still grows at first are tables.
+    # 20 clients, 100 entities and a segment take 300,000 bytes. At first, tables still grow.
     assert all(b - a < 20_000 for a, b in itertools.pairwise(after[1:])), after
 
 

@@ -1,4 +1,5 @@
-"""The benchmark of the server: the search, on servers of known size, and each kind of server once, with few players."""
+"""The benchmark of the server: its search with stand-ins of known capacity, and each kind of server once with few
+players."""
 
 import sys
 import tomllib
@@ -14,7 +15,7 @@ needs_linux = pytest.mark.skipif(sys.platform != "linux", reason="the generator 
 
 
 class Holds:
-    """Stands for a rig: a server that holds so many clients, and works in proportion to how many there are."""
+    """A stand-in for a rig: a server that holds `most` clients and works in proportion to their number."""
 
     def __init__(self, most: int) -> None:
         self.most = most
@@ -109,7 +110,7 @@ def test_a_variants_quantiles_are_of_all_its_rounds_together() -> None:
 @pytest.mark.e2e
 @pytest.mark.alone
 def test_churn_over_sockets_leaves_nothing_behind(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(rss, "SETTLE_S", 18.0)  # who says no goodbye is kept for 15 s
+    monkeypatch.setattr(rss, "SETTLE_S", 18.0)  # a client without a goodbye is kept for 15 s
     told: list[bench.Figures] = []
     found = rss.churn(1 / 3, told.append)
     first, last = found["minutes"]
@@ -120,7 +121,7 @@ def test_churn_over_sockets_leaves_nothing_behind(monkeypatch: pytest.MonkeyPatc
     assert last["segments_loaded"] > 10
     for level, slack in (("clients", 5), ("players", 10), ("entities", 12), ("segments", 1)):
         assert abs(last[level] - first[level]) <= slack, (level, first, last)
-    # A connection takes 15 KB; where the server kept hold of those that are lost, it grew by 10 KB for each that came.
+    # A connection takes 15 KB. If the server kept lost connections, it would grow by 10 KB for each.
     assert (last["rss_mb"] - first["rss_mb"]) * 1e6 < 5_000 * last["joined"], (first, last)
 
 

@@ -1,4 +1,4 @@
-"""The benchmark of saved worlds, run as people run it: its shape, and no figure of time is judged."""
+"""The benchmark of saved worlds as a command: the form of its output; no time is judged."""
 
 import json
 import subprocess

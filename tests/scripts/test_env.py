@@ -1,4 +1,4 @@
-"""Tests of the environment's set-up, and of how commands start; nothing is installed here."""
+"""The set-up of the environment, and how commands start. Nothing is installed here."""
 
 import os
 import shutil
@@ -30,11 +30,11 @@ def test_a_set_up_says_where_with_what_and_how_long(env: ModuleType, capsys: pyt
         f"setting up {env.VENV} with the pins of requirements.txt, once: up to a minute ... done in "
     )
     assert env.ensure(env.RUNTIME) == env.PYTHON
-    assert capsys.readouterr().out == "", "it is there"
+    assert capsys.readouterr().out == "", "the environment is there already"
     env.ensure(env.DEV)
     assert "with the pins of requirements-dev.txt" in capsys.readouterr().out
     env.ensure(env.RUNTIME)
-    assert capsys.readouterr().out == "", "more than that is there"
+    assert capsys.readouterr().out == "", "only a part of the environment is there"
 
 
 def test_an_interrupted_set_up_is_begun_anew(

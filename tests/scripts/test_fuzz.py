@@ -1,4 +1,4 @@
-"""The fuzzer: a short run of it, that it is the same again from the same seed, and that it finds what there is."""
+"""The fuzzer: a short run, the same run again from its seed, and a fault that it finds."""
 
 from pathlib import Path
 

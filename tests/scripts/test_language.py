@@ -1,5 +1,6 @@
-"""The language check: a text that breaks a rule is found at its line, and a plain text is not."""
+"""The language check finds a text that breaks a rule at its line, and accepts plain texts."""
 
+import subprocess
 from pathlib import Path
 
 import pytest
@@ -98,9 +99,15 @@ def test_a_finding_names_place_rule_and_text() -> None:
     assert str(finding).endswith(": Those of the " + "x" * 87 + "...")
 
 
-def test_all_listed_places_comply(capsys: pytest.CaptureFixture[str]) -> None:
-    assert all((language.ROOT / name).exists() for name in language.COMPLIANT)
+def test_the_repository_complies(capsys: pytest.CaptureFixture[str]) -> None:
+    assert all((language.ROOT / name).exists() for name in language.CHECKED)
     assert language.main([]) == 0, capsys.readouterr().out
+
+
+def test_every_folder_and_page_is_checked() -> None:
+    listed = subprocess.run(("git", "ls-files"), cwd=language.ROOT, capture_output=True, text=True, check=False).stdout
+    places = {Path(path).parts[0] for path in listed.splitlines() if Path(path).suffix in (".md", ".py")}
+    assert {place for place in places if place[0] != "."} <= set(language.CHECKED)
 
 
 def test_files_are_found_by_suffix_or_first_line(

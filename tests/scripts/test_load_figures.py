@@ -1,4 +1,4 @@
-"""The figures of a load test: several processes put together, what is shown meanwhile, and who was too slow."""
+"""The figures of a load test: several processes put together, the live display, and the reason for a bottleneck."""
 
 import io
 import random
@@ -51,7 +51,7 @@ def result(clients: list[Figures], values_s: list[float], cpu_s: float) -> Figur
 def test_three_processes_have_the_figures_of_one_with_all_their_bots() -> None:
     clients, rng = [client(number) for number in range(12)], random.Random(1)
     parts = [[rng.expovariate(1000) for _ in range(n)] for n in (50, 400, 30)]
-    parts[2] = [0.2 + value for value in parts[2]]  # all that is late is in one of them
+    parts[2] = [0.2 + value for value in parts[2]]  # all late values are in one of them
     whole = figures.figures([result(clients, [*chain(*parts)], 6.0)], 10.0, {}, {}, [])
     several = figures.figures(
         [result(clients[4 * i : 4 * i + 4], part, 2.0) for i, part in enumerate(parts)], 10.0, {}, {}, []
@@ -59,7 +59,7 @@ def test_three_processes_have_the_figures_of_one_with_all_their_bots() -> None:
     assert several | {"bots": None} == whole | {"bots": None}
     quantiles = [between([], lags(part))["p99"] for part in parts]
     assert [each["lag_ms"]["p99"] for each in several["bots"]] == quantiles
-    assert several["bots_lag_ms"]["p99"] > 200 > sum(quantiles) / len(parts)  # no average of quantiles
+    assert several["bots_lag_ms"]["p99"] > 200 > sum(quantiles) / len(parts)  # not an average of quantiles
     assert [(each["clients"], each["cpu_share"]) for each in several["bots"]] == [(4, 0.2)] * 3
 
 
@@ -69,7 +69,7 @@ def test_three_processes_have_the_figures_of_one_with_all_their_bots() -> None:
         ([0.001] * 100, 2.0, ""),
         ([0.029] * 100, 8.9, ""),
         ([0.001] * 60 + [0.05] * 40, 2.0, "other work keeps this machine busy"),
-        ([0.05] * 100, 6.0, "more --processes"),  # never up to date: others leave it no more than that
+        ([0.05] * 100, 6.0, "more --processes"),  # always late, although other work leaves it no more CPU time
         ([0.001] * 100, 9.5, "more --processes"),
     ],
 )
@@ -90,7 +90,7 @@ def bots(at: float, **more: Any) -> Figures:
 def test_a_glance_is_of_what_happened_since_the_last_one() -> None:
     server = {"ticks": 100, "uptime_s": 50.0, "cpu_s": 4.0, "tick_lateness_counts": [[100, 90], [9000, 10]]}
     later = {"ticks": 164, "uptime_s": 52.0, "cpu_s": 4.5, "tick_lateness_counts": [[100, 153], [9000, 11]]}
-    # Each process has spoken at a moment of its own, and they are of different age.
+    # Each process reports at its own times, and the processes started at different times.
     before = glance.Look(server, [bots(7.0, bytes_down=10_000), bots(900.0, inputs_late=3)])
     now = glance.Look(
         later,
@@ -130,6 +130,6 @@ def test_figures_are_lines_of_their_own_but_on_a_terminal(terminal: bool) -> Non
         stage.at(3.0)
         stage.show(3.0, [("clients", "5"), ("ticks", "32.0 /s")])
     said = out.getvalue()
-    assert ("\x1b[" in said) == terminal  # there it is a picture that is drawn anew
+    assert ("\x1b[" in said) == terminal  # on a terminal the picture is drawn anew
     assert ("     3 s  clients 5, ticks 32.0 /s\n" in said) != terminal
     assert "32.0 /s" in said

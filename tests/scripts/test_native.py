@@ -1,4 +1,4 @@
-"""The sources compiled by mypyc play as they do as they are."""
+"""The sources compiled by mypyc behave like the sources themselves."""
 
 import json
 import os

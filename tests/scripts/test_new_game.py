@@ -1,4 +1,4 @@
-"""The skeleton of a game: it works as it is written, and nothing of anybody's is overwritten."""
+"""The skeleton of a game works as it is written, and overwrites no file."""
 
 import subprocess
 import sys

@@ -1,4 +1,4 @@
-"""The window of the game: what is seen where, what keys and mouse do, and a whole session without a display."""
+"""The window of the game: what it draws where, keys and mouse, and a whole session without a display."""
 
 import itertools
 import os
@@ -47,7 +47,7 @@ def _display() -> Iterator[None]:
 
 
 def blocks(*kinds: tuple[int, int, int, int]) -> Blocks:
-    """An empty segment with some blocks."""
+    """Returns the blocks of an otherwise empty segment."""
     world = World(load_scene("flat"))
     world.load_segment((0, 0, 0), np.zeros(32768, np.uint8))
     for x, y, z, kind in kinds:
@@ -79,9 +79,9 @@ def test_only_what_has_changed_is_drawn_anew() -> None:
     assert len(before) == 4
     ground.refresh(world.blocks, 99)
     assert ground.pictures == before
-    world.set_block(40, 10, 30, 4)  # far from the rim: nobody else's shadow
+    world.set_block(40, 10, 30, 4)  # far from the rim, so without the shadow of other blocks
     ground.refresh(world.blocks, 0)
-    assert ground.pictures == before, "not more than was asked for"
+    assert ground.pictures == before, "no more than was asked for"
     ground.refresh(world.blocks, 1)
     assert [segment for segment in before if ground.pictures[segment] is not before[segment]] == [(1, 0, 0)]
     world.unload_segment((1, 1, 0))
@@ -106,7 +106,7 @@ def test_what_stands_before_something_covers_it() -> None:
 
 
 class Idle:
-    """The match carries the messages."""
+    """A transport that does nothing, because the match carries the messages."""
 
     def poll(self, now: float) -> None:
         pass
@@ -118,7 +118,7 @@ class Idle:
 
 
 class Session:
-    """A window on a player of a match, by default of tag."""
+    """A window with a player of a match, by default of tag."""
 
     def __init__(self, latency_s: float = 0.01, scene: str = "meadow", rules: Rules | None = None) -> None:
         self.match = Match(load_scene(scene), 5, rules=rules or Tag())
@@ -131,7 +131,7 @@ class Session:
         return self.core.input if self.core.state == "playing" else NEUTRAL
 
     def run(self, seconds: float) -> None:
-        """So long, at 20 frames a second."""
+        """Runs for `seconds` at 20 frames a second."""
         for _ in range(round(20 * seconds)):
             self.match.run(0.05)
             self.window.frame(self.player.local)
@@ -141,7 +141,7 @@ class Session:
         self.run(0.05)
 
     def colours(self) -> int:
-        """How many different ones are in the window."""
+        """Returns the number of different colours in the window."""
         surface = pygame.display.get_surface()
         assert surface is not None
         pixels = pygame.surfarray.array3d(surface).reshape(-1, 3)
@@ -203,7 +203,7 @@ def test_a_slider_sets_the_latency(monkeypatch: pytest.MonkeyPatch) -> None:
         session.run(0.1)
         assert session.window.lag_s == pytest.approx(lag_s, abs=0.01)
         kind = pygame.MOUSEMOTION
-    for each in (pygame.MOUSEBUTTONUP, pygame.MOUSEMOTION):  # let go: the mouse is free again
+    for each in (pygame.MOUSEBUTTONUP, pygame.MOUSEMOTION):  # the button is released: the mouse is free again
         monkeypatch.setattr(pygame.mouse, "get_pos", lambda: track.center)
         pygame.event.post(pygame.event.Event(each, button=1))
     session.run(0.1)

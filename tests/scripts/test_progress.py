@@ -1,4 +1,4 @@
-"""Tests that the soak sees players who get nowhere although snapshots come."""
+"""The soak test detects players who are stuck although snapshots arrive."""
 
 from collections.abc import Callable
 from random import Random
@@ -18,7 +18,8 @@ HZ = 32
 
 
 def stuck(seconds: float, state: Callable[[float], tuple[int, float] | None], *, walks: bool = True) -> float:
-    """The stuck time of a player whose inputs used and blocks walked are told by time; None: there is no snapshot."""
+    """Returns the stuck time of a player. `state` gives inputs used and blocks walked by time; None: there is no
+    snapshot."""
     progress = Progress(walks=walks)
     for tick in range(round(seconds * HZ)):
         if (told := state(tick / HZ)) is not None:
@@ -41,7 +42,7 @@ def test_after_a_stall_there_are_two_seconds_to_move_again(again_s: float, expec
         done = min(now, stall) + max(now - stall - stalled_s - again_s, 0.0)
         return int(done * HZ), 3 * done
 
-    assert stuck(40, state) == pytest.approx(expected, abs=0.25)  # a quarter: what it takes to have gone half a block
+    assert stuck(40, state) == pytest.approx(expected, abs=0.25)  # a quarter of a second is the time for half a block
 
 
 def test_one_whose_inputs_are_used_but_who_does_not_move_is_stuck_if_it_is_to_walk() -> None:
@@ -73,7 +74,7 @@ def watched(match: Match, core: Core, seconds: float) -> Walker:
 
 
 class Deaf(Core):
-    """A client whose inputs get lost from a time on."""
+    """A client whose inputs are lost while `sends` is False."""
 
     sends = True
 
@@ -83,7 +84,7 @@ class Deaf(Core):
 
 
 def joined() -> tuple[Match, Deaf]:
-    """A match with one walker who has played for 5 s."""
+    """Returns a match with one walker who has played for 5 s."""
     match, core = Match(load_scene("flat"), 1), Deaf()
 
     def policy(core: Core, rng: Random) -> Input:
@@ -106,7 +107,7 @@ def test_a_walker_walks_and_its_inputs_count() -> None:
 @pytest.mark.parametrize("stall_s", [1.0, 3.5, 8.0])
 def test_a_walker_is_not_stuck_after_its_server_stood_still(stall_s: float) -> None:
     match, core = joined()
-    match._started += round(stall_s * HZ)  # no tick for so long
+    match._started += round(stall_s * HZ)  # no tick for `seconds`
     assert watched(match, core, stall_s + 20).progress.stuck_s == 0
 
 

@@ -1,4 +1,4 @@
-"""The two reports, run as people run them: their shape, and what is exact in them. No figure of time is judged."""
+"""The two reports as commands: their form, and the exact figures in them. No time is judged."""
 
 import json
 import subprocess

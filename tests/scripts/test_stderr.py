@@ -1,4 +1,4 @@
-"""A child that fails is named with its cause, by everybody who starts children."""
+"""The cause of a child process that fails is reported by every command that starts one."""
 
 import argparse
 import contextlib
