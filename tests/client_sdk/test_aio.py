@@ -160,7 +160,7 @@ def test_a_server_that_stops_reading_is_left(run: Run) -> None:
         run(scene())
 
 
-def test_nobody_there_reads_like_advice(run: Run) -> None:
+def test_a_refused_connection_reads_like_advice(run: Run) -> None:
     async def scene() -> None:
         with pytest.raises(ConnectError, match="start one with: sovereign-server"):
             await AsyncClient.connect(address)
@@ -195,7 +195,7 @@ def test_silence_ends_in_time(run: Run) -> None:
         run(scene())
 
 
-def test_whoever_stops_waiting_may_ask_again(url: str, run: Run) -> None:
+def test_a_task_that_stopped_waiting_can_wait_again(url: str, run: Run) -> None:
     async def scene() -> None:
         async with await AsyncClient.connect(url) as client:
             await first(client, Joined)
@@ -207,7 +207,7 @@ def test_whoever_stops_waiting_may_ask_again(url: str, run: Run) -> None:
     run(scene())
 
 
-def test_an_error_in_before_update_is_told_and_the_player_goes_on(url: str, run: Run) -> None:
+def test_an_error_in_before_update_is_reported_and_the_player_goes_on(url: str, run: Run) -> None:
     calls = 0
 
     def wrong(core: Core) -> None:
@@ -226,7 +226,7 @@ def test_an_error_in_before_update_is_told_and_the_player_goes_on(url: str, run:
     run(scene())
 
 
-def test_two_who_wait_both_hear_of_the_end(url: str, run: Run) -> None:
+def test_two_waiting_tasks_both_get_the_end(url: str, run: Run) -> None:
     async def scene() -> None:
         async def all_of(client: AsyncClient) -> int:
             return len([event async for event in client])

@@ -79,7 +79,7 @@ def test_follow_alone_stands() -> None:
     assert set(wishes("follow", 1)) == {NEUTRAL}
 
 
-def test_a_bot_that_is_not_in_a_world_yet_wishes_nothing() -> None:
+def test_a_bot_that_is_not_in_a_world_yet_sets_no_input() -> None:
     core = Core()
     Bot(Wander(random.Random(1)))(core)
     assert core.state == "joining"
@@ -94,7 +94,7 @@ class Attentive(Wander):
         self.heard = attributes
 
 
-def test_a_policy_that_wants_to_learns_what_the_rules_say() -> None:
+def test_a_policy_with_learn_gets_the_attributes_of_entities() -> None:
     match = Match(FLAT, 1)
     policy = Attentive(random.Random(1))
     player = match.join(bot(policy))

@@ -133,7 +133,7 @@ def test_a_timeline_is_a_phase() -> None:
     assert timeline.when(69.5) == 2.0
 
 
-def test_a_timeline_tells_of_jumps_only() -> None:
+def test_a_timeline_reports_jumps_only() -> None:
     class To:
         phase = 0.0
 
@@ -179,7 +179,7 @@ def test_it_holds_still_until_it_has_seen_enough() -> None:
     assert set(loop.phases) == {102.0}
 
 
-def test_its_own_corrections_cancel_however_late_it_hears_of_them() -> None:
+def test_the_lead_allows_for_its_own_steering_with_any_delay() -> None:
     """The distance is covered once, at full speed: no overshoot and no ringing with a round trip of two seconds."""
     for delay in (0, 8, 64):
         loop = Loop(lambda i: 101.0 if i < 1000 else 105.0, delay=delay).run(2000)
@@ -240,7 +240,7 @@ def test_it_rises_at_once_and_falls_slowly() -> None:
     assert min(rough.speeds()) > -0.04
 
 
-def test_what_is_learnt_while_nothing_was_steered_is_covered_and_no_more() -> None:
+def test_stalls_within_a_long_frame_are_covered_and_no_more() -> None:
     """A frame took ten seconds, and every eighth input in it was stalled."""
     loop = Loop(lambda i: 101.0).run(1000)
     phase = loop.timeline.phase

@@ -66,7 +66,7 @@ def test_a_client_joins_and_plays_uncompiled_and_then_goes_on_compiled(slow: Slo
     assert core.stats.snapshots > 200
 
 
-def test_a_client_that_is_told_which_kernel_has_it_at_once(slow: Slow) -> None:
+def test_a_client_with_a_given_kernel_has_it_at_once(slow: Slow) -> None:
     match = Match(load_scene("flat"), seed=3)
     for compiled in (True, False):
         core = Core(compiled=compiled)

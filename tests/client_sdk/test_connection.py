@@ -135,7 +135,7 @@ def test_a_stream_that_breaks_off_is_a_loss() -> None:
     assert pair.connection.data_to_send(NOW) == b""
 
 
-def test_goodbye_is_said_and_then_the_connection_closes() -> None:
+def test_a_bye_is_sent_and_then_the_connection_closes() -> None:
     pair = Pair().open()
     pair.core.close()
     pair.to_peer()
@@ -180,7 +180,7 @@ def test_a_goodbye_without_an_end_is_not_waited_for() -> None:
     assert pair.connection.done(NOW + 12)
 
 
-def test_a_program_that_slept_has_heard_nothing_and_that_is_no_sign() -> None:
+def test_silence_while_the_program_slept_does_not_count() -> None:
     pair = Pair().open()
     for k in range(8):
         pair.connection.look(NOW + 60 * k)

@@ -69,7 +69,7 @@ class Served:
 
 
 @pytest.mark.parametrize("off", [1e6, 1e15, 1e300, -1e300])
-def test_whatever_a_server_says_of_its_time_little_is_replayed(off: float) -> None:
+def test_with_any_server_time_few_ticks_are_replayed(off: float) -> None:
     served = Served(off)
     served.live(0.25)
     assert Joined in [type(event) for event in served.core.events()]
@@ -140,7 +140,7 @@ def test_what_cannot_be_sent_is_not_predicted() -> None:
     assert core.prediction.predicted.blocks.get(17, 18, 1) == 1
 
 
-def test_edits_while_a_segment_is_on_its_way_are_in_it() -> None:
+def test_edits_that_arrive_between_pieces_of_a_segment_are_in_it() -> None:
     served = Served()
     packed = pack(WORLD.blocks.segment(HERE).reshape(-1))
     served.core.receive(terrain(chunk=packed[:10]), served.now)

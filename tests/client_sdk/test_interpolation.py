@@ -137,7 +137,7 @@ def test_an_entity_that_was_placed_in_tick_after_tick_is_nowhere_between() -> No
     assert [shown(interpolation, tick / 4)["a"] for tick in range(40, 77)] == [tick // 4 % 3 for tick in range(40, 77)]
 
 
-def test_an_entity_that_was_placed_while_snapshots_were_skipped_is_drawn_where_it_was_until_that_is_told() -> None:
+def test_an_entity_that_was_placed_while_snapshots_were_skipped_is_drawn_where_it_was_until_the_next_snapshot() -> None:
     interpolation = acts((10, states(a=0), ""), (18, states(a=4), "a"), (19, states(a=5), ""))
     assert [shown(interpolation, tick)["a"] for tick in (10.0, 14.0, 17.75, 18.0, 18.5)] == [0, 0, 0, 4, 4.5]
 
@@ -158,7 +158,7 @@ def test_a_placed_entity_that_was_not_there_before_and_one_that_is_gone_are_no_t
     assert [shown(interpolation, tick) for tick in (10.5, 11.5, 12.5)] == [{"a": 0}, {"b": 1}, {}]
 
 
-def test_what_is_kept_is_bounded() -> None:
+def test_the_history_is_bounded() -> None:
     interpolation = fed(*[(tick, states(a=tick)) for tick in range(1000)])
     assert shown(interpolation, 0.0) == {"a": 1000 - KEPT_S * RATE}
 
@@ -204,7 +204,7 @@ def test_a_step_of_the_servers_time_does_not_show_the_past_again() -> None:
     assert interpolation.delay_ticks == delay_ticks
 
 
-def test_the_delay_falls_no_lower_than_one_tick_nor_than_what_there_is_to_show() -> None:
+def test_the_delay_falls_no_lower_than_one_tick_and_the_history() -> None:
     interpolation = fed((10, states(a=0)))
     for second in range(4, 900):
         interpolation.advance(11.5, float(second))

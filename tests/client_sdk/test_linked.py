@@ -75,7 +75,7 @@ def test_a_message_takes_its_time_from_when_it_comes() -> None:
     assert heard(port) == [1]
 
 
-def test_what_is_under_way_stays_in_front_when_the_link_changes() -> None:
+def test_messages_on_the_way_stay_in_front_when_the_link_changes() -> None:
     port = linked(FAR)
     port.receive(told(1), 16.0)
     port.link = Link(0.0625)
@@ -98,7 +98,7 @@ def test_what_is_under_way_stays_in_front_when_the_link_changes() -> None:
     assert heard(port) == [5]
 
 
-def test_the_end_is_heard_behind_what_came_before_it() -> None:
+def test_the_end_is_reported_after_the_messages_before_it() -> None:
     port = linked(FAR)
     port.receive(encode(Bye(messages.FULL, "the server is full", -1.0)), 16.0)
     port.lost(1006, "gone", 16.0)
@@ -108,7 +108,7 @@ def test_the_end_is_heard_behind_what_came_before_it() -> None:
     assert port.core.events() == [Left(messages.FULL, "the server is full")]
 
 
-def test_what_was_on_a_lost_line_is_gone() -> None:
+def test_messages_on_a_lost_line_are_gone() -> None:
     match = Match(load_scene("flat"), 1)
     core = Core(patience_s=10)
     player = match.join(wander, Link(), core)
@@ -155,7 +155,7 @@ def test_chance_is_the_same_again() -> None:
     assert max(arrivals("far")) > 0.25, "lost packets are sent again"
 
 
-def test_no_such_link_is_told_with_those_that_there_are() -> None:
+def test_an_unknown_link_is_refused_with_a_list_of_the_known_ones() -> None:
     with pytest.raises(ValueError, match="link = 'wlan': must be one of lan, regional, typical, far, wifi"):
         Client.connect("ws://127.0.0.1:1", link="wlan")
 

@@ -83,7 +83,7 @@ def test_one_seed_is_one_story() -> None:
 
 
 @pytest.mark.parametrize("link", ["thin", *long("far")])
-def test_a_link_is_felt_and_the_game_sees_it(link: str) -> None:
+def test_a_simulated_link_shows_in_the_clients_figures(link: str) -> None:
     program = Program(tag())
     client = program.join("Ann", link=link)
     client.set_input(1, 0)
@@ -122,7 +122,7 @@ def test_figures_name_their_templates() -> None:
         assert found == {ann.entity: "freezer", bob.entity: "player"}
 
 
-def test_who_stood_still_comes_back_to_the_same_world() -> None:
+def test_a_suspended_client_reconnects_to_the_same_world() -> None:
     program = Program(tag())
     client = program.join("Ann")
     program.run(2)
@@ -140,7 +140,7 @@ def test_who_stood_still_comes_back_to_the_same_world() -> None:
     assert client.stats.divergences == 0
 
 
-def test_goodbye_is_heard() -> None:
+def test_a_bye_reaches_the_game() -> None:
     program = Program(Game(load_scene("flat")))
     with program.join("Ann") as client:
         program.run(1)
@@ -158,7 +158,7 @@ def test_goodbye_is_heard() -> None:
         (Game(load_scene("flat"), authenticate=lambda token: _nobody()), "nobody comes in"),
     ],
 )
-def test_who_is_refused_reads_why(game: Game, says: str) -> None:
+def test_a_refused_client_gets_the_reason(game: Game, says: str) -> None:
     program = Program(game)
     client = program.join("Ann")
     program.run(1)
@@ -186,7 +186,7 @@ def test_a_game_that_begins_anew_is_waited_for() -> None:
     assert isinstance(back, Resumed)
 
 
-def test_who_is_refused_hears_of_it_over_a_link_too() -> None:
+def test_a_refused_client_gets_the_reason_over_a_link_too() -> None:
     game = Game(load_scene("flat"), limits=Limits(clients_max=1))
     program = Program(game)
     program.join("Ann")

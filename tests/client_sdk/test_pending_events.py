@@ -67,7 +67,7 @@ def test_events_of_the_game_push_none_of_the_sdk_out_and_the_other_way_round() -
     assert events == [EventsDropped(2), *game(3), EventsDropped(6), *loaded[-3:]]
 
 
-def test_what_began_and_ended_is_never_dropped() -> None:
+def test_events_of_a_beginning_or_an_end_are_never_dropped() -> None:
     back: list[Event] = [Disconnected("gone", 1.0), Resumed(5, 2.0)]
     lasting: list[Event] = [Joined(1, FLAT, 0), *back * 20, Left(1000, "over")]
     queue = PendingEvents()

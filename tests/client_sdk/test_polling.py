@@ -172,7 +172,7 @@ def test_a_server_that_vanishes_is_an_event() -> None:
     assert "broke off" in left.reason
 
 
-def test_a_shutdown_says_when_to_come_back() -> None:
+def test_a_shutdown_says_when_to_reconnect() -> None:
     def script(sock: socket.socket) -> None:
         peer = accept(sock)
         peer.protocol.send_binary(encode(Bye(messages.GOING_AWAY, "the server is going down", 2.0)))
@@ -185,7 +185,7 @@ def test_a_shutdown_says_when_to_come_back() -> None:
     assert events == [Left(messages.GOING_AWAY, "the server is going down", 2.0)]
 
 
-def test_nobody_there_reads_like_advice() -> None:
+def test_a_refused_connection_reads_like_advice() -> None:
     with socket.create_server(("127.0.0.1", 0)) as listener:
         port = listener.getsockname()[1]
     with pytest.raises(ConnectError, match=f"no server there .* start one with: sovereign-server --port {port}"):
@@ -214,7 +214,7 @@ def test_silence_ends_in_time() -> None:
         over.set()
 
 
-def test_close_waits_no_longer_than_told() -> None:
+def test_close_waits_no_longer_than_its_timeout() -> None:
     with silent_server() as url:
         client = Client.connect(url)
         begun = time.monotonic()

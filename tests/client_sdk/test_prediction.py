@@ -116,7 +116,7 @@ def test_before_it_has_begun_and_behind_the_server_nothing_is_compared() -> None
     assert (done.correction, done.replayed) == (None, 0)
 
 
-def test_a_rehearsal_changes_nothing() -> None:
+def test_a_sync_test_changes_nothing() -> None:
     pair = Pair((17, 16, 1))
     pair.ahead(*[EAST] * 9)
     before = pair.client.predicted.state_hash()
@@ -162,7 +162,7 @@ def test_after_a_correction_the_replay_is_what_the_server_will_compute() -> None
     assert pair.client.predicted.state_hash() == pair.server.state_hash()
 
 
-def test_another_ones_new_input_is_predicted_anew_and_no_correction() -> None:
+def test_a_new_input_of_another_entity_is_a_reprediction_and_no_correction() -> None:
     pair = Pair((20, 20, 1))
     pair.ahead(EAST, EAST, EAST)
     pair.act(EAST, others=NORTH)
@@ -173,7 +173,7 @@ def test_another_ones_new_input_is_predicted_anew_and_no_correction() -> None:
     assert pair.client.predicted.state_hash() == pair.server.state_hash()
 
 
-def test_a_correction_by_another_one_says_so() -> None:
+def test_a_correction_by_another_entity_has_that_cause() -> None:
     pair = Pair((16.75, 16, 1))  # an eighth of a block away
     pair.ahead(*[EAST] * 8)
     pair.act(*[EAST] * 8, others=EAST)
@@ -189,7 +189,7 @@ def test_a_correction_that_nothing_explains_is_an_alarm() -> None:
     assert pair.reconcile().correction.cause == NONDETERMINISM
 
 
-def test_what_the_rules_did_is_named_and_the_picture_may_jump() -> None:
+def test_an_act_of_the_rules_is_named_as_the_cause() -> None:
     pair = Pair()
     pair.ahead(EAST, EAST)
     pair.server.place(ME, (5, 5, 1))
@@ -218,7 +218,7 @@ def test_when_the_own_entity_is_not_there_others_go_on() -> None:
 # -- interest ------------------------------------------------------------------------------------------------
 
 
-def test_a_keyframe_removes_whom_it_does_not_mention_but_only_there() -> None:
+def test_a_keyframe_removes_the_other_entities_of_its_segment_only() -> None:
     pair = Pair((20, 20, 1), (40, 20, 1), (41, 22, 1))
     for entity in (2, 3):
         pair.server.remove(entity)
@@ -229,7 +229,7 @@ def test_a_keyframe_removes_whom_it_does_not_mention_but_only_there() -> None:
     pair.assert_agreed()
 
 
-def test_who_left_for_a_segment_that_is_not_seen_is_gone_and_one_that_came_is_not() -> None:
+def test_an_entity_that_left_for_an_unseen_segment_is_gone_and_one_that_came_stays() -> None:
     pair = Pair((20, 20, 1), (22, 22, 1))
     pair.server.place(2, (40, 20, 1))
     pair.act(NEUTRAL)
@@ -249,7 +249,7 @@ def test_a_dropped_segment_is_forgotten_with_all_that_is_in_it() -> None:
     assert not pair.known.grounded()
 
 
-def test_who_walks_out_of_a_dropped_segment_into_a_seen_one_stays() -> None:
+def test_an_entity_that_walks_out_of_a_dropped_segment_into_a_seen_one_stays() -> None:
     pair = Pair((40, 20, 1))
     pair.server.place(OTHER, (20, 20, 1))
     pair.act(NEUTRAL)

@@ -27,7 +27,7 @@ def test_rates_are_those_of_the_last_second() -> None:
     assert stats.bytes_down_per_s == 400, "the second is not over"
 
 
-def test_corrections_are_told_by_their_causes() -> None:
+def test_corrections_are_counted_by_cause() -> None:
     stats = Stats()
     for cause in ("late input", "other entity", "late input"):
         stats.corrected(Corrected(1, ("x",), 0.25, 3, cause))
@@ -57,7 +57,7 @@ def test_late_inputs_are_shown_of_the_last_seconds_and_counted_since_the_start()
     assert stats.late_share == 32 / (30 * 32)
 
 
-def test_inputs_whose_fate_is_told_later_are_no_more_than_all() -> None:
+def test_late_reports_make_no_share_above_one() -> None:
     stats = Stats(inputs_sent=1000)
     for second in range(10):
         stats.measure(float(second))
@@ -112,7 +112,7 @@ def test_the_round_trip_is_that_of_the_last_seconds(before_s: float, after_s: fl
     assert dict(core.stats.figures())["round trip"] == f"{core.stats.rtt_s * 1000:.0f} ms"
 
 
-def test_what_a_player_sees_of_a_bad_moment_is_over_soon_after_it() -> None:
+def test_the_shown_share_of_late_inputs_recovers_soon() -> None:
     match = Match(load_scene("flat"), 1)
     core = Core()
     match.join(wander, Link(0.02), core)

@@ -122,7 +122,7 @@ def test_a_wrong_argument_of_connect_is_named(given: dict[str, Any], said: str) 
 
 
 @pytest.mark.parametrize("url", [None, 5, b"ws://127.0.0.1:1", "ws://\ud800", "ws://127.0.0.1:1/\ud800", ""])
-def test_what_is_no_address_is_named(url: Any) -> None:
+def test_an_invalid_address_is_named(url: Any) -> None:
     for connect in (lambda: Client.connect(url), lambda: asyncio.run(AsyncClient.connect(url))):
         with pytest.raises(ConnectError):
             connect()

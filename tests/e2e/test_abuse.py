@@ -161,7 +161,7 @@ async def storm(address: tuple[str, int], all_of: list[Abuse]) -> tuple[int, int
         return prediction.confirmed.tick - tick, honest.stats.snapshots - snapshots
 
 
-def test_each_is_told_why_and_nobody_else_notices() -> None:
+def test_each_peer_gets_the_reason_and_other_clients_notice_nothing() -> None:
     all_of = list(abuses())
     random.Random(3).shuffle(all_of)
     with running("--port", "0", "--scene", "flat") as server:

@@ -50,7 +50,7 @@ async def said(url: str) -> str:
     return str(aio.value).replace(url, "URL")
 
 
-async def test_nobody_is_there() -> None:
+async def test_no_server_is_there() -> None:
     with socket.create_server(("127.0.0.1", 0)) as listener:
         port = listener.getsockname()[1]
     wanted = f"URL: no server there (connection refused); start one with: sovereign-server --port {port}"
@@ -58,17 +58,17 @@ async def test_nobody_is_there() -> None:
 
 
 @pytest.mark.parametrize("url", ["example.org:8765", "http://example.org:8765"])
-async def test_that_is_no_address(url: str) -> None:
+async def test_an_invalid_address(url: str) -> None:
     assert await said(url) == "'URL': scheme isn't ws or wss; a server's address looks like ws://localhost:8765"
 
 
-async def test_a_host_that_there_is_not() -> None:
+async def test_a_host_that_does_not_exist() -> None:
     found = await said("ws://nobody.invalid:8765")
     assert found.startswith("URL: cannot be reached (")
     assert found.endswith("); is the address right?")
 
 
-def test_something_else_is_there() -> None:
+def test_another_kind_of_server_is_there() -> None:
     def page(sock: socket.socket) -> None:
         sock.recv(65536)
         sock.sendall(b"HTTP/1.1 404 Not Found\r\nContent-Length: 0\r\n\r\n")
@@ -101,7 +101,7 @@ async def test_tls_on_one_side_only(plain: str, secure: str) -> None:
     assert (await said(f"ws://{secure}")).endswith("; if the server speaks TLS, use wss://")
 
 
-async def test_nobody_vouches_for_the_server(secure: str) -> None:
+async def test_a_certificate_that_is_not_trusted(secure: str) -> None:
     found = await said(f"wss://{secure}")
     assert found.startswith("URL: no secure connection, the server's certificate is not trusted (")
     assert found.endswith(
@@ -134,13 +134,13 @@ def left(game: Game, token: str = "", change: Callable[[Client], None] | None = 
         (signed(GOOD, OTHER), "the token is signed with another key"),
     ],
 )
-def test_a_token_that_does_not_do(token: str, wanted: str) -> None:
+def test_a_token_that_is_refused(token: str, wanted: str) -> None:
     found = left(Game(load_scene("flat"), authenticate=Tokens(KEY, lambda: NOW)), token)
     assert found.code == messages.UNAUTHORISED
     assert found.reason == f"{wanted}; connect with token=... and a valid token; the operator of the server issues them"
 
 
-def test_a_check_of_ones_own_has_its_say() -> None:
+def test_the_reason_of_a_games_own_check() -> None:
     def check(token: str) -> str:
         raise AuthError("the club is closed on Mondays")
 

@@ -151,7 +151,7 @@ def looked_at(data: Path, scene: Scene, copy: Path) -> tuple[World, tuple[int, s
 
 
 @pytest.mark.parametrize("kills", [5, *long(50)])
-def test_nothing_that_a_client_was_told_is_lost_in_kills(tmp_path: Path, kills: int) -> None:
+def test_no_acknowledged_edit_is_lost_in_kills(tmp_path: Path, kills: int) -> None:
     seed = 17
     rng, cells, scene = random.Random(seed), Cells(), load_scene("flat")
     editors = [Editor(cells, scene) for _ in range(BOTS)]
@@ -222,7 +222,7 @@ def test_a_clean_stop_leaves_a_checkpoint_and_no_log(tmp_path: Path) -> None:
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="limits another process's files")
-def test_a_full_disk_is_told_players_move_on_and_room_is_made_use_of(tmp_path: Path) -> None:
+def test_a_full_disk_refuses_edits_players_move_on_and_saving_resumes(tmp_path: Path) -> None:
     cells, data = Cells(), tmp_path / "data"
     with running("--port", "0", "--scene", "flat", "--data", str(data)) as server:
         address = server.address()

@@ -204,7 +204,9 @@ def both() -> dict[str, tuple[Figures, Figures]]:
 
 
 @pytest.mark.parametrize("name", LINKS)
-def test_nobody_is_lost_and_nothing_is_unexplained(both: dict[str, tuple[Figures, Figures]], name: str) -> None:
+def test_no_client_is_lost_and_every_correction_is_explained(
+    both: dict[str, tuple[Figures, Figures]], name: str
+) -> None:
     for figures in both[name]:
         assert not [event for event in figures.events if isinstance(event, (Diverged, Left))]
         assert set(figures.corrections) <= {"late input", "other entity"}
@@ -230,7 +232,7 @@ def test_in_a_dip_the_latest_wins_and_then_all_is_as_before(both: dict[str, tupl
     assert measured.age_ms(0.9, end + 0.5) <= 1.5 * simulated.age_ms(0.9, end + 0.5) + NOISE_MS
 
 
-def test_an_outage_is_felt_and_held_keys_survive_it(both: dict[str, tuple[Figures, Figures]]) -> None:
+def test_an_outage_delays_snapshots_and_held_keys_survive_it(both: dict[str, tuple[Figures, Figures]]) -> None:
     simulated, measured = both["outage"]
     for figures in (simulated, measured):
         assert figures.age_ms(1) >= 200

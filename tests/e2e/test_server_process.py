@@ -64,7 +64,7 @@ def last_words(link: ClientConnection) -> Message:
     return last
 
 
-def test_serves_and_tells_its_clients_when_it_ends() -> None:
+def test_it_serves_and_sends_a_bye_at_its_end() -> None:
     with running("--port", "0", "--scene", "flat", "--tick-rate", "64") as server:
         address = server.address()
         assert page(address, "/healthz") == "ok\n"
@@ -102,7 +102,7 @@ def mute(address: tuple[str, int]) -> Iterator[socket.socket]:
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, *long(signal.SIGINT)])
-def test_a_client_that_does_not_answer_does_not_keep_it(number: signal.Signals) -> None:
+def test_a_client_that_does_not_answer_does_not_delay_the_end(number: signal.Signals) -> None:
     with running("--port", "0", "--scene", "flat") as server:
         address = server.address()
         with mute(address), socket.create_connection(address):
@@ -152,7 +152,7 @@ def status(address: tuple[str, int], path: str) -> tuple[int, str]:
             return error.code, error.read().decode()
 
 
-def test_while_it_goes_down_it_says_so_and_nobody_comes_in() -> None:
+def test_while_draining_it_accepts_no_clients_and_is_not_ready() -> None:
     with running("--port", "0", "--scene", "flat", "--restart-s", "7") as server:
         address = server.address()
         with mute(address):  # the server waits for the answer to its close frame
@@ -166,7 +166,7 @@ def test_while_it_goes_down_it_says_so_and_nobody_comes_in() -> None:
             assert server.end() == 0
 
 
-def test_who_is_beyond_a_limit_is_told_so_before_the_websocket_opens() -> None:
+def test_a_connection_beyond_a_limit_is_refused_before_the_websocket_opens() -> None:
     with running(
         "--port", "0", "--scene", "flat", "--loopback-exempt", "no", "--connections-per-address", "1"
     ) as server:
@@ -224,7 +224,7 @@ def test_a_second_signal_ends_it_at_once() -> None:
 
 @pytest.mark.skipif(os.name == "nt", reason="a signal ends a process there")
 @pytest.mark.parametrize("number", [signal.SIGINT, *long(signal.SIGTERM)])
-def test_a_signal_ends_it_that_its_starter_had_it_ignore(number: signal.Signals) -> None:
+def test_a_signal_that_was_inherited_as_ignored_ends_it(number: signal.Signals) -> None:
     """A shell makes the background jobs of a script ignore SIGINT."""
     with inheriting(signal.SIG_IGN, number), running("--port", "0", "--scene", "flat") as server:
         server.address()
@@ -301,7 +301,7 @@ async def storm(address: tuple[str, int]) -> None:
     await asyncio.gather(*(one(turn) for turn in range(200)))
 
 
-def test_rubbish_leaves_no_trace_and_the_ticks_go_on() -> None:
+def test_garbage_leaves_no_trace_and_the_ticks_go_on() -> None:
     with running("--port", "0", "--scene", "flat") as server:
         address = server.address()
         with joined(address):

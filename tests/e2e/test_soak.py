@@ -44,7 +44,7 @@ def test_everything_at_once_loses_no_edit_and_leaves_no_error_unexplained(tmp_pa
     assert details["blocks_walked_least"] > 5
 
 
-def test_an_edit_that_was_told_and_is_not_there_is_found() -> None:
+def test_an_acknowledged_edit_that_is_missing_is_found() -> None:
     world, untouched = build([floor()]), build([floor()])
     cells, rng = Cells(), random.Random(1)
     done, open_, refused = (0, 0, 1), (1, 0, 1), (2, 0, 1)
@@ -62,7 +62,7 @@ def test_an_edit_that_was_told_and_is_not_there_is_found() -> None:
     assert len(cells.lost(world, untouched)) == 1
 
 
-def test_what_a_log_holds_is_explained_or_not(tmp_path: Path) -> None:
+def test_each_log_entry_is_explained_or_an_error(tmp_path: Path) -> None:
     told = [("started", "info"), ("the event loop has stalled", "warning"), ("internal error in serving", "error")]
     lines = [json.dumps({"event": event, "level": level}) for event, level in told]
     (tmp_path / "log 1").write_text("\n".join([*lines, "Traceback (most recent call last):"]) + "\n", "utf-8")

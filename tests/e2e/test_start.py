@@ -214,7 +214,7 @@ def test_the_log_tells_a_new_world_from_one_that_goes_on(tmp_path: Path) -> None
             assert server.log()[0]["event"] == event
 
 
-def test_a_bad_start_is_one_line_and_exit_code_2() -> None:
+def test_a_failed_start_is_one_line_and_exit_code_2() -> None:
     with running("--port", "x") as server:
         assert server.end() == 2
         assert server.rest() == []

@@ -67,7 +67,7 @@ async def test_aio(url: str, trust: ssl.SSLContext) -> None:
         assert client.stats.divergences == 0
 
 
-async def test_who_does_not_trust_it_is_told_so(url: str) -> None:
+async def test_a_client_that_does_not_trust_the_certificate_gets_the_reason(url: str) -> None:
     with pytest.raises(ConnectError, match="no secure connection"):
         Client.connect(url)
     with pytest.raises(ConnectError, match="no secure connection"):

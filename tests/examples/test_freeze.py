@@ -34,7 +34,7 @@ def clean(player: Player) -> None:
     assert set(player.core.stats.corrections_by_cause) <= {"server act", "other entity", "late input"}
 
 
-def test_who_is_touched_freezes_and_is_thawed_by_a_friend() -> None:
+def test_a_touched_player_freezes_and_is_thawed_by_a_friend() -> None:
     match = Match(load_scene(Freeze.scene), seed=3, rules=Freeze())
     ann, bob = match.join(bot(to(2)), TYPICAL), match.join(bot(heading(-1, 0)), TYPICAL)
     match.run(1)

@@ -14,7 +14,7 @@ MEADOW = load_scene("meadow")
 HERE = (32.0, 32.0, 9.0)
 
 
-def test_who_is_it_runs_after_the_nearest_who_can_be_tagged() -> None:
+def test_it_runs_after_the_nearest_player_that_can_be_tagged() -> None:
     places = {1: HERE, 2: (34.0, 32.0, 9.0), 3: (32.0, 40.0, 9.0)}
     assert wish(MEADOW, 1, 0, places, (1.0, 1.0, 0.0), [1], [])[:2] == (1.0, 0.0)
     assert wish(MEADOW, 1, 0, places, (1.0, 1.0, 0.0), [1], [2])[:2] == (0.0, 1.0)
@@ -22,14 +22,14 @@ def test_who_is_it_runs_after_the_nearest_who_can_be_tagged() -> None:
 
 @pytest.mark.parametrize("me", [1, 2, 3])
 @pytest.mark.parametrize("angle", range(8))
-def test_the_others_run_away_from_whoever_is_it(me: int, angle: int) -> None:
+def test_the_others_run_away_from_it(me: int, angle: int) -> None:
     way = math.cos(angle), math.sin(angle)
     places = {me: HERE, 9: (32 + 6 * way[0], 32 + 6 * way[1], 9.0)}
     x, y, _ = wish(MEADOW, me, 0, places, (1.0, 1.0, 0.0), [9], [])
     assert x * way[0] + y * way[1] < -0.5
 
 
-def test_nobody_runs_out_of_the_scene() -> None:
+def test_no_runner_leaves_the_scene() -> None:
     for scene in (MEADOW, load_scene("hills")):
         east = scene.size[0] * 32.0
         for me in range(1, 9):
@@ -37,13 +37,13 @@ def test_nobody_runs_out_of_the_scene() -> None:
             assert x < 0
 
 
-def test_who_gets_no_further_jumps() -> None:
+def test_a_blocked_runner_jumps() -> None:
     places = {1: HERE, 2: (36.0, 32.0, 9.0)}
     assert not wish(MEADOW, 1, 0, places, (5.0, 0.0, 0.0), [1], [])[2]
     assert wish(MEADOW, 1, 0, places, (0.0, 0.0, 0.0), [1], [])[2]
 
 
-def test_a_bot_sees_in_its_world_who_is_it_and_learns_who_is_safe() -> None:
+def test_a_bot_finds_it_by_template_and_safe_players_by_attribute() -> None:
     scene = Tag().prepare(load_scene(Tag.scene))
     world = World(scene)
     world.load_terrain()

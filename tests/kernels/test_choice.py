@@ -48,7 +48,7 @@ def test_one_setting_forces_a_form(form: str) -> None:
     assert chosen(ROOT, SOVEREIGN_KERNEL=form)[::2] == [form, form]
 
 
-def test_a_setting_that_is_none_is_refused_by_name(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_unknown_form_is_refused_by_name(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(kernels.VARIABLE, "fast")
     with pytest.raises(ValueError, match=r"^SOVEREIGN_KERNEL = 'fast': must be one of auto, prebuilt, numba, plain$"):
         kernels.get()
@@ -79,14 +79,14 @@ REFUSED = "from shared import kernels; print([kernels.chosen(), kernels.trouble(
         ),
     ],
 )
-def test_a_change_of_what_it_does_makes_it_stale(copy: Path, file: str, old: str, new: str) -> None:
+def test_a_change_of_its_code_makes_it_stale(copy: Path, file: str, old: str, new: str) -> None:
     edit(copy, file, old, new)
     instead = NUMBA if kernels.numba_installed() else PLAIN
     assert chosen(copy, program=REFUSED) == [instead, STALE, f"{instead}: {STALE}"]
 
 
 @here
-def test_comments_do_nothing(copy: Path) -> None:
+def test_a_change_of_comments_does_not_make_it_stale(copy: Path) -> None:
     edit(copy, "kernel.py", "    least = heap[0]\n", "\n    # The least is on top.\n    least = heap[0]  # always\n")
     edit(copy, "bulk.py", '"""Returns four bytes from', '"""Returns four bytes\n\n    from')
     assert chosen(copy) == [PREBUILT, "", PREBUILT]
@@ -136,7 +136,7 @@ def test_checksums_of_code_leave_out_what_does_nothing() -> None:
 
 
 @here
-def test_arguments_that_are_none_are_refused_and_nothing_is_kept() -> None:
+def test_invalid_arguments_are_refused_and_no_buffer_is_kept() -> None:
     kernel = kernels.get(True)
     if kernel.form != PREBUILT:
         pytest.skip("another form is forced")

@@ -29,7 +29,7 @@ def test_a_module_is_one_object_under_both_names() -> None:
 
 
 @pytest.mark.parametrize("name", ["sovereign_netcode.server.nothing", "sovereign_netcode.nothing"])
-def test_what_is_not_there_is_named_as_it_was_asked_for(name: str) -> None:
+def test_a_missing_module_is_named_as_it_was_imported(name: str) -> None:
     with pytest.raises(ModuleNotFoundError) as error:
         importlib.import_module(name)
     assert error.value.name == name
@@ -51,7 +51,7 @@ def test_a_package_runs_under_the_long_name(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("theirs", ["shared/__init__.py", *long("server.py", "client_sdk.py")])
-def test_a_module_of_the_program_with_the_same_name_is_told(tmp_path: Path, theirs: str) -> None:
+def test_a_module_of_the_program_with_the_same_name_is_reported(tmp_path: Path, theirs: str) -> None:
     (tmp_path / theirs).parent.mkdir(exist_ok=True)
     (tmp_path / theirs).write_text("", "utf-8")
     name = theirs.partition("/")[0].removesuffix(".py")

@@ -74,7 +74,7 @@ def test_everything_else_stays(source: str) -> None:
         ("x = [y, '-m', 'server', z]\n", "a.py:1: '-m', 'server': write '-m', 'sovereign_netcode.server'"),
     ],
 )
-def test_what_would_be_wrong_in_the_wheel_is_refused(source: str, reason: str) -> None:
+def test_an_import_that_would_fail_in_the_wheel_is_refused(source: str, reason: str) -> None:
     with pytest.raises(RewriteError) as error:
         rewritten(source, "a.py", MODULES)
     assert str(error.value) == reason

@@ -36,7 +36,7 @@ def test_the_search_ends_close_below_the_most_that_is_held(most: int) -> None:
     assert len(holds.asked) == len(set(holds.asked)) <= 12
 
 
-def test_a_search_of_few_steps_tells_what_it_has_tried() -> None:
+def test_a_search_of_few_steps_reports_each_step() -> None:
     told: list[bench.Figures] = []
     stages = bench.search(cast("bench.Rig", Holds(10)), 400, 1.0, 0.2, 3, told.append)
     assert [stage["clients"] for stage in stages] == [400, 200, 100]
@@ -81,7 +81,7 @@ def test_each_kind_of_server_holds_a_few_players(kind: str) -> None:
 @pytest.mark.e2e
 @pytest.mark.alone
 @pytest.mark.parametrize("kind", jitter.VARIANTS)
-def test_each_variant_of_the_product_differs_in_what_it_says_only(kind: str) -> None:
+def test_each_variant_of_the_product_has_its_settings(kind: str) -> None:
     uvloop = pytest.importorskip("uvloop")
     with bench.rig(kind, capacity=4, per_segment=4) as running:
         running.hold(4, 0.5)
@@ -137,7 +137,7 @@ def test_the_slope_is_that_of_the_line() -> None:
     }
 
 
-def test_a_margin_is_where_nobody_appears() -> None:
+def test_no_spawn_point_is_in_the_margin() -> None:
     scene = Scene.from_table({"name": "wide", **tomllib.loads(bench.scene_toml(20, 5, margin=3))})
     assert scene.size[:2] == (5, 5)
     assert all(max(x, y) < 2 * 32 for x, y, _ in scene.spawns)

@@ -28,7 +28,7 @@ def test_a_run_is_the_same_again_from_its_seed(tmp_path: Path) -> None:
     assert runs[0]["outcomes"] == runs[1]["outcomes"]
 
 
-def test_what_breaks_a_promise_is_found_and_told_with_its_input(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_input_that_breaks_a_promise_is_found_and_printed(monkeypatch: pytest.MonkeyPatch) -> None:
     def fragile(data: bytes) -> str:
         assert b"\xc1" not in data
         return str(len(data) > 10)

@@ -73,7 +73,7 @@ def test_three_processes_have_the_figures_of_one_with_all_their_bots() -> None:
         ([0.001] * 100, 9.5, "more --processes"),
     ],
 )
-def test_one_process_of_four_that_cannot_keep_up_is_told(lags_s: list[float], cpu_s: float, said: str) -> None:
+def test_one_process_of_four_that_cannot_keep_up_is_reported(lags_s: list[float], cpu_s: float, said: str) -> None:
     good = [result([client(number)], [0.0005] * 500, 1.0) for number in range(3)]
     found = figures.figures([*good, result([client(3)], lags_s, cpu_s)], 10.0, {}, {}, [])
     told = figures.bottleneck(found)
@@ -87,7 +87,7 @@ def bots(at: float, **more: Any) -> Figures:
     return {"playing": 5, "ended": [], "at": at, "cpu_s": 0.0, "lag_counts": []} | counts | more
 
 
-def test_a_glance_is_of_what_happened_since_the_last_one() -> None:
+def test_a_glance_shows_the_time_since_the_last_one() -> None:
     server = {"ticks": 100, "uptime_s": 50.0, "cpu_s": 4.0, "tick_lateness_counts": [[100, 90], [9000, 10]]}
     later = {"ticks": 164, "uptime_s": 52.0, "cpu_s": 4.5, "tick_lateness_counts": [[100, 153], [9000, 11]]}
     # Each process reports at its own times, and the processes started at different times.
@@ -114,7 +114,7 @@ def test_a_glance_is_of_what_happened_since_the_last_one() -> None:
     }
 
 
-def test_a_glance_does_without_what_nobody_tells() -> None:
+def test_a_glance_leaves_out_missing_figures() -> None:
     joining, begun = {"playing": 2, "ended": []}, bots(7.0)
     assert glance.rows(glance.Look({}, [joining]), glance.Look({}, [begun])) == [("clients", "5")]
     both = glance.Look({}, [joining, begun])

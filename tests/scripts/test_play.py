@@ -96,7 +96,7 @@ def test_faces_are_those_that_can_be_seen() -> None:
     assert faces == {(5, 5, 5): 1, (6, 5, 5): 3, (5, 5, 6): 3}
 
 
-def test_what_stands_before_something_covers_it() -> None:
+def test_a_block_in_front_covers_a_figure() -> None:
     target = pygame.Surface(SIZE)
     for wall, hides in (((7, 3, 0), True), ((7, 3, 1), True), ((3, 7, 0), False), ((5, 5, 3), False)):
         ground = iso.Ground()
@@ -148,7 +148,7 @@ class Session:
         return len(np.unique(pixels, axis=0))
 
 
-def test_everybody_is_in_the_picture_and_the_keys_do_what_they_say() -> None:
+def test_all_players_are_drawn_and_the_keys_work() -> None:
     session = Session()
     window, core = session.window, session.core
     assert core.state == "playing"

@@ -28,7 +28,7 @@ def stuck(seconds: float, state: Callable[[float], tuple[int, float] | None], *,
 
 
 @pytest.mark.parametrize("walks", [True, False])
-def test_one_who_walks_is_not_stuck(walks: bool) -> None:
+def test_a_player_that_walks_is_not_stuck(walks: bool) -> None:
     assert stuck(60, lambda now: (int(now * HZ), 3 * now), walks=walks) == 0
 
 
@@ -45,16 +45,16 @@ def test_after_a_stall_there_are_two_seconds_to_move_again(again_s: float, expec
     assert stuck(40, state) == pytest.approx(expected, abs=0.25)  # a quarter of a second is the time for half a block
 
 
-def test_one_whose_inputs_are_used_but_who_does_not_move_is_stuck_if_it_is_to_walk() -> None:
+def test_a_player_that_should_walk_and_does_not_move_is_stuck() -> None:
     assert stuck(10, lambda now: (int(now * HZ), 0.0)) == pytest.approx(8.0, abs=0.1)
     assert stuck(10, lambda now: (int(now * HZ), 0.0), walks=False) == 0
 
 
-def test_one_who_is_moved_by_others_but_whose_inputs_are_not_used_is_stuck() -> None:
+def test_a_player_that_only_others_move_is_stuck() -> None:
     assert stuck(10, lambda now: (7, 3 * now)) == pytest.approx(8.0, abs=0.1)
 
 
-def test_a_return_begins_the_time_anew() -> None:
+def test_a_reconnect_restarts_the_time() -> None:
     progress = Progress(walks=True)
     for tick in range(20 * HZ):
         if tick % (HZ + 1) == 0:

@@ -12,7 +12,7 @@ def check_of_ones_own(token: str) -> str:
     return token.upper()
 
 
-def test_anyone_tokens_or_a_check_of_ones_own(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_settings_choose_anyone_tokens_or_a_games_own_check(monkeypatch: pytest.MonkeyPatch) -> None:
     assert authenticator(Settings()) is None
     monkeypatch.setenv("SOVEREIGN_AUTH_KEY", "k" * 32)
     tokens = authenticator(Settings(auth="token"))
@@ -24,7 +24,7 @@ def test_anyone_tokens_or_a_check_of_ones_own(monkeypatch: pytest.MonkeyPatch) -
 
 
 @pytest.mark.parametrize("auth", ["no.such:thing", "json:nothing", ".:x", "sys:path"])
-def test_a_check_that_is_none_is_told_of(auth: str) -> None:
+def test_an_invalid_check_is_reported(auth: str) -> None:
     with pytest.raises(SettingsError, match="auth = "):
         authenticator(Settings(auth=auth))
 

@@ -60,7 +60,7 @@ def test_it_is_what_pettingzoo_takes_for_an_environment(rules: type[Rules]) -> N
     parallel_seed_test(lambda: arena(rules=rules))
 
 
-def test_what_an_agent_sees() -> None:
+def test_observations_of_an_agent() -> None:
     env = arena()
     seen, infos = env.reset(seed=1)
     assert list(seen) == list(infos) == env.agents == ["player_0", "player_1", "player_2"]
@@ -84,7 +84,7 @@ def test_what_an_agent_sees() -> None:
     assert 7 in mine["blocks"]
 
 
-def test_what_is_not_loaded_is_told_from_air() -> None:
+def test_observations_distinguish_unloaded_blocks_from_air() -> None:
     env = arena(scene=scene(origin=(0, 0, 0), size=(1, 1, 1), spawns=[(1.0, 31.0, 0.0)], gravity=0.0), agents=1)
     seen, _ = env.reset()
     blocks = seen["player_0"]["blocks"]
@@ -126,7 +126,7 @@ def test_actions_move_and_attributes_reward() -> None:
     assert custom.step({})[1] == {agent: float(custom.entity(agent)) for agent in custom.possible_agents}
 
 
-def test_who_is_over_leaves_and_the_others_go_on_until_the_time_is_over() -> None:
+def test_an_agent_that_is_over_leaves_and_the_others_go_on_to_the_time_limit() -> None:
     env = arena(seconds=8.0)
     env.reset()
     out = env.entity("player_1")

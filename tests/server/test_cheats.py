@@ -135,7 +135,7 @@ def test_inputs_from_the_future_are_consumed_in_their_ticks_and_not_before(cheat
     cheat.prove()
 
 
-def test_inputs_from_the_past_are_not_made_up_for(cheat: Cheat) -> None:
+def test_late_inputs_are_not_made_up_for(cheat: Cheat) -> None:
     cheat.tick(100)
     cheat.link.say(Inputs(1, 0, EAST * INPUT_ROWS_MAX))
     cheat.tick(100)
@@ -181,7 +181,7 @@ def test_a_lag_switch_loses_what_it_withholds(cheat: Cheat, withheld: int) -> No
     cheat.prove()
 
 
-def test_wishes_that_are_too_long_are_shortened(cheat: Cheat) -> None:
+def test_directions_that_are_too_long_are_shortened(cheat: Cheat) -> None:
     for row in (bytes((127, 127, 0)), bytes((128, 128, 0)), bytes((128, 0, 255)), bytes((129, 127, 254))):
         cheat.link.say(ahead(cheat.table, row, 16))
         cheat.tick(16)
@@ -295,7 +295,7 @@ def test_edits_out_of_reach_are_refused_whatever_tick_they_name(cheat: Cheat) ->
     assert len(verdicts(cheat.link)) == len(orders)
 
 
-def test_nobody_is_walled_in_and_no_floor_is_pushed_up_under_anyone(cheat: Cheat) -> None:
+def test_a_block_into_a_player_is_refused_and_moves_no_player(cheat: Cheat) -> None:
     cheat.tick(128)
     inside = [(0, 0, 1), (0, 0, 2)]  # the box of 5/8 x 5/8 x 7/4 at (0, 0, 1)
     for number, cell in enumerate(inside, 1):
@@ -322,7 +322,7 @@ def test_edits_that_come_too_fast_are_refused(cheat: Cheat) -> None:
     assert done(cheat.link) == 2 * rate + 2 * rate - 1, "the burst, and two seconds of edits without the last tick's"
 
 
-def test_coming_back_gives_no_edits(cheat: Cheat) -> None:
+def test_a_reconnect_gives_no_edits(cheat: Cheat) -> None:
     rate = cheat.table.game.limits.edits_per_s
     links, number = [cheat.link], 1
     began = cheat.table.tick_number
@@ -351,7 +351,7 @@ def test_leaving_and_joining_anew_gives_no_edits() -> None:
 # -- coming back ---------------------------------------------------------------------------------------------
 
 
-def test_of_two_connections_only_the_newer_one_is_heard(cheat: Cheat) -> None:
+def test_of_two_connections_only_the_newer_one_counts(cheat: Cheat) -> None:
     old = cheat.link
     cheat.take_over()
     for _ in range(16):
@@ -387,7 +387,7 @@ def test_quick_reconnects_give_no_inputs(cheat: Cheat) -> None:
     cheat.prove()
 
 
-def test_what_waits_for_who_never_reads_is_bounded_over_any_number_of_returns(cheat: Cheat) -> None:
+def test_pending_verdicts_of_a_client_that_never_reads_are_bounded_over_reconnects(cheat: Cheat) -> None:
     player = cheat.table.game.players[cheat.entity]
     resume = cheat.link.got(Welcome)[-1].resume
     longest = 0
@@ -420,7 +420,7 @@ class Asking(Rules):
 
 
 @pytest.mark.parametrize("seen", [0, -1, -(1 << 63), -1e300, 5e-324, 1e300, (1 << 64) - 1, 10_000.5])
-def test_who_lies_about_what_it_saw_gets_the_last_half_second(seen: float) -> None:
+def test_a_false_view_tick_is_limited_to_the_last_half_second(seen: float) -> None:
     rules = Asking()
     cheat = Cheat(plain(rules))
     cheat.tick(100)

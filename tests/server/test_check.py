@@ -21,7 +21,7 @@ def test_it_asks_whether_the_server_is_ready_where_no_page_is_named(url: str, pa
 
 
 @pytest.mark.parametrize("url", ["", "127.0.0.1:8765", "ftp://x", "http://", "http:///readyz", "ws:/x"])
-def test_what_is_no_address(url: str) -> None:
+def test_an_invalid_address_is_refused(url: str) -> None:
     with pytest.raises(SettingsError) as error:
         healthcheck.main(["--url", url], {})
     assert str(error.value) == f"url = {url!r}: must be like ws://HOST:PORT, wss://, http:// or https://"

@@ -73,7 +73,7 @@ def test_the_edits_are_well_chosen() -> None:
     assert former.state_hash(world) == before
 
 
-def test_all_that_tells_worlds_apart_tells_these_apart() -> None:
+def test_every_comparison_of_worlds_finds_these_edits() -> None:
     world = build([floor(0)])
     log, relief, copy = ChangeLog(world), Relief(world), world.copy()
 
@@ -92,7 +92,7 @@ def test_all_that_tells_worlds_apart_tells_these_apart() -> None:
     assert all(copy.blocks.get(*edit[:3]) == edit.kind for edit in CHOSEN)
 
 
-def test_a_checkpoint_holds_whatever_was_touched() -> None:
+def test_a_checkpoint_holds_every_touched_segment() -> None:
     world, _ = generated(build([floor(0)]).scene, compiled=False)
     saved = saved_of(world)
     edited(world)
@@ -106,7 +106,7 @@ def test_a_checkpoint_holds_whatever_was_touched() -> None:
 
 
 @pytest.mark.parametrize("restart", ["crash", "stop"])
-def test_what_was_answered_is_there_after_a_checkpoint_and_a_restart(tmp_path: Path, restart: str) -> None:
+def test_answered_edits_are_there_after_a_checkpoint_and_a_restart(tmp_path: Path, restart: str) -> None:
     table = Stored(tmp_path / "data")
     link = table.join()
     table.tick(64)  # a player who has just joined may not edit yet

@@ -96,7 +96,7 @@ class Disk:
         self.durable_tick = 1 << 30
 
 
-def test_a_verdict_is_told_when_its_tick_is_on_disk() -> None:
+def test_a_verdict_is_sent_when_its_tick_is_on_disk() -> None:
     disk = Disk()
     table = Table(saves=disk)
     link = builder(table)
@@ -114,7 +114,7 @@ def test_a_verdict_is_told_when_its_tick_is_on_disk() -> None:
     assert verdicts(link) == {1: messages.DONE, 2: messages.OUT_OF_REACH}
 
 
-def test_a_client_is_let_in_when_its_token_is_on_disk_or_nothing_can_be_saved() -> None:
+def test_a_client_is_welcomed_when_its_token_is_on_disk_or_nothing_can_be_saved() -> None:
     disk = Disk()
     table = Table(Limits(stalled_s=0.1), saves=disk)
     disk.durable_tick = table.tick_number
@@ -154,7 +154,7 @@ def test_while_nothing_can_be_saved_commands_are_refused_and_players_move_on() -
     assert verdicts(link)[3] == messages.DONE
 
 
-def test_what_a_client_ordered_before_it_was_closed_is_not_carried_out(table: Table) -> None:
+def test_commands_of_a_closed_client_are_not_carried_out(table: Table) -> None:
     link = table.join()
     link.say(order(1, table.tick_number + 1, 18, 16, 1, 5), b"\xff")
     table.tick(2)

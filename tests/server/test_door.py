@@ -35,7 +35,7 @@ def test_an_address_gets_its_share_and_pages_beyond_it_and_then_nothing() -> Non
     assert door.answer(JOIN, "1.2.3.4", 0.0) is None
 
 
-def test_what_has_left_leaves_nothing_behind() -> None:
+def test_an_ended_connection_leaves_nothing_behind() -> None:
     door = Admission(Limits(connections_per_address=1))
     for n in range(1000):
         address = f"10.0.{n >> 8}.{n & 255}"
@@ -69,7 +69,7 @@ def test_joins_have_a_rate_and_a_burst_of_two_seconds() -> None:
     assert refused(door.answer(HEALTH, "1.2.3.4", 1000.0))[0] == 200
 
 
-def test_a_rate_below_one_in_two_seconds_lets_somebody_in() -> None:
+def test_a_rate_below_one_in_two_seconds_still_allows_joins() -> None:
     door = Admission(Limits(joins_per_s=0.1))
     found = [door.answer(JOIN, "1.2.3.4", now) is None for now in (0.0, 1.0, 9.0, 10.5, 11.0, 21.0)]
     assert found == [True, False, False, True, False, True]
@@ -124,7 +124,7 @@ def test_browsers_come_from_known_pages(allowed: tuple[str, ...], origin: str | 
         assert page.status == 403
 
 
-def test_a_server_that_goes_down_says_when_to_come_back() -> None:
+def test_a_draining_server_says_when_to_reconnect() -> None:
     wait: list[float] = []
     door = Admission(closing=lambda: wait[0] if wait else None)
     assert door.answer(JOIN, "127.0.0.1", 0.0) is None
@@ -179,7 +179,7 @@ OTHER_HOSTS = [
 
 
 @pytest.mark.parametrize("path", ["/", "/live", "/live/0", "/stats", "/metrics", "/healthz", "/readyz", "/nothing"])
-def test_pages_are_not_given_by_a_name_that_somebody_else_has_pointed_here(path: str) -> None:
+def test_pages_are_refused_by_a_host_name_that_is_not_the_servers_own(path: str) -> None:
     figures = {path: lambda: Page(200, b"figures")}
     door = Admission(pages=Pages(private=figures), hosts=("127.0.0.1", "Play.example"))
     for host in OWN_HOSTS:
@@ -193,7 +193,7 @@ def test_pages_are_not_given_by_a_name_that_somebody_else_has_pointed_here(path:
     assert door.refused == {"host": len(OTHER_HOSTS)}
 
 
-def test_an_operator_can_allow_every_name_for_pages_but_not_for_players_from_there() -> None:
+def test_an_operator_can_allow_every_host_name_for_pages_but_not_for_players() -> None:
     door = Admission(hosts=("*",))
     for host in OTHER_HOSTS:
         assert refused(door.answer(Request("GET", "/healthz", host, None, upgrade=False), "127.0.0.1", 0.0))[0] == 200

@@ -68,7 +68,7 @@ def test_a_join_that_fails_leaves_nothing_behind(
     again.stop()
 
 
-def test_a_return_that_fails_may_be_tried_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_reconnect_that_fails_may_be_tried_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     table = Stored(tmp_path)
     link = table.connect(ANN)
     table.tick(2)

@@ -50,7 +50,7 @@ def connect(table: Table) -> BrokenLink:
 
 
 @pytest.mark.parametrize("broken", [{"send"}, {"outstanding"}, {"send", "close"}, {"outstanding", "close"}])
-def test_a_client_that_cannot_be_served_is_let_go_and_the_others_notice_nothing(
+def test_a_client_that_cannot_be_served_is_closed_and_the_others_notice_nothing(
     table: Table, broken: set[str], caplog: pytest.LogCaptureFixture
 ) -> None:
     links = [connect(table) for _ in range(3)]
@@ -83,7 +83,7 @@ def test_a_welcome_that_cannot_be_sent_ends_that_join_only(table: Table) -> None
 
 
 @pytest.mark.parametrize("broken", [{"send"}, {"close"}])
-def test_who_cannot_be_told_to_go_goes(broken: set[str]) -> None:
+def test_a_client_whose_bye_fails_is_closed_all_the_same(broken: set[str]) -> None:
     table = Table(Limits(silence_s=1.0))
     bad, good = connect(table), connect(table)
     table.tick(1)
@@ -152,7 +152,7 @@ def test_a_segment_that_cannot_be_encoded_is_left_out_and_comes_when_it_can(monk
     assert table.game.faults.total == 5
 
 
-def test_nobody_is_blamed_for_the_time_that_the_server_was_away() -> None:
+def test_no_client_is_closed_for_a_pause_of_the_server() -> None:
     table = Table(Limits(silence_s=5.0, stalled_s=5.0, hello_s=5.0))
     link, late = table.join(), table.connect()
     table.now += 60.0
@@ -166,7 +166,7 @@ def test_nobody_is_blamed_for_the_time_that_the_server_was_away() -> None:
     assert late.refusal()[1] == "no hello within 5 s"
 
 
-def test_who_has_gone_on_while_the_server_was_away_is_not_taken_for_a_flood() -> None:
+def test_messages_sent_during_a_pause_of_the_server_are_no_flood() -> None:
     for ticks_first in (True, False):
         table = Table()
         link = table.join()
@@ -187,7 +187,7 @@ def test_who_has_gone_on_while_the_server_was_away_is_not_taken_for_a_flood() ->
         assert link.closings == []
 
 
-def test_who_was_to_come_back_while_the_server_was_away_still_may() -> None:
+def test_the_time_to_reconnect_is_extended_by_a_pause_of_the_server() -> None:
     table = Table(resume_s=15.0)
     link = table.join()
     link.say(Inputs(table.tick_number + 1, table.tick_number, bytes(3)))  # the client has got its welcome
@@ -202,7 +202,7 @@ def test_who_was_to_come_back_while_the_server_was_away_still_may() -> None:
     assert not table.game.players
 
 
-def test_of_the_same_mistake_the_first_the_tenth_and_so_on_are_logged(caplog: pytest.LogCaptureFixture) -> None:
+def test_the_1st_10th_and_100th_of_one_fault_are_logged(caplog: pytest.LogCaptureFixture) -> None:
     faults = FaultReporter()
 
     def mistake() -> None:

@@ -37,7 +37,7 @@ def test_an_input_moves_the_player_in_its_tick(table: Table) -> None:
     assert (snapshot.newest, snapshot.first, snapshot.statuses) == (3, 3, bytes([messages.USED]))
 
 
-def test_who_leaves_is_gone_before_who_comes_is_placed(table: Table) -> None:
+def test_leaving_players_are_removed_before_joining_ones_are_placed(table: Table) -> None:
     first = table.join()
     table.lose(first)
     second = table.connect(HELLO)
@@ -47,7 +47,7 @@ def test_who_leaves_is_gone_before_who_comes_is_placed(table: Table) -> None:
     assert table.game.counters.left == 1
 
 
-def test_the_others_see_who_came_and_who_left(table: Table) -> None:
+def test_the_others_see_joins_and_leaves(table: Table) -> None:
     watcher, other = table.join(), table.join()
     assert ids(watcher.got(Snapshot)[-1]) == [2]
     table.lose(other)
@@ -67,7 +67,7 @@ def test_lost_is_harmless_before_hello_between_hello_and_tick_and_twice(table: T
     assert silent.sent == []
 
 
-def test_who_falls_out_comes_back_at_a_spawn_and_is_said_to_have_been_placed(table: Table) -> None:
+def test_an_entity_that_falls_out_returns_to_a_spawn_and_is_flagged_as_placed(table: Table) -> None:
     link = table.join()
     table.game.world.place(1, (31.0, 31.0, -40.0))
     table.tick()
@@ -79,7 +79,7 @@ def test_who_falls_out_comes_back_at_a_spawn_and_is_said_to_have_been_placed(tab
     assert rows[5] & 4
 
 
-def test_who_falls_out_and_leaves_does_not_come_back(table: Table) -> None:
+def test_an_entity_that_falls_out_and_leaves_does_not_return(table: Table) -> None:
     link = table.join()
     table.game.world.place(1, (31.0, 31.0, -40.0))
     table.tick()
@@ -98,7 +98,7 @@ def test_a_session_that_ends_in_the_middle_of_a_tick_costs_the_others_nothing() 
     assert (table.game.sessions, len(table.game.world)) == ([], 0)
 
 
-def test_when_the_server_goes_down_everyone_is_told_when_to_come_back(table: Table) -> None:
+def test_a_shutdown_sends_every_client_the_time_to_reconnect(table: Table) -> None:
     links = [table.connect(HELLO, calls_back=i % 2 == 0) for i in range(6)]
     table.tick(6)
     table.game.shut_down("maintenance", 2.5)
@@ -129,7 +129,7 @@ def test_a_link_that_is_full_is_skipped_and_catches_up_in_one_snapshot(table: Ta
 
 
 @pytest.mark.parametrize(("skipped", "keyframe"), [(HISTORY - 1, False), (HISTORY, True)])
-def test_a_link_that_was_full_for_too_long_gets_everything_anew(table: Table, skipped: int, keyframe: bool) -> None:
+def test_a_link_that_was_full_for_too_long_gets_keyframes(table: Table, skipped: int, keyframe: bool) -> None:
     link = table.join()
     table.join()
     table.tick(60)
@@ -164,7 +164,7 @@ def test_terrain_waits_behind_snapshots_within_its_budget() -> None:
     assert sum(per_tick) == total > 60
 
 
-def test_an_endless_plea_for_everything_anew_is_granted_rarely(table: Table) -> None:
+def test_repeated_resyncs_are_granted_rarely(table: Table) -> None:
     link = table.join()
     table.tick(8)
     before = table.game.counters.terrain_bytes
@@ -176,7 +176,7 @@ def test_an_endless_plea_for_everything_anew_is_granted_rarely(table: Table) -> 
     assert table.game.counters.terrain_bytes - before < 3 * len(packed)
 
 
-def test_after_a_plea_for_everything_anew_the_own_segment_comes_first() -> None:
+def test_after_a_resync_the_own_segment_comes_first() -> None:
     table = Table(size=(3, 3, 1), fill=[[0, 0, 0, 96, 96, 1, 1]], spawns=((48.0, 48.0, 1.0),))
     link = table.join()
     table.tick(80)

@@ -341,7 +341,7 @@ async def test_an_error_of_the_game_closes_that_connection_and_is_counted(
         UPGRADE.replace(b"GET", b"PUT"),
     ],
 )
-async def test_what_is_no_handshake_is_answered_in_one_line(
+async def test_an_invalid_handshake_is_answered_in_one_line(
     bench: Bench, caplog: pytest.LogCaptureFixture, rubbish: bytes
 ) -> None:
     peer = await bench.connect(rubbish)
@@ -419,7 +419,7 @@ async def test_a_peer_that_neither_reads_nor_hangs_up_is_aborted(bench: Bench, m
     await bench.all_gone()
 
 
-async def test_outstanding_counts_what_the_peer_has_not_taken(bench: Bench) -> None:
+async def test_outstanding_counts_bytes_that_the_peer_has_not_received(bench: Bench) -> None:
     peer = await bench.client(limit=1024)
     link = bench.notes.opened[0]
     await bench.until(lambda: not link.outstanding())
@@ -456,7 +456,7 @@ EXTRAS = {
 
 
 @pytest.mark.parametrize("flood", EXTRAS)
-async def test_a_flood_of_what_is_no_message_ends_in_an_abort(bench: Bench, flood: str) -> None:
+async def test_a_flood_without_a_message_ends_in_an_abort(bench: Bench, flood: str) -> None:
     peer, other = await bench.client(), await bench.client()
     peer.write(EXTRAS[flood] * 5000)
     assert len(await peer.end()) <= 2 * module.EXTRAS_PER_S
@@ -467,7 +467,7 @@ async def test_a_flood_of_what_is_no_message_ends_in_an_abort(bench: Bench, floo
         pass
 
 
-async def test_what_comes_after_the_end_is_not_parsed_and_too_much_of_it_ends_in_an_abort(
+async def test_bytes_after_the_end_are_not_parsed_and_too_many_end_in_an_abort(
     bench: Bench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     peer = await bench.client()
@@ -549,7 +549,7 @@ def outcome(chunks: list[bytes], *, plain: bool) -> tuple[list[bytes], list[int]
 
 @settings(max_examples=examples(300))
 @given(st.lists(st.one_of(DATA, DATA, CONTROL, ODD), max_size=12), st.lists(st.integers(0, 2000), max_size=8))
-def test_cut_here_or_parsed_by_websockets_comes_to_the_same(frames: list[bytes | int], cuts: list[int]) -> None:
+def test_the_fast_parser_and_websockets_agree(frames: list[bytes | int], cuts: list[int]) -> None:
     whole = [binary(bytes(frame)) if isinstance(frame, int) else frame for frame in frames]
     while len(stream := b"".join(whole)) > 20_000:  # whole frames: of half a one, who sees less of it judges later
         whole.pop()
@@ -634,7 +634,7 @@ async def test_a_browser_of_another_page_is_refused(bench: Bench) -> None:
     assert bench.gateway.admission.refused == {"origin": 1}
 
 
-async def test_stop_listening_ends_what_is_no_websocket_and_leaves_the_rest(bench: Bench) -> None:
+async def test_stop_listening_ends_connections_that_are_no_websocket(bench: Bench) -> None:
     good, idle = await bench.client(), await bench.connect(b"GET")
     await bench.until(lambda: len(bench.gateway.connections) == 2)
     bench.gateway.stop_listening()

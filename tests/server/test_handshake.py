@@ -30,7 +30,7 @@ def test_messages_and_names_have_a_longest() -> None:
     assert table.game.counters.closed == {messages.TOO_BIG: 1, messages.MALFORMED: 1}
 
 
-def test_who_says_hello_is_welcomed_and_shown_the_world_in_the_next_tick(table: Table) -> None:
+def test_a_hello_is_answered_by_a_welcome_and_a_snapshot_in_the_next_tick(table: Table) -> None:
     link = table.connect(HELLO)
     assert (link.sent, len(table.game.world)) == ([], 0)
     table.tick()
@@ -46,7 +46,7 @@ def test_who_says_hello_is_welcomed_and_shown_the_world_in_the_next_tick(table: 
     assert table.game.counters.joined == 1
 
 
-def test_a_client_of_another_version_is_told_which_one_is_spoken(table: Table) -> None:
+def test_a_client_of_another_version_gets_the_servers_version(table: Table) -> None:
     code, reason = table.connect(Hello(7, {}, "")).refusal()
     assert code == messages.WRONG_VERSION
     assert reason == f"the client is newer: protocol version 7, the server speaks {messages.VERSION}"
@@ -58,7 +58,7 @@ def test_a_client_of_the_same_scene_may_say_so(table: Table) -> None:
     assert link.session.entity
 
 
-def test_a_client_of_another_scene_is_told_which_fields_differ(table: Table) -> None:
+def test_a_client_of_another_scene_gets_the_fields_that_differ(table: Table) -> None:
     other = scene(gravity=9.0, tick_rate=32, origin=(0, 0, 0), size=(1, 1, 1), spawns=((16.0, 16.0, 1.0),))
     code, reason = table.connect(Hello(messages.VERSION, other.digests, "")).refusal()
     assert (code, reason) == (
@@ -83,7 +83,9 @@ def test_a_field_that_only_one_side_has_differs_too(table: Table) -> None:
     ],
     ids=lambda said: f"{said}"[:40],
 )  # fmt: skip
-def test_what_is_out_of_place_or_malformed_ends_the_connection(table: Table, said: tuple[Message | bytes, ...]) -> None:
+def test_an_unexpected_or_malformed_message_ends_the_connection(
+    table: Table, said: tuple[Message | bytes, ...]
+) -> None:
     link = table.connect(*said)
     code, reason = link.refusal()
     assert code == messages.MALFORMED
@@ -100,7 +102,7 @@ def test_hello_in_the_middle_of_the_game_ends_it(table: Table) -> None:
     assert link.refusal() == (messages.MALFORMED, "unexpected Hello after the join")
 
 
-def test_goodbye_is_answered_by_closing(table: Table) -> None:
+def test_a_bye_is_answered_by_closing(table: Table) -> None:
     link = table.join()
     link.say(Bye(1000, "", -1.0), Ping(1.0))
     assert link.closings == [(messages.GOING_AWAY, "goodbye")]
@@ -151,7 +153,7 @@ def test_no_two_players_share_a_place(table: Table) -> None:
     assert len(places) == 12
 
 
-def test_who_does_not_say_hello_is_closed_even_while_pinging() -> None:
+def test_a_client_without_a_hello_is_closed_even_while_pinging() -> None:
     table = Table(Limits(hello_s=1.0))
     link = table.connect()
     for _ in range(64):
@@ -162,7 +164,7 @@ def test_who_does_not_say_hello_is_closed_even_while_pinging() -> None:
     assert link.refusal() == (messages.NO_HELLO, "no hello within 1 s")
 
 
-def test_who_says_nothing_any_more_is_closed_and_who_pings_is_not() -> None:
+def test_a_silent_client_is_closed_and_a_pinging_one_is_not() -> None:
     table = Table(Limits(silence_s=1.0))
     silent, alive = table.join(), table.join()
     for _ in range(70):
@@ -172,7 +174,7 @@ def test_who_says_nothing_any_more_is_closed_and_who_pings_is_not() -> None:
     assert alive.closings == []
 
 
-def test_who_reads_nothing_is_closed() -> None:
+def test_a_client_that_reads_nothing_is_closed() -> None:
     table = Table(Limits(stalled_s=1.0))
     link = table.join()
     link.waiting = 1 << 20

@@ -72,7 +72,7 @@ async def page(address: tuple[str, int], trust: ssl.SSLContext) -> bytes:
     return line
 
 
-async def test_who_only_opens_the_socket_counts_until_it_goes(
+async def test_a_peer_that_only_opens_the_socket_counts_until_it_disconnects(
     gateway: Gateway, context: ssl.SSLContext, trust: ssl.SSLContext
 ) -> None:
     address = await gateway.listen("127.0.0.1", 0, context)
@@ -89,7 +89,7 @@ async def test_who_only_opens_the_socket_counts_until_it_goes(
     await until(lambda: gateway.admission.total == 0)
 
 
-async def test_a_handshake_has_a_limit_and_rubbish_is_none(
+async def test_a_handshake_has_a_time_limit_and_garbage_ends_it(
     gateway: Gateway, context: ssl.SSLContext, trust: ssl.SSLContext
 ) -> None:
     gateway.admission.limits = Limits(handshake_s=0.2)
@@ -105,7 +105,7 @@ async def test_a_handshake_has_a_limit_and_rubbish_is_none(
     assert await page(address, trust) == b"HTTP/1.1 200 OK\r\n"
 
 
-async def test_the_end_cuts_handshakes_off(gateway: Gateway, context: ssl.SSLContext) -> None:
+async def test_closing_ends_handshakes(gateway: Gateway, context: ssl.SSLContext) -> None:
     address = await gateway.listen("127.0.0.1", 0, context)
     reader, writer = await asyncio.open_connection(*address)
     await until(lambda: gateway.admission.total == 1)
@@ -118,7 +118,7 @@ async def test_the_end_cuts_handshakes_off(gateway: Gateway, context: ssl.SSLCon
         await asyncio.open_connection(*address)
 
 
-async def test_the_end_finds_who_is_accepted_and_has_not_begun(
+async def test_closing_ends_accepted_sockets_whose_handshake_has_not_begun(
     gateway: Gateway, context: ssl.SSLContext, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     arrive, loop = gateway.admission.arrive, asyncio.get_running_loop()
@@ -135,7 +135,7 @@ async def test_the_end_finds_who_is_accepted_and_has_not_begun(
     assert gateway.admission.total == 0
 
 
-async def test_many_who_come_at_once_are_accepted_one_in_a_pass_of_the_loop(
+async def test_many_connections_at_once_are_accepted_one_per_pass_of_the_loop(
     gateway: Gateway, context: ssl.SSLContext
 ) -> None:
     address = await gateway.listen("127.0.0.1", 0, context)
@@ -150,7 +150,7 @@ async def test_many_who_come_at_once_are_accepted_one_in_a_pass_of_the_loop(
     assert passes >= len(peers)
 
 
-async def test_trouble_in_accepting_is_told_and_passes(
+async def test_an_error_in_accepting_is_reported_and_accepting_goes_on(
     gateway: Gateway, context: ssl.SSLContext, trust: ssl.SSLContext, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(tls_accept, "AGAIN_S", 0.0)

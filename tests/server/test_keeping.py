@@ -77,7 +77,7 @@ def goes_on(table: Stored, before: FakeLink, token: bytes, rules: Told) -> None:
     assert table.game.world.blocks.get(18, 16, 1) == 5
 
 
-def test_who_touched_before_a_stop_is_not_told_to_have_begun_after_it(tmp_path: Path) -> None:
+def test_a_contact_from_before_a_restart_does_not_begin_again(tmp_path: Path) -> None:
     first, told = Stored(tmp_path, Told()), Told()
     a, b = (first.game.api.spawn("runner", (x, 16.0, 1.0)) for x in (10.0, 10.0 - 0.625))
     first.tick(2)
@@ -103,7 +103,7 @@ def test_after_a_stop_the_game_goes_on(tmp_path: Path) -> None:
     again.stop()
 
 
-def test_who_does_not_come_back_after_a_restart_leaves(tmp_path: Path) -> None:
+def test_a_player_that_does_not_reconnect_after_a_restart_leaves(tmp_path: Path) -> None:
     first = Stored(tmp_path)
     link, _ = played(first)
     first.stop()
@@ -125,7 +125,7 @@ def test_a_new_world_begins_and_an_old_one_does_not_begin_again(tmp_path: Path) 
         table.stop()
 
 
-def test_notes_come_to_what_they_were_made_of() -> None:
+def test_notes_restore_the_state_that_they_were_made_of() -> None:
     notes: list[list[Any]] = [
         ["player", 1, "Ann", "ann@x", [b"1"]], ["said", 1, {"a": 1}], ["shared", {"x": 1}], ["answered", 1, 4, 0],
         ["player", 2, "", "", [b"2"]], ["answered", 1, 9, 2], ["said", 1, {"b": 2}], ["left", 2],

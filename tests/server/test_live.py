@@ -53,7 +53,7 @@ def top(world: World, x: int, y: int) -> tuple[int, int]:
     return 0, 0
 
 
-def test_who_is_where_and_what_they_are_called() -> None:
+def test_places_and_names_of_players() -> None:
     table = Table(resume_s=10.0)
     ann = table.connect(Hello(VERSION, {}, "<b>Ann", "secret-token"))
     table.connect(Hello(VERSION, {}, ""))
@@ -83,7 +83,7 @@ def test_who_is_where_and_what_they_are_called() -> None:
     assert ann.session.player.tokens[0].hex() not in text
 
 
-def test_what_is_shared_and_json_has_no_word_for_is_text() -> None:
+def test_shared_values_that_json_lacks_are_shown_as_text() -> None:
     table = Table()
     table.join()
     shares = {"time": 1.5, "seed": b"\x00", "odds": float("nan"), "of": [{"id": b"\x01"}], "teams": ["red"]}
@@ -98,7 +98,7 @@ def test_what_is_shared_and_json_has_no_word_for_is_text() -> None:
     assert told == {"time": 1.5, "seed": "b'\\x00'", "odds": "nan", "of": "[{'id': b'\\x01'}]", "teams": ["red"]}
 
 
-def test_one_answer_serves_all_who_look_for_an_eighth_of_a_second() -> None:
+def test_one_answer_serves_all_viewers_for_an_eighth_of_a_second() -> None:
     table = Table()
     table.join()
     answer = live(table).pages()["/live"]
@@ -110,7 +110,7 @@ def test_one_answer_serves_all_who_look_for_an_eighth_of_a_second() -> None:
     assert json.loads(answer().body)["figures"]["tick"] == table.tick_number
 
 
-def test_of_a_crowd_some_are_shown_and_all_players() -> None:
+def test_a_crowd_shows_all_players_and_a_sample_of_the_other_entities() -> None:
     table = Table(size=(10, 10, 1), fill=WIDE)
     table.join()
     world = table.game.world
@@ -186,7 +186,7 @@ def test_the_page_allows_its_own_script_and_style_and_nothing_else() -> None:
     assert not re.findall(r"//[\w.-]+\.\w|@import|\bsrc=|<link|url\(|innerHTML|outerHTML|insertAdjacent|\bstyle=", text)
 
 
-def test_it_is_for_those_who_may_see_figures_and_can_be_switched_off() -> None:
+def test_the_page_needs_access_to_figures_and_can_be_switched_off() -> None:
     def statuses(address: str, **flags: str) -> list[int]:
         server = Server(load(flags, {}), Table().game)
         asked = (Request("GET", path, "", None, upgrade=False) for path in ("/", "/live", "/live/0", "/live/1"))

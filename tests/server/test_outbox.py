@@ -34,7 +34,7 @@ def filled(*ticks: int, most: int = 100) -> Outbox:
     return outbox
 
 
-def test_an_event_goes_when_its_tick_is_known_and_none_overtakes_it() -> None:
+def test_an_event_is_sent_when_its_tick_is_known_and_in_order() -> None:
     outbox = filled(5, 5, 7, 9)
     assert taken(outbox, 4) == []
     assert taken(outbox, 6) == [5, 5]
@@ -43,7 +43,7 @@ def test_an_event_goes_when_its_tick_is_known_and_none_overtakes_it() -> None:
     assert not outbox.due
 
 
-def test_only_so_many_bytes_go_but_always_one_event() -> None:
+def test_the_bytes_of_events_are_limited_but_one_is_always_sent() -> None:
     outbox = filled(*range(10))
     size = len(happened(0))
     assert taken(outbox, 99, 2 * size) == [0, 1]
@@ -52,7 +52,7 @@ def test_only_so_many_bytes_go_but_always_one_event() -> None:
     assert taken(outbox, 99, 3 * size - 1) == [4, 5, 6]
 
 
-def test_the_oldest_of_too_many_are_dropped_and_the_next_ones_number_is_told() -> None:
+def test_the_oldest_of_too_many_are_dropped_and_the_next_number_is_sent() -> None:
     outbox = filled(*range(10), most=4)
     assert len(outbox) == 4
     assert taken(outbox, 0) == ["6"], "at once, although no event may be sent yet"
@@ -60,7 +60,7 @@ def test_the_oldest_of_too_many_are_dropped_and_the_next_ones_number_is_told() -
     assert outbox.add(10, happened(10), 4) is False
 
 
-def test_after_a_return_the_next_ones_number_is_told_once() -> None:
+def test_after_a_reconnect_the_next_number_is_sent_once() -> None:
     outbox = filled(1, 2, 3)
     assert taken(outbox, 2) == [1, 2]
     outbox.reconnect()

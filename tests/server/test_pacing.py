@@ -30,7 +30,7 @@ class Path:
         return now
 
 
-def test_of_an_unknown_path_two_snapshots_may_be_on_the_way() -> None:
+def test_two_snapshots_may_be_on_the_way_on_an_unknown_link() -> None:
     assert Path().window(100, 0.0) == LEAST_BYTES
     assert Path().window(4000, 0.0) == 8000
 
@@ -41,7 +41,7 @@ def test_the_rate_is_what_has_been_acknowledged() -> None:
     assert path.flow.rate == 320 / TICK_S
 
 
-def test_three_round_trips_of_the_rate_may_be_on_the_way_and_of_a_long_path_one_and_a_half() -> None:
+def test_three_round_trips_of_the_rate_may_be_on_the_way_or_one_and_a_half_on_a_long_link() -> None:
     for rtt_s, hold_s in ((0.1, 0.3), (0.2, 0.6), (0.3, HOLD_S_MAX), (1.0, 1.5)):
         path = Path()
         path.flow.answered(rtt_s, 0, 0.0)
@@ -64,7 +64,7 @@ def test_the_shortest_round_trip_counts() -> None:
     assert pacing.least_rtt_s == 0.05
 
 
-def test_of_a_full_path_the_width_is_no_distance() -> None:
+def test_a_full_link_does_not_count_as_a_long_one() -> None:
     path = Path()
     now = path.stream(2.0, 320) + SAMPLE_S
     path.outstanding = 10**6
@@ -114,7 +114,7 @@ def test_a_path_that_mostly_holds_snapshots_back_is_narrow_and_gets_small_ones_u
     assert path.window(1000, now) == wide
 
 
-def test_what_is_on_the_way_is_asked_only_where_that_decides_and_never_taken_for_less() -> None:
+def test_the_system_is_asked_only_if_that_decides_and_no_byte_is_missed() -> None:
     path = Path()
     path.window(100, 0.0)
     assert (path.asked, path.flow.outstanding) == (1, 0)
@@ -132,7 +132,7 @@ def test_what_is_on_the_way_is_asked_only_where_that_decides_and_never_taken_for
     assert (path.asked, path.flow.outstanding) == (3, 60)
 
 
-def test_where_the_system_cannot_tell_what_the_client_has_not_acknowledged_is_on_the_way() -> None:
+def test_without_the_system_unacknowledged_snapshots_are_on_the_way() -> None:
     path = Path(None)
     path.window(100, 0.0)
     for tick in range(100):  # a client that waits for terrain acknowledges nothing

@@ -30,7 +30,7 @@ def test_ready_or_the_reason() -> None:
 
 
 @pytest.mark.parametrize("figures", [lambda: {"x": object()}, lambda: 1 / 0])
-def test_a_page_that_fails_is_told_of_and_says_nothing_of_why(figures: object) -> None:
+def test_a_page_that_fails_is_reported_and_does_not_show_the_reason(figures: object) -> None:
     failed: list[str] = []
     pages = Pages(private={"/stats": json_page(figures)}, failed=failed.append)  # type: ignore[arg-type]
     page = pages.get("GET", "/stats", trusted=True)

@@ -45,7 +45,7 @@ def test_inputs_move_the_own_entity_and_no_other(table: Table) -> None:
     assert table.game.world.position(second.session.entity) == rest
 
 
-def test_an_input_of_one_who_has_left_moves_nobody(table: Table) -> None:
+def test_an_input_of_a_player_that_has_left_moves_nothing(table: Table) -> None:
     first = table.join()
     table.lose(first)
     first.say(Inputs(table.tick_number + 1, 0, EAST))
@@ -68,7 +68,7 @@ def test_a_held_key_goes_on_after_a_wall_is_gone() -> None:
     assert table.game.world.velocity(1)[0] > 0
 
 
-def test_a_teleport_across_segments_is_told_to_those_who_watch_either_end() -> None:
+def test_a_teleport_across_segments_reaches_clients_that_see_either_end() -> None:
     table = Table(fill=WIDE, size=(4, 1, 1), spawns=((10.0, 16.0, 1.0), (120.0, 16.0, 1.0), (14.0, 16.0, 1.0)))
     links = [table.join() for _ in range(3)]
     west, east = sorted(links[:2], key=lambda link: table.game.world.position(link.session.entity)[0])
@@ -81,7 +81,7 @@ def test_a_teleport_across_segments_is_told_to_those_who_watch_either_end() -> N
     assert traveller.session.entity in ids(east.got(Snapshot)[-1])
 
 
-def test_who_falls_out_of_the_world_comes_back(table: Table) -> None:
+def test_a_player_that_falls_out_of_the_world_returns(table: Table) -> None:
     link = table.join()
     table.game.world.place(link.session.entity, (16.0, 16.0, -3.0))
     table.tick(3)
@@ -89,7 +89,7 @@ def test_who_falls_out_of_the_world_comes_back(table: Table) -> None:
     assert table.game.counters.fell_out > 0
 
 
-def test_a_sleeper_is_told_to_whoever_comes_later(table: Table) -> None:
+def test_a_sleeper_is_sent_to_clients_that_join_later(table: Table) -> None:
     first = table.join()
     table.tick(100)
     assert not table.game.world.awake(first.session.entity)

@@ -79,7 +79,7 @@ def recorded(compiled: bool) -> Recorded:
     return Recorded(compiled)
 
 
-def test_what_nothing_happened_to_is_not_mentioned(recorded: Recorded) -> None:
+def test_unchanged_entities_are_not_sent(recorded: Recorded) -> None:
     recorded.world.spawn("box", (5, 5, 1))
     recorded.tick(3)
     assert recorded.changed(2) == set()
@@ -96,7 +96,7 @@ def test_a_keyframe_is_all_that_is_there_however_long_ago_it_moved(recorded: Rec
     assert recorded.part((2, 0, 0), KEYFRAME) == ([], [], [])
 
 
-def test_who_crosses_a_border_is_gone_here_and_there_whole(recorded: Recorded) -> None:
+def test_an_entity_that_crosses_a_border_is_gone_here_and_whole_there(recorded: Recorded) -> None:
     recorded.world.spawn("box", (31, 5, 1))
     recorded.tick()
     recorded.world.place(1, (33, 5, 1))
@@ -107,7 +107,7 @@ def test_who_crosses_a_border_is_gone_here_and_there_whole(recorded: Recorded) -
     assert recorded.log.segment(1) == EAST
 
 
-def test_who_came_back_is_not_gone(recorded: Recorded) -> None:
+def test_an_entity_that_came_back_is_not_gone(recorded: Recorded) -> None:
     recorded.world.spawn("box", (31, 5, 1))
     recorded.tick()
     for x in (33, 31):
@@ -138,7 +138,7 @@ def test_ids_are_not_used_again_but_rows_are(recorded: Recorded) -> None:
     assert recorded.part(HOME, 3) == ([2], [1], [])
 
 
-def test_an_edit_is_told_as_the_block_is_now(recorded: Recorded) -> None:
+def test_an_edit_is_sent_as_the_present_block(recorded: Recorded) -> None:
     at = 3 << 10 | 2 << 5 | 1
     for kind in (7, 0, 9):
         recorded.edit(1, 2, 3, kind)
@@ -146,7 +146,7 @@ def test_an_edit_is_told_as_the_block_is_now(recorded: Recorded) -> None:
     assert [recorded.part(HOME, since)[2] for since in (0, 1, 2, 3)] == [[(at, 9)]] * 3 + [[]]
 
 
-def test_an_edit_back_is_told_too(recorded: Recorded) -> None:
+def test_an_edit_back_is_sent_too(recorded: Recorded) -> None:
     recorded.edit(-1, 31, 31, 5)
     recorded.tick()
     recorded.edit(-1, 31, 31, 0)
@@ -155,7 +155,7 @@ def test_an_edit_back_is_told_too(recorded: Recorded) -> None:
     assert recorded.changed(1) == {WEST}
 
 
-def test_every_change_of_a_block_in_the_world_is_told(recorded: Recorded) -> None:
+def test_every_change_of_a_block_in_the_world_is_sent(recorded: Recorded) -> None:
     recorded.world.fill((1, 2, 3), (3, 3, 4), 7)
     recorded.world.write_blocks(WEST, [5], [9])
     recorded.tick()
@@ -164,7 +164,7 @@ def test_every_change_of_a_block_in_the_world_is_told(recorded: Recorded) -> Non
     assert recorded.part(WEST, 0)[2] == [(5, 9)]
 
 
-def test_an_edit_that_changes_nothing_is_not_told(recorded: Recorded) -> None:
+def test_an_edit_that_changes_nothing_is_not_sent(recorded: Recorded) -> None:
     recorded.edit(1, 2, 3, 7)
     recorded.tick()
     recorded.edit(1, 2, 3, 7)
@@ -172,7 +172,7 @@ def test_an_edit_that_changes_nothing_is_not_told(recorded: Recorded) -> None:
     assert recorded.changed(1) == set()
 
 
-def test_who_was_acted_upon_is_flagged_in_every_part_that_tells_of_it(recorded: Recorded) -> None:
+def test_an_entity_that_the_rules_acted_on_is_flagged_in_every_part_with_it(recorded: Recorded) -> None:
     for x in (5, 9):
         recorded.world.spawn("box", (x, 5, 1))
     recorded.tick()
@@ -191,7 +191,7 @@ def flags(recorded: Recorded, segment: Cell, since: int) -> dict[int, int]:
     return dict(zip(states[:, ID].tolist(), (states[:, FLAGS] & ~FALLING).tolist(), strict=True))
 
 
-def test_who_was_placed_is_flagged_as_such_and_who_was_thrown_or_changed_is_not(recorded: Recorded) -> None:
+def test_a_placed_entity_is_flagged_as_placed_and_a_thrown_or_changed_one_is_not(recorded: Recorded) -> None:
     for x in (5, 9, 13, 17):
         recorded.world.spawn("box", (x, 5, 1))
     recorded.tick()
@@ -209,7 +209,7 @@ def test_who_was_placed_is_flagged_as_such_and_who_was_thrown_or_changed_is_not(
     assert flags(recorded, HOME, 0) == {**acts, 4: 0, 5: 0}
 
 
-def test_who_was_placed_out_of_a_segment_is_flagged_in_the_other_and_in_its_keyframe_for_a_while(
+def test_an_entity_that_was_placed_out_of_a_segment_is_flagged_in_the_other_and_in_its_keyframe_for_a_while(
     recorded: Recorded,
 ) -> None:
     for x in (5, 40):
@@ -225,7 +225,7 @@ def test_who_was_placed_out_of_a_segment_is_flagged_in_the_other_and_in_its_keyf
     assert flags(recorded, EAST, KEYFRAME) == {1: 0, 2: 0}
 
 
-def test_whoever_places_an_entity_it_is_told() -> None:
+def test_each_placed_entity_is_noted_whatever_placed_it() -> None:
     game = Game(row_of_segments(), compiled=False)
     world, stage = game.world, game.api
     thing, pushed = stage.spawn("box", (5, 5, 1)), stage.spawn("box", (9, 5, 1))
@@ -268,7 +268,7 @@ def test_the_void_below_the_floor_has_parts_like_any_segment(recorded: Recorded)
     assert recorded.part(below, 20) == ([], [1], [])
 
 
-def test_one_encoding_serves_all_who_ask_for_the_same(recorded: Recorded) -> None:
+def test_one_encoding_serves_all_clients_with_the_same_tick(recorded: Recorded) -> None:
     recorded.world.spawn("box", (5, 5, 9))
     recorded.tick(2)
     assert recorded.log.since(1)[HOME] is recorded.log.since(1)[HOME]
@@ -280,7 +280,7 @@ def test_one_encoding_serves_all_who_ask_for_the_same(recorded: Recorded) -> Non
     assert unpack(after).reshape(SEGMENT, SEGMENT, SEGMENT)[1, 1, 1] == 1
 
 
-def test_what_is_seen_around_a_segment_is_joined_once_for_all_who_see_the_same(recorded: Recorded) -> None:
+def test_the_parts_of_one_view_are_joined_once_for_all_its_clients(recorded: Recorded) -> None:
     recorded.tick()
     for x in (3, 35):
         recorded.edit(x, 3, 9, 1)
@@ -462,7 +462,7 @@ class Stalling:
 
 
 @pytest.mark.parametrize("seed", range(6))
-def test_a_client_has_what_the_server_has_whatever_it_skipped_and_wherever_it_looked(seed: int) -> None:
+def test_a_client_equals_the_server_with_any_skips_and_any_interest(seed: int) -> None:
     recorded, checks = Stalling(seed), 0
     recorded.tick()
     for _ in range(400):

@@ -35,7 +35,7 @@ def heard(table: Table, link: FakeLink) -> None:
     link.say(Inputs(table.tick_number + 1, table.tick_number, bytes(3)))
 
 
-def test_who_comes_back_in_time_goes_on_as_before(table: Table) -> None:
+def test_a_player_that_reconnects_in_time_goes_on_as_before(table: Table) -> None:
     link = table.connect(Hello(messages.VERSION, {}, "Ann"))
     table.tick()
     me = link.session.entity
@@ -56,7 +56,7 @@ def test_who_comes_back_in_time_goes_on_as_before(table: Table) -> None:
     assert table.game.world.position(me)[1] > place[1]
 
 
-def test_who_comes_too_late_begins_anew(table: Table) -> None:
+def test_a_player_that_reconnects_too_late_joins_anew(table: Table) -> None:
     link = table.join()
     table.lose(link)
     table.tick(int(KEPT_S / table.tick_s) + 2)
@@ -88,7 +88,7 @@ def test_a_welcome_that_was_lost_on_its_way_costs_nothing(table: Table) -> None:
     assert back(table, first).session.entity == me
 
 
-def test_a_token_that_is_shown_uses_up_those_before_it(table: Table) -> None:
+def test_a_used_token_uses_up_the_ones_before_it(table: Table) -> None:
     """The client that shows it has read its welcome, even if it has not acknowledged a snapshot."""
     link = table.join()
     me, tokens = link.session.entity, [token(link)]
@@ -110,7 +110,7 @@ def test_a_guessed_token_is_worth_nothing(table: Table) -> None:
         assert back(table, guess).session.entity != link.got(Welcome)[0].entity
 
 
-def test_who_comes_back_before_the_loss_is_noticed_takes_over(table: Table) -> None:
+def test_a_reconnect_before_the_loss_is_noticed_takes_over(table: Table) -> None:
     link = table.join()
     me = link.session.entity
     again = back(table, token(link))
@@ -122,7 +122,7 @@ def test_who_comes_back_before_the_loss_is_noticed_takes_over(table: Table) -> N
 
 
 @pytest.mark.parametrize("said", [Bye(1000, "", -1.0), b"\xff"], ids=["goodbye", "a broken rule"])
-def test_who_leaves_for_good_frees_the_entity_at_once(table: Table, said: Bye | bytes) -> None:
+def test_a_player_that_leaves_frees_the_entity_at_once(table: Table, said: Bye | bytes) -> None:
     link = table.join()
     link.say(said)
     table.lose(link)
@@ -166,7 +166,7 @@ def test_only_the_latest_verdicts_are_kept(table: Table) -> None:
     assert list(player.settled) == list(range(10, SETTLED_MAX + 10))
 
 
-def test_who_was_never_heard_of_is_kept_for_a_moment_only() -> None:
+def test_a_player_without_an_acknowledgement_is_kept_for_a_moment_only() -> None:
     """Otherwise clients that join and disconnect again and again would fill the world with entities."""
     table = Table(resume_s=10.0)
     silent, known = table.join(), table.join()
@@ -181,7 +181,7 @@ def test_who_was_never_heard_of_is_kept_for_a_moment_only() -> None:
     assert list(table.game.players) == [known.session.entity]
 
 
-def test_who_comes_back_to_a_full_server_takes_over_the_own_place() -> None:
+def test_a_reconnect_to_a_full_server_takes_over_the_own_place() -> None:
     table = Table(Limits(clients_max=1), resume_s=10.0)
     link = table.join()
     heard(table, link)
@@ -191,7 +191,7 @@ def test_who_comes_back_to_a_full_server_takes_over_the_own_place() -> None:
     assert back(table, b"").refusal()[0] == messages.FULL
 
 
-def test_those_away_make_room_where_there_are_as_many_players_as_there_may_be() -> None:
+def test_reconnecting_players_make_room_on_a_full_server() -> None:
     table = Table(Limits(clients_max=3), resume_s=10.0)
     links = [table.join() for _ in range(3)]
     for link in (links[1], links[0]):

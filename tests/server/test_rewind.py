@@ -134,7 +134,7 @@ def test_between_two_snapshots_everybody_is_where_the_sdk_draws_them(seed: int, 
     assert looks > 15
 
 
-def test_until_its_tick_is_over_an_entity_that_is_placed_and_changed_is_what_and_where_it_was() -> None:
+def test_an_entity_that_is_placed_and_changed_is_as_before_until_its_tick_is_over() -> None:
     world, rewind = rewinding()
     thing = world.spawn("stone", (0, 0, 0))
     for _ in range(4):
@@ -152,7 +152,7 @@ def test_until_its_tick_is_over_an_entity_that_is_placed_and_changed_is_what_and
         assert past.box((12, 3, 0), (12.5, 3.5, 0.5)) == ([] if ids else [thing])
 
 
-def test_who_was_not_sent_some_ticks_saw_what_was_placed_in_them_at_the_end_of_the_gap() -> None:
+def test_a_client_saw_entities_that_were_placed_in_skipped_ticks_at_the_end_of_the_gap() -> None:
     world, rewind = rewinding(tick_rate=32)
     thing = world.spawn("stone", (0, 0, 0))
     for tick in range(1, 9):
@@ -295,7 +295,7 @@ def test_the_blocks_along_a_ray(origin: Vec, way: Vec, cells: list[Cell]) -> Non
         ((0, 0, 0), (1, 0, 0), 1e9, "length"),
     ],
 )
-def test_a_ray_that_is_none_is_refused_by_field(origin: Vec, way: Vec, length: float, field: str) -> None:
+def test_an_invalid_ray_is_refused_by_field(origin: Vec, way: Vec, length: float, field: str) -> None:
     past = rewinding()[1].at(0)
     with pytest.raises(SceneError, match=field):
         past.ray(origin, way, length)
@@ -328,7 +328,7 @@ def test_hits_are_nearest_first_up_to_the_first_block() -> None:
         past.box((0, 0, 0), (NAN, 0, 0))
 
 
-def test_what_is_not_loaded_stops_a_ray_and_the_void_does_not() -> None:
+def test_unloaded_segments_stop_a_ray_and_the_void_does_not() -> None:
     past = rewinding()[1].at(0)
     assert past.ray((0.5, 0.5, 3.5), (0, 1, 0), 99)[-1].block == (0, 32, 3)
     assert past.ray((31.5, 0.5, -3.5), (0, 0, -1), 99) == []
@@ -418,7 +418,7 @@ def test_at_200_ms_a_shot_at_what_is_drawn_hits_always_and_without_rewinding_har
     assert 0.19 < max(run.lags) <= 0.25
 
 
-def test_beyond_the_window_nobody_is_shot_where_they_were() -> None:
+def test_lag_compensation_ends_at_the_window() -> None:
     run = Range(0.6, 5)
     assert set(run.lags) == {WINDOW_S}
     assert run.rewound < 60

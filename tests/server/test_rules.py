@@ -78,7 +78,7 @@ def verdict(link: FakeLink, number: int) -> int:
     return int(found)
 
 
-def test_joining_and_leaving_are_told_while_the_entity_is_there(table: Table, rules: Told) -> None:
+def test_join_and_leave_hooks_run_while_the_entity_exists(table: Table, rules: Told) -> None:
     link = table.connect(Hello(messages.VERSION, {}, "Ann"))
     table.tick()
     table.lose(link)
@@ -115,7 +115,7 @@ def test_without_rules_a_command_is_not_possible() -> None:
     assert verdict(link, 1) == messages.INVALID
 
 
-def test_contact_is_told_once_when_it_begins(table: Table, rules: Told) -> None:
+def test_a_contact_is_reported_once_when_it_begins(table: Table, rules: Told) -> None:
     game = table.game.api
     table.tick()
     a, b = game.spawn("runner", (10.0, 16.0, 1.0)), game.spawn("runner", (12.0, 16.0, 1.0))
@@ -135,7 +135,7 @@ def test_contact_is_told_once_when_it_begins(table: Table, rules: Told) -> None:
     assert contacts[1][3] > begun + 10
 
 
-def test_a_contact_is_not_missed_in_a_tick_in_which_somebody_joins(table: Table, rules: Told) -> None:
+def test_a_contact_is_not_missed_in_a_tick_with_a_join(table: Table, rules: Told) -> None:
     game = table.game.api
     table.tick()
     a, b = game.spawn("runner", (10.0, 16.0, 1.0)), game.spawn("runner", (12.0, 16.0, 1.0))
@@ -146,7 +146,7 @@ def test_a_contact_is_not_missed_in_a_tick_in_which_somebody_joins(table: Table,
     assert [told[:3] for told in rules.told if told[0] == "contact"] == [("contact", a, b)]
 
 
-def test_who_touches_now_is_told_however_long_it_lasts(table: Table) -> None:
+def test_touching_returns_contacts_however_long_they_last(table: Table) -> None:
     game = table.game.api
     a, b, c = (game.spawn("runner", (x, 16.0, 1.0)) for x in (10.0, 11.0, 10.0 - 0.625))
     assert (game.touching(a), game.touching(b), game.touching(c)) == ([c], [], [a])
@@ -157,7 +157,7 @@ def test_who_touches_now_is_told_however_long_it_lasts(table: Table) -> None:
         game.touching(99)
 
 
-def test_who_falls_out_is_the_rules_affair_or_comes_back(table: Table, rules: Told) -> None:
+def test_an_entity_that_falls_out_is_handled_by_the_rules_or_returns(table: Table, rules: Told) -> None:
     link = table.join()
     table.game.world.place(link.session.entity, (16.0, 16.0, -3.0))
     table.tick(2)
@@ -165,7 +165,7 @@ def test_who_falls_out_is_the_rules_affair_or_comes_back(table: Table, rules: To
     assert table.game.world.position(1)[2] >= 1.0
 
 
-def test_what_is_said_of_an_entity_reaches_all_who_see_it_and_changes(table: Table) -> None:
+def test_attributes_reach_all_clients_that_see_the_entity_and_change(table: Table) -> None:
     early = table.connect(Hello(messages.VERSION, {}, "Ann"))
     table.tick()
     game = table.game.api
@@ -185,7 +185,7 @@ def test_what_is_said_of_an_entity_reaches_all_who_see_it_and_changes(table: Tab
     assert (game.get(npc, "hunger"), game.get(npc, "mood", "none")) == (0.5, "none")
 
 
-def test_who_comes_into_sight_brings_along_what_is_said_of_it() -> None:
+def test_an_entity_that_comes_into_view_brings_its_attributes() -> None:
     table = Table(size=(4, 1, 1), fill=[[0, 0, 0, 128, 32, 1, 1]], spawns=((16.0, 16.0, 1.0),))
     link = table.join()
     game = table.game.api
@@ -198,7 +198,7 @@ def test_who_comes_into_sight_brings_along_what_is_said_of_it() -> None:
 
 
 @pytest.mark.parametrize("wide", [False, True])
-def test_what_is_said_of_a_crowd_is_spread_over_messages_and_all_of_it_arrives(
+def test_attributes_of_a_crowd_are_spread_over_messages_and_all_arrive(
     wide: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     if wide:
@@ -221,7 +221,7 @@ def test_what_is_said_of_a_crowd_is_spread_over_messages_and_all_of_it_arrives(
     assert table.game.faults.total == 0
 
 
-def test_events_go_to_whom_they_are_for_once(table: Table) -> None:
+def test_events_reach_their_players_once(table: Table) -> None:
     ann, bob = table.join(), table.join()
     game = table.game.api
     game.send("all", {"n": 1})
@@ -236,7 +236,7 @@ def test_events_go_to_whom_they_are_for_once(table: Table) -> None:
     assert bob.got(Happened) == [Happened(tick, "all", msgpack.packb({"n": 1}))]
 
 
-def test_events_wait_for_who_is_slow_and_the_oldest_of_too_many_are_dropped_and_counted() -> None:
+def test_events_wait_for_a_slow_client_and_the_oldest_of_too_many_are_dropped_and_counted() -> None:
     table = Table(Limits(outbox_max=5), rules=Rules())
     link = table.join()
     link.waiting = 1 << 20
@@ -261,7 +261,7 @@ def test_events_wait_for_who_is_slow_and_the_oldest_of_too_many_are_dropped_and_
     assert table.game.counters.events_dropped == 2
 
 
-def test_what_is_said_to_who_is_away_goes_after_the_return_and_what_was_on_its_way_is_counted() -> None:
+def test_events_to_a_reconnecting_player_are_sent_after_the_reconnect_and_lost_ones_are_counted() -> None:
     table = Table(rules=Rules(), resume_s=9.0)
     link = table.join()
     link.say(Inputs(0, table.tick_number, b""))
@@ -282,7 +282,7 @@ def test_what_is_said_to_who_is_away_goes_after_the_return_and_what_was_on_its_w
     assert again.sent.index(NextHappened(1)) < again.sent.index(again.got(Happened)[0])
 
 
-def test_nothing_is_kept_for_a_player_inside_the_server() -> None:
+def test_no_events_are_kept_for_an_in_process_player() -> None:
     table = Table(rules=Rules())
     link = table.join()
     player = link.session.player
@@ -294,7 +294,7 @@ def test_nothing_is_kept_for_a_player_inside_the_server() -> None:
     assert not link.got(Happened)
 
 
-def test_shared_values_reach_all_also_who_comes_later(table: Table) -> None:
+def test_shared_values_reach_all_clients_and_later_ones(table: Table) -> None:
     early = table.join()
     game = table.game.api
     game.share("left_s", 60)
@@ -311,7 +311,7 @@ def test_shared_values_reach_all_also_who_comes_later(table: Table) -> None:
     assert dict(game.shared) == {"left_s": 59}
 
 
-def test_a_list_that_is_changed_in_place_is_told_when_it_is_said_again(table: Table) -> None:
+def test_a_list_that_is_changed_in_place_is_sent_when_it_is_set_again(table: Table) -> None:
     link, game = table.join(), table.game.api
     bag = ["key"]
     game.set(1, "bag", bag)
@@ -334,7 +334,7 @@ def test_a_list_that_is_changed_in_place_is_told_when_it_is_said_again(table: Ta
     assert game.get(1, "bag") == ["key", "lamp", "rope"]
 
 
-def test_what_is_equal_in_python_alone_is_told(table: Table) -> None:
+def test_values_that_only_python_holds_equal_are_sent(table: Table) -> None:
     link, game = table.join(), table.game.api
     for value in ([1], [True], [1.0], (1.0,)):
         game.share("value", value)
@@ -343,7 +343,7 @@ def test_what_is_equal_in_python_alone_is_told(table: Table) -> None:
     assert [(value, type(value[0])) for value in told] == [([1], int), ([True], bool), ([1.0], float)]
 
 
-def test_what_is_too_much_is_refused_by_name(table: Table) -> None:
+def test_too_long_values_are_refused_by_name(table: Table) -> None:
     game = table.game.api
     npc = game.spawn("runner", (10.0, 16.0, 1.0))
     for value, why in (("x" * 300, "bytes"), (object(), "MessagePack"), ({1: 2}, "MessagePack")):
@@ -368,7 +368,7 @@ def test_what_is_too_much_is_refused_by_name(table: Table) -> None:
     assert len(table.game.world) == before
 
 
-def test_players_are_not_the_rules_to_steer_or_remove(table: Table) -> None:
+def test_rules_cannot_steer_or_remove_players(table: Table) -> None:
     table.join()
     with pytest.raises(SceneError, match="player"):
         table.game.api.steer(1, 1, 0)
@@ -381,7 +381,7 @@ class Tidy(Rules):
         self.game.remove(player.entity)
 
 
-def test_rules_may_remove_who_leaves() -> None:
+def test_rules_may_remove_a_leaving_player() -> None:
     table = Table(rules=Tidy())
     first, second = table.join(), table.join()
     table.lose(first)
@@ -398,7 +398,7 @@ class Broken(Rules):
     on_leave = on_tick = on_start = on_command = on_contact = on_fell_out = can_edit = on_join  # type: ignore[assignment]
 
 
-def test_rules_that_raise_are_counted_and_told_and_stop_nobody(caplog: pytest.LogCaptureFixture) -> None:
+def test_rules_that_raise_are_counted_and_logged_and_stop_nothing(caplog: pytest.LogCaptureFixture) -> None:
     table = Table(rules=Broken())
     link = table.join()
     table.tick(10)

@@ -50,7 +50,7 @@ def test_each_input_is_used_in_its_tick_and_once() -> None:
     assert queue.used == 3
 
 
-def test_a_missing_input_is_the_last_one_ten_times_and_then_none() -> None:
+def test_a_missing_input_repeats_the_last_one_ten_times_and_then_is_neutral() -> None:
     queue = filed(1, EAST)
     taken = [queue.take(tick) for tick in range(1, 15)]
     assert taken == [EAST] * (1 + REPEATS_MAX) + [NEUTRAL] * 3
@@ -92,7 +92,7 @@ def test_a_first_input_that_is_late_ends_idleness() -> None:
 # -- what is refused -----------------------------------------------------------------------------------------
 
 
-def test_the_first_word_on_a_tick_counts() -> None:
+def test_the_first_input_for_a_tick_counts() -> None:
     queue = filed(1, EAST, EAST)
     queue.file(inputs(1, NORTH, NORTH, WEST), 0, 1.0)
     assert [queue.take(tick) for tick in (1, 2, 3)] == [EAST, EAST, WEST]
@@ -121,7 +121,7 @@ def test_all_that_may_be_ahead_fits_without_loss() -> None:
     assert [queue.take(8 + i) for i in range(AHEAD_MAX)] == wishes
 
 
-def test_a_wish_that_is_too_long_is_shortened_by_the_rule_of_both_sides() -> None:
+def test_a_direction_that_is_too_long_is_shortened_by_the_rule_of_both_sides() -> None:
     for input_ in (Input(127, 127, 1), Input(-128, 0, 0), Input(-128, -128, 255), Input(100, -100, 2)):
         queue = filed(1, input_)
         assert queue.take(1) == clamp(input_) != input_
@@ -146,7 +146,7 @@ def test_inputs_that_have_not_been_used_can_be_withdrawn_and_sent_anew() -> None
     assert list(margins(queue)) == [1, 2, 3, 4, 5]
 
 
-def test_what_has_been_used_stays_used() -> None:
+def test_used_inputs_stay_used() -> None:
     queue = filed(1, EAST, EAST, EAST)
     assert [queue.take(tick) for tick in (1, 2)] == [EAST, EAST]
     queue.restart(1)
@@ -219,7 +219,7 @@ def test_margins_count_off_across_gaps_and_refusals() -> None:
     assert max(told) == queue.newest == AHEAD_MAX + 3
 
 
-def test_what_was_told_is_not_told_again_and_counting_goes_on() -> None:
+def test_feedback_is_sent_once_and_counting_goes_on() -> None:
     queue = filed(1, EAST)
     queue.take(1)
     queue.take_feedback()
@@ -238,7 +238,7 @@ MESSAGES = st.tuples(
 
 
 @given(st.lists(st.tuples(st.lists(MESSAGES, max_size=3), st.booleans()), max_size=80))
-def test_every_input_of_any_client_has_one_fate_and_memory_is_bounded(
+def test_every_input_of_any_client_has_one_status_and_memory_is_bounded(
     ticks: list[tuple[list[tuple[int, int]], bool]],
 ) -> None:
     queue, sent, told = InputQueue(), 0, 0

@@ -34,7 +34,7 @@ def test_defaults() -> None:
     assert sum(map(len, SECTIONS.values())) == len(KINDS), "a name has one meaning in all sources"
 
 
-def test_the_settings_tell_which_kernel_runs(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_settings_name_the_kernel_that_runs(monkeypatch: pytest.MonkeyPatch) -> None:
     printed = parse(["--print-config"], {})
     assert f'kernel = "auto"  # default; runs: {kernels.describe("auto")}\n' in str(printed)
     printed = parse(["--print-config"], {"SOVEREIGN_KERNEL": "plain"})
@@ -228,7 +228,7 @@ def test_any_value_of_a_file_is_a_setting_or_an_error_that_names_it(name: str, v
 
 
 @pytest.mark.parametrize("host", ["0.0.0.0", "::", "192.168.1.1", "play.example"])
-def test_who_may_play_is_said_where_others_can_reach_it(host: str) -> None:
+def test_a_reachable_server_needs_a_choice_of_who_may_play(host: str) -> None:
     with pytest.raises(SettingsError, match="say who may play"):
         parse(["--host", host], {})
     assert settings(["--host", host, "--auth", "none"]).auth == "none"
@@ -249,7 +249,7 @@ def test_anyone_may_play_where_only_this_machine_is(host: str) -> None:
         (["--tls-key", "k"], "tls_key (from --tls-key): needs tls_cert as well"),
     ],
 )
-def test_what_only_makes_sense_together(arguments: list[str], message: str) -> None:
+def test_settings_that_need_each_other(arguments: list[str], message: str) -> None:
     with pytest.raises(SettingsError) as error:
         parse(arguments, {})
     assert str(error.value) == message

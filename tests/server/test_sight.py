@@ -55,7 +55,7 @@ def take(sight: ClientView, log: Log, tick: int, room: int) -> list[Cell]:
     return taken
 
 
-def test_known_is_the_tick_up_to_which_all_that_was_in_sight_has_been_sent() -> None:
+def test_known_is_the_tick_up_to_which_every_seen_segment_has_been_sent() -> None:
     sight, log = looking(), Log(dict.fromkeys(ROW, 10))
     assert sight.known == -2
     assert take(sight, log, 5, 20) == [OWN, NEAR]
@@ -69,7 +69,7 @@ def test_known_is_the_tick_up_to_which_all_that_was_in_sight_has_been_sent() -> 
     assert sight.known == 9
 
 
-def test_what_comes_into_sight_later_was_not_in_sight_before() -> None:
+def test_a_segment_that_comes_into_view_limits_known_from_then_on() -> None:
     sight, log = ClientView(), Log(dict.fromkeys(ROW, 10))
     sight.move((OWN,), 2, 4)
     take(sight, log, 5, 100)
@@ -102,7 +102,7 @@ def test_the_own_segment_always_goes_and_one_more_however_little_room_there_is()
     assert others == {NEAR, FAR}
 
 
-def test_what_waits_is_caught_up_with_from_where_it_was_and_nobody_starves() -> None:
+def test_a_waiting_segment_is_sent_since_its_last_tick_and_none_starves() -> None:
     sight, log = looking(), Log(dict.fromkeys(ROW, 10))
     take(sight, log, 1, 100)
     latest = dict.fromkeys(ROW, 1)
@@ -127,7 +127,7 @@ def test_a_part_is_asked_for_since_the_tick_it_was_sent_last() -> None:
 
 
 @pytest.mark.parametrize("ticks", [HISTORY, HISTORY + 1])
-def test_who_is_too_far_behind_has_lost_track(ticks: int) -> None:
+def test_a_client_that_is_too_far_behind_has_lost_track(ticks: int) -> None:
     sight, log = looking(), Log(dict.fromkeys(ROW, 10))
     take(sight, log, 1, 100)
     assert sight.lost_track(1 + ticks, HISTORY) == (ticks > HISTORY)
@@ -137,7 +137,7 @@ def test_who_is_too_far_behind_has_lost_track(ticks: int) -> None:
     assert {since for _, since in log.asked} == {KEYFRAME}
 
 
-def test_only_what_was_sent_and_is_seen_no_more_is_dropped() -> None:
+def test_only_sent_segments_that_are_no_longer_seen_are_dropped() -> None:
     sight, log = looking(), Log(dict.fromkeys(ROW, 10))
     take(sight, log, 1, 10)  # the client knows its own segment and one more
     sight.move(((20, 0, 0),), 2)

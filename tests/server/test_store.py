@@ -141,7 +141,7 @@ def test_notes_come_back_since_the_checkpoint_each_with_its_tick(opened: Callabl
     assert again.kept is None
 
 
-def test_what_a_restart_changes_is_in_the_log(opened: Callable[..., Store], tmp_path: Path) -> None:
+def test_changes_by_a_restart_are_in_the_log(opened: Callable[..., Store], tmp_path: Path) -> None:
     store = opened()
     ghost = store.world.spawn("box", (0, 0, 0))
     store.world.step()
@@ -219,7 +219,7 @@ def altered(directory: Path, *statements: str) -> None:
             connection.execute(statement)
 
 
-def test_what_cannot_be_used_is_refused_and_left_as_it_is(opened: Callable[..., Store], tmp_path: Path) -> None:
+def test_an_unusable_directory_is_refused_and_left_as_it_is(opened: Callable[..., Store], tmp_path: Path) -> None:
     store = opened()
     play(store, 60, random.Random(1))
     good = crashed(store, tmp_path)
@@ -270,7 +270,7 @@ def test_what_cannot_be_used_is_refused_and_left_as_it_is(opened: Callable[..., 
     assert opened(good).world.tick == 60
 
 
-def test_a_replay_that_comes_out_otherwise_says_what_to_do(
+def test_a_replay_with_another_result_says_what_to_do(
     opened: Callable[..., Store], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     store = opened()

@@ -179,7 +179,7 @@ def test_only_a_power_cut_without_fsync_may_cost_the_end(
         assert "the machine was restarted since" in caplog.text
 
 
-def test_a_system_that_does_not_tell_of_its_start_is_trusted_less(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_system_that_does_not_report_its_boot_is_trusted_less(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(mark, "boot", lambda: mark.UNKNOWN)
     assert mark.Mark(1, 1, 1, True, mark.UNKNOWN).binding
     assert not mark.Mark(1, 1, 1, False, mark.UNKNOWN).binding

@@ -184,7 +184,7 @@ def into_trouble(store: Store, disk: Disk, rng: random.Random, error: Exception 
 @pytest.mark.parametrize(
     ("error", "said"), [(FULL, "database or disk is full"), (RuntimeError("a bug"), "internal error")]
 )
-def test_no_room_is_told_and_made_up_for_once_there_is_some(
+def test_a_full_disk_is_reported_and_made_up_for_once_there_is_room(
     disk: Disk, store: Store, tmp_path: Path, caplog: pytest.LogCaptureFixture, error: Exception, said: str
 ) -> None:
     rng = random.Random(1)

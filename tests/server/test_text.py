@@ -59,7 +59,7 @@ def test_a_key_of_any_bytes_is_one() -> None:
 
 
 @pytest.mark.parametrize("bad", [*BAD, None, 7, b"ann", "a" * 65, ["ann"]])
-def test_what_a_check_of_ones_own_returns(bad: Any) -> None:
+def test_the_subject_that_a_games_own_check_returns(bad: Any) -> None:
     table = Table()
     table.game.joining.authenticate = lambda token: bad
     code, reason = table.connect(Hello(messages.VERSION, {}, "Ann", "x")).refusal()
@@ -69,7 +69,7 @@ def test_what_a_check_of_ones_own_returns(bad: Any) -> None:
     assert (table.game.players, len(table.game.world), table.game.sessions[1:]) == ({}, 0, [])
 
 
-def test_a_check_of_ones_own_that_fails_costs_its_client_alone() -> None:
+def test_a_games_own_check_that_fails_costs_its_client_alone() -> None:
     table = Table()
     table.game.joining.authenticate = lambda token: {"ann": "Ann"}[token]
     bad, good = (table.connect(Hello(messages.VERSION, {}, "", said)) for said in ("bob", "ann"))
@@ -80,7 +80,7 @@ def test_a_check_of_ones_own_that_fails_costs_its_client_alone() -> None:
 
 
 @pytest.mark.parametrize("bad", BAD)
-def test_the_reason_of_a_refusal_is_told_as_far_as_it_can_be(bad: str) -> None:
+def test_the_reason_of_a_refusal_is_sent_as_far_as_utf8_allows(bad: str) -> None:
     def check(token: str) -> str:
         raise AuthError(f"{bad} is not known")
 
@@ -126,7 +126,7 @@ def test_names_and_tokens_of_clients(bad: Any) -> None:
 
 
 @pytest.mark.parametrize("bad", BAD)
-def test_what_a_client_asks_for(bad: str) -> None:
+def test_texts_in_commands_of_a_client(bad: str) -> None:
     loopback = Loopback(Game(load_scene("flat"), compiled=False))
     client = loopback.join("Ann")
     frame = 0
@@ -160,7 +160,7 @@ def acts(game: GameApi, bad: str) -> list[Callable[[], Any]]:
 
 
 @pytest.mark.parametrize("bad", BAD)
-def test_what_rules_say(tmp_path: Path, bad: str) -> None:
+def test_texts_of_the_rules(tmp_path: Path, bad: str) -> None:
     table = Stored(tmp_path)
     link = table.join()
     game = table.game.api

@@ -71,7 +71,7 @@ GOOD = {"sub": "ann", "exp": NOW + 60}
         (signed("ann"), "the token is not a JWT"),
     ],
 )
-def test_who_is_not_let_in_is_told_why(token: str, reason: str) -> None:
+def test_a_refused_client_gets_the_reason(token: str, reason: str) -> None:
     with pytest.raises(AuthError) as error:
         check(token)
     assert str(error.value) == reason
@@ -79,7 +79,7 @@ def test_who_is_not_let_in_is_told_why(token: str, reason: str) -> None:
     assert len(token) < 8 or token not in repr(error.value)
 
 
-def test_nested_beyond_all_measure_is_no_token() -> None:
+def test_a_deeply_nested_token_is_refused() -> None:
     deep = base64.urlsafe_b64encode(b'{"alg":' + b"[" * 5000).rstrip(b"=").decode()
     for token in (f"{deep}.e30.AAAA", jwt.PyJWS().encode(b"[" * 100_000, KEY, "HS256")):
         with pytest.raises(AuthError, match="the token is not a JWT"):

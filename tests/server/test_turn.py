@@ -95,7 +95,7 @@ def test_prepare_must_return_a_scene(returned: Any) -> None:
             enter()
 
 
-def test_what_prepare_raises_is_told_with_its_name() -> None:
+def test_an_exception_in_prepare_is_reported_with_its_name() -> None:
     def prepare(self: Rules, scene: Scene) -> Scene:
         self.game.spawn("player", (0, 0, 0))
         return scene
@@ -164,7 +164,7 @@ def behind(decorated: Callable[..., Any]) -> Callable[..., Any]:
 
 
 @pytest.mark.parametrize("method", [waits, yields, yields_and_waits])
-def test_a_hook_that_returns_something_to_be_run_has_failed(method: Any, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_hook_that_returns_a_coroutine_or_generator_has_failed(method: Any, caplog: pytest.LogCaptureFixture) -> None:
     table = Table(rules=made(on_tick=behind(method)))
     table.tick(3)
     assert table.game.counters.rules_failed == 3
@@ -174,7 +174,7 @@ def test_a_hook_that_returns_something_to_be_run_has_failed(method: Any, caplog:
 @pytest.mark.parametrize(
     ("answer", "allowed"), [(None, False), (0, False), (False, False), (True, True), ("yes", True)]
 )
-def test_an_edit_is_allowed_by_what_is_true(answer: Any, allowed: bool, caplog: pytest.LogCaptureFixture) -> None:
+def test_an_edit_is_allowed_by_any_true_value(answer: Any, allowed: bool, caplog: pytest.LogCaptureFixture) -> None:
     table = Table(rules=made(can_edit=lambda self, *_: answer))
     link = table.join()
     table.tick(64)
@@ -280,7 +280,7 @@ async def test_hooks_may_change_the_game_within_an_event_loop() -> None:
 
 @pytest.mark.parametrize("name", ACTS)
 @pytest.mark.parametrize("elsewhere", [in_a_thread, in_a_callback, lambda act: act() and ""])
-def test_what_comes_by_soon_happens_in_the_next_tick(name: str, elsewhere: Callable[[Any], str]) -> None:
+def test_a_call_by_soon_happens_in_the_next_tick(name: str, elsewhere: Callable[[Any], str]) -> None:
     made_elsewhere, made_here = Played(), Played()
     elsewhere(lambda: made_elsewhere.api.soon(ACTS[name], made_elsewhere))
     before = marks(made_elsewhere)
@@ -293,7 +293,7 @@ def test_what_comes_by_soon_happens_in_the_next_tick(name: str, elsewhere: Calla
     assert made_elsewhere.game.counters.rules_failed == 0
 
 
-def test_soon_keeps_the_order_takes_arguments_and_leaves_what_is_added_for_the_tick_after() -> None:
+def test_soon_keeps_the_order_takes_arguments_and_defers_calls_added_meanwhile() -> None:
     table = Table()
     stage, said = table.game.api, []
 
@@ -332,7 +332,7 @@ def test_soon_comes_after_the_start_and_ahead_of_the_other_hooks() -> None:
     assert rules.said == ["start", "soon", "join", "tick"]
 
 
-def test_what_fails_soon_is_counted_and_stops_nobody(caplog: pytest.LogCaptureFixture) -> None:
+def test_a_failing_call_by_soon_is_counted_and_stops_nothing(caplog: pytest.LogCaptureFixture) -> None:
     table = Table()
 
     def fails() -> None:
@@ -347,7 +347,7 @@ def test_what_fails_soon_is_counted_and_stops_nobody(caplog: pytest.LogCaptureFi
 
 
 @pytest.mark.parametrize("bad", [None, 5, "f", waits, yields, functools.partial(waits)])
-def test_what_cannot_be_called_soon_is_named_at_once(bad: Any) -> None:
+def test_a_value_that_cannot_be_called_is_refused_by_soon_at_once(bad: Any) -> None:
     table = Table()
     with pytest.raises(RulesError, match=r"^soon: act"):
         table.game.api.soon(bad)
@@ -385,7 +385,7 @@ def test_many_threads_at_once_lose_nothing() -> None:
         assert [turn for one, turn in seen if one == number] == list(range(200))
 
 
-def test_what_comes_by_soon_is_saved_as_all_else(tmp_path: Any) -> None:
+def test_calls_by_soon_are_saved_like_all_others(tmp_path: Any) -> None:
     table = Stored(tmp_path)
     stage = table.game.api
     in_a_thread(lambda: stage.soon(stage.spawn, "stone", (8, 8, 1)))

@@ -11,7 +11,7 @@ from shared.scene import load_scene
 from shared.world import World
 
 
-def test_that_something_is_compiled_is_told_once_and_only_then(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_compiling_is_announced_once_and_only_if_it_happens(monkeypatch: pytest.MonkeyPatch) -> None:
     numba = pytest.importorskip("numba")
     monkeypatch.setenv(kernels.VARIABLE, kernels.NUMBA)
     one, other = numba.njit(lambda: 1), numba.njit(lambda: 2)

@@ -62,7 +62,7 @@ def watch(ears: Ears) -> Iterator[Callable[..., Watchdog]]:
 Watch = Callable[..., Watchdog]
 
 
-async def test_a_stalled_loop_is_told_of_with_its_stack_and_so_is_its_end(ears: Ears, watch: Watch) -> None:
+async def test_a_stalled_loop_is_logged_with_its_stack_and_so_is_its_end(ears: Ears, watch: Watch) -> None:
     watchdog = watch(stall_s=STALL_S, beat_s=STALL_S / 4)
 
     def this_holds_up_the_loop() -> dict[str, Any]:
@@ -107,7 +107,7 @@ async def test_a_loop_that_has_its_turns_is_left_alone(ears: Ears, watch: Watch)
         (2.9, "code that held the interpreter has stalled the event loop"),
     ],
 )
-async def test_where_the_thread_had_no_turn_either_cpu_time_tells_why(
+async def test_cpu_time_distinguishes_a_held_interpreter_from_a_suspended_process(
     ears: Ears, watch: Watch, cpu_s: float, said: str
 ) -> None:
     watch(stall_s=60.0)._log_asleep(3.0, cpu_s)

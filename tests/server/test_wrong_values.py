@@ -136,7 +136,7 @@ def test_an_entity_that_is_not_there_is_named(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", [*BY_ENTITY, "get"])
-def test_what_is_no_number_of_an_entity_is_named(name: str) -> None:
+def test_a_value_that_is_no_entity_number_is_named(name: str) -> None:
     reads: Act = lambda g, e: g.get(e, "mood")  # noqa: E731
     act = BY_ENTITY.get(name, reads)
     for bad in [*ENTITY, 0, -1, 1 << 31]:

@@ -44,7 +44,7 @@ def changed(states: Int64s, rng: random.Random) -> Int64s:
 
 
 @pytest.mark.parametrize("seed", range(8))
-def test_alike_are_those_whose_rows_that_count_are_equal(seed: int, compiled: bool) -> None:
+def test_states_are_alike_if_the_rows_that_count_are_equal(seed: int, compiled: bool) -> None:
     rng = random.Random(seed)
     kernel = kernels.get(compiled)
     found = set()

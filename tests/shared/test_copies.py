@@ -156,7 +156,7 @@ def test_a_state_with_the_bookkeeping_flag_is_still_woken(compiled: bool) -> Non
     assert other.falling(entity)
 
 
-def test_removed_and_told_again_in_one_tick(compiled: bool) -> None:
+def test_an_entity_removed_and_written_again_in_one_tick(compiled: bool) -> None:
     world = build([floor()], compiled=compiled)
     entity = world.spawn("box", (0, 0, 5))
     state = world.state(entity)
@@ -193,7 +193,7 @@ def test_rows_used_again_keep_the_order_of_ids(compiled: bool) -> None:
     assert results[0][0][0] == 33 / 64 - 5 / 8
 
 
-def test_an_entity_at_the_edge_of_what_is_loaded_is_no_ghost(compiled: bool) -> None:
+def test_an_entity_at_the_edge_of_the_loaded_world_exists_fully(compiled: bool) -> None:
     """The position is the first place that is not loaded, on the high face of the box. The entity still stops others,
     is found and is woken."""
     templates = (*TEMPLATES, Template("west of it", (0, 0, 0), (-1, 1, 1), walk_speed=3))
@@ -226,7 +226,7 @@ def test_entities_meet_in_the_void(compiled: bool) -> None:
     assert world.position(upper)[2] >= world.position(lower)[2] + 7 / 4
 
 
-def test_a_wish_beyond_the_range_is_the_fastest(compiled: bool) -> None:
+def test_a_direction_beyond_the_range_is_full_speed(compiled: bool) -> None:
     world = build([floor()], compiled=compiled)
     entity = world.spawn("box", (0, 0, 0))
     world.step({entity: Input(10_000, -(10**9))})

@@ -92,7 +92,7 @@ def crowd(made: Scene, n: int, rng: random.Random, compiled: bool) -> World:
         product(["hills", "arena", "topdown"], [20, 32], ["mean", "semi"]),
     ),
 )
-def test_a_crowd_that_is_told_of_is_the_crowd(name: str, rate: int, integrator: str, compiled: bool) -> None:
+def test_a_crowd_that_is_sent_equals_the_crowd(name: str, rate: int, integrator: str, compiled: bool) -> None:
     """Entities meet walls, steps and each other; blocks come and go; entities are thrown and placed. Every bit agrees
     in every tick."""
     rng = random.Random(f"{name} {rate}")
@@ -146,7 +146,7 @@ def events(world: World, entity: int) -> int:
     return int(row[CHANGED]) & (1 << EVENT_BITS) - 1 if row[CHANGED] >> EVENT_BITS == world.tick else 0
 
 
-def test_each_thing_that_happens_is_told_once(compiled: bool) -> None:
+def test_each_event_of_an_entity_is_sent_once(compiled: bool) -> None:
     """The entity walks against a wall, jumps over it and falls off the far edge."""
     world = build([floor(0, 8), [3, -9, 0, 4, 9, 1, 1]], compiled=compiled)
     me = world.spawn("box", (0, 0, 0))
@@ -186,7 +186,7 @@ def test_holding_a_course_costs_nothing(compiled: bool) -> None:
 
 
 @pytest.mark.parametrize("n", [0, 1, 2, 40, 1500])
-def test_news_are_packed_in_the_order_of_ids_segment_by_segment(n: int, compiled: bool) -> None:
+def test_changes_are_packed_in_the_order_of_ids_segment_by_segment(n: int, compiled: bool) -> None:
     rng = np.random.default_rng(n)
     matrix = np.zeros((n + 50, len(COLUMNS)), np.int64)
     rows = rng.permutation(n + 50)[:n]
@@ -238,7 +238,7 @@ def turn(entity: int, what: int, *rest: int) -> list[int]:
     return [entity, what, *rest, *[0] * (6 - len(rest))]
 
 
-def test_a_turn_of_nobody_is_told_and_the_others_have_theirs(compiled: bool) -> None:
+def test_a_turn_of_an_unknown_entity_is_reported_and_the_others_apply(compiled: bool) -> None:
     """The rows ascend by id or not. Unknown ids include one whose row is free again, and id 0, which free rows have."""
     world = build(compiled=compiled)
     for entity in (9, 3, 5):
@@ -254,9 +254,7 @@ def test_a_turn_of_nobody_is_told_and_the_others_have_theirs(compiled: bool) -> 
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_whatever_is_told_an_entity_stays_in_its_segment_and_the_kernel_in_its_tables(
-    seed: int, compiled: bool
-) -> None:
+def test_with_any_turns_an_entity_stays_in_its_segment_and_the_kernel_in_its_tables(seed: int, compiled: bool) -> None:
     rng = random.Random(seed)
     world = build(compiled=compiled)
     for i in range(8):

@@ -9,11 +9,11 @@ from shared.inputs import JUMP, MOVE_MAX, NEUTRAL, Input, clamp, make_input, row
 BYTES = range(-128, 128)
 
 
-def test_no_wish_is_to_stand_still() -> None:
+def test_no_direction_is_to_stand_still() -> None:
     assert Input(0, 0, 0) == NEUTRAL == make_input()
 
 
-def test_every_wish_that_fits_into_its_record_comes_out_no_longer_than_full_speed() -> None:
+def test_every_clamped_direction_is_at_most_full_speed() -> None:
     for x in BYTES:
         for y in range(-128, 128, 5):
             short = clamp(Input(x, y, 3))
@@ -35,7 +35,7 @@ def test_clamping_twice_is_clamping_once() -> None:
             assert clamp(once) == once
 
 
-def test_a_long_wish_keeps_its_direction_and_is_as_long_as_whole_numbers_allow() -> None:
+def test_a_long_direction_keeps_its_angle_and_is_as_long_as_whole_numbers_allow() -> None:
     for x in BYTES:
         for y in range(-128, 128, 7):
             square = x * x + y * y
@@ -47,7 +47,7 @@ def test_a_long_wish_keeps_its_direction_and_is_as_long_as_whole_numbers_allow()
                 assert short * short * square <= (MOVE_MAX * long) ** 2 < (abs(short) + 1) ** 2 * square
 
 
-def test_mirrored_wishes_stay_mirrored() -> None:
+def test_mirrored_directions_stay_mirrored() -> None:
     for x in range(129):
         for y in range(0, 129, 3):
             short = clamp(Input(x, y))

@@ -102,7 +102,7 @@ def test_a_snapshot_joined_from_encoded_segments_is_the_snapshot(segments: int) 
     assert decode_from_server(join_snapshot(message[:7], segments, msgpack.packb(PART) * segments)) == message
 
 
-def test_each_side_refuses_what_only_it_may_say() -> None:
+def test_each_side_refuses_messages_that_only_it_may_send() -> None:
     for message in FROM_CLIENT:
         if not isinstance(message, Bye):
             assert_refused(encode(message), server=True)

@@ -162,7 +162,7 @@ def test_places_outside_of_the_range_are_refused(compiled: bool) -> None:
         world.spawn("box", (RANGE_BLOCKS, 0, 0))
 
 
-def test_nobody_there(compiled: bool) -> None:
+def test_an_entity_that_does_not_exist_is_refused(compiled: bool) -> None:
     world = build([floor()], compiled=compiled)
     for call in (
         lambda: world.place(1, (0, 0, 0)),

@@ -135,7 +135,7 @@ def solid_overlaps(world: World) -> set[tuple[object, object]]:
 
 @some
 @given(play=plays)
-def test_nobody_ends_inside_of_what_he_was_not_in_before(compiled: bool, play: Play) -> None:
+def test_no_entity_enters_an_obstacle(compiled: bool, play: Play) -> None:
     world = stage(play, compiled)
     assert solid_overlaps(world) == set()
     inside: set[tuple[object, object]] = set()

@@ -101,7 +101,7 @@ def example(kind: type[Any]) -> Any:
     return next(found for side, text in blocks("wire") if isinstance(found := message(text, side), kind))
 
 
-def test_the_snapshot_is_what_is_said_of_it() -> None:
+def test_the_snapshot_example_is_as_described() -> None:
     snapshot = example(Snapshot)
     assert (np.frombuffer(snapshot.margins, "<i2") / bounds(32).margin_one).tolist() == [2.5, -0.25, 2.0]
     assert snapshot.newest == 1021
@@ -122,7 +122,7 @@ def test_the_snapshot_is_what_is_said_of_it() -> None:
     assert (x, y, z, states[0, 6] / 2**16) == (259.5, 252.25, 12.0, 3.0)
 
 
-def test_the_terrain_is_what_is_said_of_it() -> None:
+def test_the_terrain_example_is_as_described() -> None:
     kinds = unpack(example(messages.Terrain).chunk)
     ((_, text),) = blocks("terrain")
     told = {int(at): int(kind) for at, kind in re.findall(r"byte (\d+) is (\d+)\n", text)}

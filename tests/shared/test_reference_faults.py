@@ -242,7 +242,7 @@ def test_blocks_removed_and_placed_in_every_segment_are_seen(compiled: bool) -> 
             assert world.position(entity)[2] == -2
 
 
-def test_nobody_collides_with_himself(compiled: bool) -> None:
+def test_an_entity_does_not_collide_with_itself(compiled: bool) -> None:
     world = build([floor()], compiled=compiled)
     entity = world.spawn("box", (0, 0, 0))
     world.place(entity, (0.25, 0, 0.25))
@@ -268,7 +268,7 @@ def test_a_box_that_is_gone_is_no_obstacle(compiled: bool, how: str) -> None:
     assert world.velocity(entity) == (3, 0, 0)
 
 
-def test_an_input_for_somebody_who_is_gone_changes_nothing(compiled: bool) -> None:
+def test_an_input_for_a_removed_entity_changes_nothing(compiled: bool) -> None:
     world = build([floor()], compiled=compiled)
     gone, here = world.spawn("box", (0, 0, 0)), world.spawn("box", (5, 0, 0))
     world.remove(gone)

@@ -137,7 +137,7 @@ def test_rounding_is_away_from_zero_at_halves() -> None:
 @pytest.mark.parametrize(
     ("x", "y"), [(127, 127), (-127, 127), (1000, 1), (127, 1), (89, 91), (10**9, -(10**9)), (0, 200)]
 )
-def test_a_wish_is_shortened_to_a_length_of_127(x: int, y: int) -> None:
+def test_a_direction_is_shortened_to_a_length_of_127(x: int, y: int) -> None:
     """The result is never longer, and shorter by less than one in each part; it is symmetric in all four quadrants."""
     short = clamp(Input(x, y, 5))
     assert short.buttons == 5
@@ -147,7 +147,7 @@ def test_a_wish_is_shortened_to_a_length_of_127(x: int, y: int) -> None:
     assert clamp(short) == short
 
 
-def test_a_wish_within_the_range_is_left_alone() -> None:
+def test_a_direction_within_the_range_is_left_alone() -> None:
     for input_ in (Input(127, 0), Input(-3, 4, 1), Input(89, 90), Input()):
         assert clamp(input_) == input_
     assert make_input(1, 1) == clamp(Input(127, 127))

@@ -140,14 +140,14 @@ def test_bookkeeping_of_a_process_does_not_travel() -> None:
     assert parts[0].entities == 1
 
 
-def test_who_was_acted_upon_is_flagged_and_nobody_else() -> None:
+def test_only_entities_that_the_rules_acted_on_are_flagged() -> None:
     rows = np.array([state_in((0, 0, 0), 1, 0, 0, entity) for entity in (3, 5, 8)], np.int64)
     _, decoded, _ = decode_parts([msgpack.unpackb(encode_part((0, 0, 0), 0, rows, acted={5, 9}))], 255)
     assert [flags & ACTED for flags in decoded[:, FLAGS].tolist()] == [0, ACTED, 0]
     assert (decoded[:, FLAGS] & FALLING).tolist() == [1, 1, 1]
 
 
-def test_who_was_placed_is_flagged_as_acted_upon_too() -> None:
+def test_a_placed_entity_is_flagged_as_acted_upon_too() -> None:
     rows = np.array([state_in((0, 0, 0), 1, 0, 0, entity) for entity in (3, 5, 8)], np.int64)
     part = msgpack.unpackb(encode_part((0, 0, 0), 0, rows, acted={3}, placed={8, 9}))
     _, decoded, _ = decode_parts([part], 255)

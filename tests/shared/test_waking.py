@@ -69,7 +69,7 @@ def test_a_lift_that_goes_down_takes_its_rider_along(compiled: bool, upside_down
 
 
 @pytest.mark.parametrize("template", ["box", "ghost"])
-def test_a_block_removed_wakes_those_that_stand_on_it_and_nobody_else(compiled: bool, template: str) -> None:
+def test_a_block_removed_wakes_only_the_entities_that_stand_on_it(compiled: bool, template: str) -> None:
     world = build([floor()], compiled=compiled)
     spots = {(x, y): world.spawn(template, (x + 0.5, y + 0.5, 0)) for x in range(-4, 4) for y in range(-4, 4)}
     settle(world)
@@ -83,7 +83,7 @@ def test_a_block_removed_wakes_those_that_stand_on_it_and_nobody_else(compiled: 
     assert [spot for spot, entity in spots.items() if world.falling(entity)] == [(-1, -1)]
 
 
-def test_a_block_placed_or_replaced_wakes_nobody(compiled: bool) -> None:
+def test_a_block_placed_or_replaced_wakes_no_entity(compiled: bool) -> None:
     world = build([floor()], compiled=compiled)
     world.spawn("box", (0, 0, 0))
     settle(world)
@@ -150,7 +150,7 @@ def test_a_mover_wakes_only_what_stands_on_it(compiled: bool) -> None:
     assert not any(world.awake(entity) for entity in beside)
 
 
-def test_a_sleeper_has_no_turn_and_is_no_news(compiled: bool) -> None:
+def test_a_sleeper_has_no_turn_and_is_not_sent(compiled: bool) -> None:
     world = build([floor()], compiled=compiled)
     entity = world.spawn("box", (0, 0, 0))
     settle(world)

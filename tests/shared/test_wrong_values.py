@@ -189,7 +189,7 @@ def test_an_entity_that_is_not_there_is_named(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", sorted(set(BY_ENTITY) - {"rows", "state_hash", "step"}))
-def test_what_is_no_number_of_an_entity_is_named(name: str) -> None:
+def test_a_value_that_is_no_entity_number_is_named(name: str) -> None:
     world = world_with_two(compiled=False)
     for bad in ENTITY:
         refused(world, lambda w, bad=bad: BY_ENTITY[name](w, bad), SceneError, "^entity = ")  # type: ignore[misc]
