@@ -285,13 +285,7 @@ class Scene:
     def kernel_tables(self) -> tuple[layout.Int64s, layout.Int64s, layout.Int64s]:
         """Returns templates, walk velocities and parameters for `layout.Arrays`; each number is rounded once."""
         templates = np.array([template.row() for template in self.templates], np.int64)
-        walk = np.array(
-            [
-                [rounded(t.walk_speed * SPEED * move / MOVE_MAX) for move in range(-MOVE_MAX, MOVE_MAX + 1)]
-                for t in self.templates
-            ],
-            np.int64,
-        )
+        walk = np.array([_walk_velocities(template.walk_speed) for template in self.templates], np.int64)
         p = np.zeros(layout.PARAMETERS, np.int64)
         p[layout.GRAVITY] = rounded(self.gravity * SPEED / self.tick_rate)
         p[layout.TERMINAL] = to_velocity(self.terminal_speed, "terminal_speed")
@@ -327,6 +321,12 @@ def load_scene(name_or_path: str | Path) -> Scene:
         return Scene.from_table({"name": path.stem} | table)
     except SceneError as error:
         raise SceneError(f"scene {path}: {error}") from error
+
+
+@functools.lru_cache(maxsize=TEMPLATES_MAX)
+def _walk_velocities(walk_speed: float) -> tuple[int, ...]:
+    """Returns the velocity for each value of a part of an input, for `layout.Arrays.walk`."""
+    return tuple(rounded(walk_speed * SPEED * move / MOVE_MAX) for move in range(-MOVE_MAX, MOVE_MAX + 1))
 
 
 def _template(entry: object) -> Template:

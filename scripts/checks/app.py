@@ -6,6 +6,7 @@ scripts/test --long   only the long forms, and the property tests with all their
 scripts/test ARGS     pytest alone with these arguments
 """
 
+import os
 import subprocess
 import time
 from concurrent.futures import ThreadPoolExecutor
@@ -25,6 +26,8 @@ LONG = "(slow or hypothesis)"
 
 def main(arguments: list[str]) -> int:
     """Runs what the arguments of `scripts/test` ask for. Returns the exit code."""
+    # Without files of bytecode each worker and each process that a test starts compiles all sources again.
+    os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
     if arguments == ["--long"]:
         steps = [together(LONG, "long"), alone(LONG, "long")]
     elif arguments == ["--all"]:

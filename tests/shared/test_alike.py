@@ -7,6 +7,7 @@ import pytest
 
 from shared import kernels
 from shared.layout import CELL, ID, TEMPLATE, Int64s, X
+from tests.lengths import long_but
 
 REACH = 10
 ALWAYS = np.array([0, 1, 0], np.int64)
@@ -43,7 +44,7 @@ def changed(states: Int64s, rng: random.Random) -> Int64s:
     return other
 
 
-@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("seed", long_but(range(3), range(8)))
 def test_states_are_alike_if_the_rows_that_count_are_equal(seed: int, compiled: bool) -> None:
     rng = random.Random(seed)
     kernel = kernels.get(compiled)

@@ -8,6 +8,7 @@ import pytest
 from shared.inputs import Input
 from shared.scene import Template
 from shared.world import World
+from tests.lengths import long_but
 from tests.worlds import EAST, JUMP, TEMPLATES, WEST, build, floor, high, settle, states, steps
 
 
@@ -57,7 +58,7 @@ def disturb(world: World, r: random.Random) -> None:
                 steps(world, r.randint(1, 9), wishes(world, r))
 
 
-@pytest.mark.parametrize("seed", range(12))
+@pytest.mark.parametrize("seed", long_but(range(4), range(12)))
 def test_restored_over_a_world_that_has_diverged(compiled: bool, seed: int) -> None:
     """A restored world goes on like the original, also after it had other rows, another capacity and other segments."""
     r = random.Random(seed)

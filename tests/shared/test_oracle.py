@@ -10,9 +10,9 @@ BLOCKS = 10
 """Number of tests that share the seeds, so that a failure and the time it takes are easy to find."""
 
 
-@pytest.mark.parametrize("block", [0, *long(1, 2)])
-def test_a_few_random_worlds(compiled: bool, block: int) -> None:
-    for seed in range(block * 25, block * 25 + 25):
+@pytest.mark.parametrize("seeds", [range(10), *long(range(10, 25), range(25, 50), range(50, 75))], ids=str)
+def test_a_few_random_worlds(compiled: bool, seeds: range) -> None:
+    for seed in seeds:
         Twins(seed, compiled=compiled).run()
 
 

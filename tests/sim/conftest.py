@@ -7,6 +7,13 @@ from collections.abc import Iterator
 import pytest
 
 
+@pytest.fixture(autouse=True, scope="module")
+def _freeze() -> None:
+    """Keeps the objects of pytest out of the collections, which take ten times as long with them."""
+    gc.collect()
+    gc.freeze()
+
+
 @pytest.fixture(autouse=True)
 def _untie() -> Iterator[None]:
     yield

@@ -102,9 +102,7 @@ def join(match: Match, path: Link, kind: type[Player] = Player) -> Player:
 # -- others ---------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("far", "rate"), long_but([(0.25, 60), (1.75, 32), (25.0, 240)], product([0.25, 1.75, 10.0, 25.0], [32, 60, 240]))
-)
+@pytest.mark.parametrize(("far", "rate"), long_but([(1.75, 32)], product([0.25, 1.75, 10.0, 25.0], [32, 60, 240])))
 def test_an_entity_that_is_placed_is_never_drawn_elsewhere(far: float, rate: int) -> None:
     rules = Acts()
     rules.far = far
@@ -124,7 +122,7 @@ def test_an_entity_that_is_placed_is_never_drawn_elsewhere(far: float, rate: int
 @pytest.mark.parametrize(
     ("path", "rate"),
     long_but(
-        [(Link(0.01, loss=0.01), 32), (PRESETS["wifi"], 32)],
+        [(PRESETS["wifi"], 32)],
         product(
             [Link(), Link(0.02), Link(0.01, loss=0.01), PRESETS["lan"], PRESETS["regional"], PRESETS["wifi"]], [32, 128]
         ),
@@ -236,9 +234,7 @@ def drawn_in_loopback(fps: float, link: str | Link | None, delay: int) -> set[fl
     return drawn
 
 
-@pytest.mark.parametrize(
-    ("fps", "delay"), long_but([(24.0, 3), (60.0, 0), (144.0, 1)], product([24.0, 60.0, 144.0], [0, 1, 3]))
-)
+@pytest.mark.parametrize(("fps", "delay"), long_but([(24.0, 3)], product([24.0, 60.0, 144.0], [0, 1, 3])))
 def test_i_am_never_drawn_between_where_i_was_and_where_i_was_put(fps: float, delay: int) -> None:
     assert drawn_in_loopback(fps, None, delay) <= {64.0, 74.0}
 
@@ -246,7 +242,7 @@ def test_i_am_never_drawn_between_where_i_was_and_where_i_was_put(fps: float, de
 @pytest.mark.parametrize(
     ("link", "delay"),
     long_but(
-        [("lan", 3), ("typical", 0), (Link(0.016), 3)],
+        [("typical", 0)],
         product(["lan", "regional", "typical", "wifi", Link(0.002), Link(0.016)], [0, 3]),
     ),
 )

@@ -68,7 +68,7 @@ def test_who_sleeps_until_something_is_due_wakes_up_once_per_tick_and_ping(prese
     assert core.updates - updates <= 1.05 * sent + 20
 
 
-@pytest.mark.parametrize("seconds", [0.3, 2.0, 12.0, *long(1.0, 5.0)])
+@pytest.mark.parametrize("seconds", [0.3, 2.0, *long(1.0, 5.0, 12.0)])
 def test_a_suspended_program_begins_anew_without_a_spiral(seconds: float) -> None:
     match = Match(load_scene("hills"), 4)
     player = match.join(wander, Link(0.05, 0.01))

@@ -69,7 +69,7 @@ def launches(speeds: list[float]) -> int:
 @pytest.mark.parametrize(
     ("fps", "rate", "within"),
     long_but(
-        [(15, 32, False), (40, 128, True), (60, 32, True), (144, 20, False)],
+        [(15, 32, False), (60, 32, True)],
         product([15, 40, 60, 144, 240], [20, 32, 128], [False, True]),
     ),
 )
@@ -101,7 +101,9 @@ def kept(core: Core, rng: random.Random) -> Input:
     return core.input
 
 
-@pytest.mark.parametrize("path", [Link(), Link(0.02), PRESETS["typical"], PRESETS["wifi"]])
+@pytest.mark.parametrize(
+    "path", long_but([PRESETS["typical"]], [Link(), Link(0.02), PRESETS["typical"], PRESETS["wifi"]])
+)
 def test_a_press_at_any_time_between_two_ticks_is_in_one_input(path: Link) -> None:
     """Ticks are predicted when they are due and the input is set at any time, as with `AsyncClient`."""
     match = Match(FLAT, seed=1)
@@ -149,7 +151,7 @@ def test_a_tap_in_mid_air_is_not_remembered_for_the_landing() -> None:
     assert launches(speeds) == taps
 
 
-@pytest.mark.parametrize("pause_s", [0.3, 1.0, 3.0, 7.0])
+@pytest.mark.parametrize("pause_s", long_but([0.3, 3.0], [0.3, 1.0, 3.0, 7.0]))
 def test_a_press_ahead_of_a_pause_is_not_remembered_for_the_time_after_it(pause_s: float) -> None:
     match = Match(FLAT, seed=5)
     player = match.join(kept, Link(0.02), Sent())

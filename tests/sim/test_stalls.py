@@ -62,9 +62,7 @@ def stop_clock(match: Match, player: Player, seconds: float) -> None:
     match.run(0.001)
 
 
-@pytest.mark.parametrize(
-    ("rate", "stall_s"), long_but([(1, 10.0), (32, 1.0), (128, 3.5)], product(RATES, (0.5, 1.0, 3.5, 10.0)))
-)
+@pytest.mark.parametrize(("rate", "stall_s"), long_but([(1, 10.0), (32, 1.0)], product(RATES, (0.5, 1.0, 3.5, 10.0))))
 def test_every_tick_has_its_input_again_after_the_server_stood_still(rate: int, stall_s: float) -> None:
     match, player = at(rate)
     stop_server(match, stall_s)
@@ -76,9 +74,7 @@ def test_every_tick_has_its_input_again_after_the_server_stood_still(rate: int, 
     assert queue(match, player).refused == 0
 
 
-@pytest.mark.parametrize(
-    ("rate", "asleep_s"), long_but([(1, 8.0), (32, 1.0), (128, 3.0)], product(RATES, (0.5, 1.0, 3.0, 8.0)))
-)
+@pytest.mark.parametrize(("rate", "asleep_s"), long_but([(1, 8.0), (32, 1.0)], product(RATES, (0.5, 1.0, 3.0, 8.0))))
 def test_every_tick_has_its_input_again_after_the_clients_clock_stood_still(rate: int, asleep_s: float) -> None:
     match, player = at(rate)
     stop_clock(match, player, asleep_s)
@@ -147,8 +143,8 @@ def test_an_input_is_a_duplicate_only_of_one_that_was_accepted() -> None:
 @pytest.mark.parametrize(
     ("rate", "fps"),
     [
-        (1, 60), (32, 1.9), (128, 7),
-        *long((1, 1), (5, 1), (20, 1.3), (32, 1), (32, 1000), (60, 1.5), (240, 1), (240, 14), (240, 1000)),
+        (1, 60), (32, 1.9),
+        *long((128, 7), (1, 1), (5, 1), (20, 1.3), (32, 1), (32, 1000), (60, 1.5), (240, 1), (240, 14), (240, 1000)),
     ],
 )  # fmt: skip
 def test_any_frame_rate_plays(rate: int, fps: float) -> None:
@@ -163,9 +159,8 @@ def test_any_frame_rate_plays(rate: int, fps: float) -> None:
 @pytest.mark.parametrize(
     ("rate", "rtt_s", "fps"),
     [
-        (128, 1.0, 0),
         (32, 1.0, 1),
-        *long((240, 0.42, 0), (240, 1.0, 60), (128, 0.5, 0), (32, 1.0, 0), (20, 1.0, 0)),
+        *long((128, 1.0, 0), (240, 0.42, 0), (240, 1.0, 60), (128, 0.5, 0), (32, 1.0, 0), (20, 1.0, 0)),
     ],
 )
 def test_a_long_way_plays_at_any_rate(rate: int, rtt_s: float, fps: float) -> None:
