@@ -88,10 +88,10 @@ def test_a_bot_that_is_not_in_a_world_yet_sets_no_input() -> None:
 class Attentive(Wander):
     """A policy that keeps the attributes that it is given."""
 
-    heard: Mapping[int, Mapping[str, Any]] | None = None
+    learnt: Mapping[int, Mapping[str, Any]] | None = None
 
     def learn(self, attributes: Mapping[int, Mapping[str, Any]]) -> None:
-        self.heard = attributes
+        self.learnt = attributes
 
 
 def test_a_policy_with_learn_gets_the_attributes_of_entities() -> None:
@@ -99,4 +99,4 @@ def test_a_policy_with_learn_gets_the_attributes_of_entities() -> None:
     policy = Attentive(random.Random(1))
     player = match.join(bot(policy))
     match.run(3)
-    assert policy.heard == {player.core.entity: {"name": "player 0"}}
+    assert policy.learnt == {player.core.entity: {"name": "player 0"}}

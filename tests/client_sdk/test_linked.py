@@ -35,67 +35,67 @@ def linked(link: str | Link | None, now: float = 16.0) -> LinkedPort:
     return port
 
 
-def told(number: int) -> bytes:
+def event(number: int) -> bytes:
     return encode(messages.Happened(number, "told", payloads.pack_value(None)))
 
 
-def heard(port: LinkedPort) -> list[int]:
+def received(port: LinkedPort) -> list[int]:
     return [event.tick for event in port.core.events() if isinstance(event, Happened)]
 
 
 def test_without_a_link_nothing_waits() -> None:
     port = linked(None)
     assert len(port.outgoing()) == 1
-    port.receive(told(1), 16.0)
-    assert heard(port) == [1]
+    port.receive(event(1), 16.0)
+    assert received(port) == [1]
     assert port.appetite == READ_BYTES
 
 
 def test_each_way_takes_as_long_as_the_path() -> None:
     port = linked(FAR)
-    port.receive(told(1), 16.0)
+    port.receive(event(1), 16.0)
     assert port.outgoing() == []
     assert port.next_update(16.0) == 16.125
     port.update(16.125 - SOON)
     assert port.outgoing() == []
-    assert heard(port) == []
+    assert received(port) == []
     port.update(16.125)
     assert [type(decode_from_client(message)) for message in port.outgoing()] == [Hello]
-    assert heard(port) == [1]
+    assert received(port) == [1]
     assert port.next_update(16.125) == math.inf
 
 
 def test_a_message_takes_its_time_from_when_it_comes() -> None:
     port = linked(FAR)
     port.update(16.0)
-    port.receive(told(1), 17.0)
+    port.receive(event(1), 17.0)
     port.update(17.125 - SOON)
-    assert heard(port) == []
+    assert received(port) == []
     port.update(17.125)
-    assert heard(port) == [1]
+    assert received(port) == [1]
 
 
 def test_messages_on_the_way_stay_in_front_when_the_link_changes() -> None:
     port = linked(FAR)
-    port.receive(told(1), 16.0)
+    port.receive(event(1), 16.0)
     port.link = Link(0.0625)
-    port.receive(told(2), 16.0)
+    port.receive(event(2), 16.0)
     port.link = None
-    port.receive(told(3), 16.0)
+    port.receive(event(3), 16.0)
     port.update(16.125 - SOON)
-    assert heard(port) == []
+    assert received(port) == []
     port.update(16.125)
-    assert heard(port) == [1, 2, 3]
+    assert received(port) == [1, 2, 3]
     assert len(port.outgoing()) == 1
     port.update(16.25)
-    port.receive(told(4), 16.25)
-    assert heard(port) == [4]
+    port.receive(event(4), 16.25)
+    assert received(port) == [4]
     port.link = "far"
-    port.receive(told(5), 16.25)
+    port.receive(event(5), 16.25)
     port.update(16.3)
-    assert heard(port) == []
+    assert received(port) == []
     port.update(17.0)
-    assert heard(port) == [5]
+    assert received(port) == [5]
 
 
 def test_the_end_is_reported_after_the_messages_before_it() -> None:
@@ -144,9 +144,9 @@ def test_chance_is_the_same_again() -> None:
         found = []
         for n in range(2000):
             now = 16 + n / 64
-            port.receive(told(n), now)
+            port.receive(event(n), now)
             port.update(now)
-            found += [now - 16 - tick / 64 for tick in heard(port)]
+            found += [now - 16 - tick / 64 for tick in received(port)]
         return found
 
     assert arrivals("wifi") == arrivals("wifi")

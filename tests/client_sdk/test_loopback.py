@@ -42,7 +42,7 @@ class Program:
                 client.update(self.now)
                 client.view(self.now)
 
-    def told(self, client: Client, *kinds: type) -> list[Event]:
+    def events_of(self, client: Client, *kinds: type) -> list[Event]:
         return [event for event in self.events[client] if isinstance(event, kinds)]
 
 
@@ -57,7 +57,7 @@ def test_one_plays_alone_without_a_single_correction() -> None:
     assert client.joining
     program.run(1)
     assert client.playing
-    assert len(program.told(client, Joined)) == 1
+    assert len(program.events_of(client, Joined)) == 1
     before = client.view(program.now).me
     client.set_input(1, 0)
     program.run(2)
@@ -106,7 +106,7 @@ def test_two_see_each_other_and_what_they_build() -> None:
     x, y, z = (int(part // 1) for part in me.position)
     ann.edit(x + 2, y, z + 2, 5)
     program.run(1)
-    assert program.told(ann, Answered) == [Answered(1, True, "done")]
+    assert program.events_of(ann, Answered) == [Answered(1, True, "done")]
     prediction = bob.core.prediction
     assert prediction is not None
     assert prediction.confirmed.blocks.get(x + 2, y, z + 2) == 5
@@ -132,11 +132,11 @@ def test_a_suspended_client_reconnects_to_the_same_world() -> None:
     assert client.playing
     assert client.entity == entity
     assert program.game.world.tick == tick + 2 * program.game.scene.tick_rate
-    assert [type(event) for event in program.told(client, Disconnected, Resumed, Left)] == [Disconnected, Resumed]
+    assert [type(event) for event in program.events_of(client, Disconnected, Resumed, Left)] == [Disconnected, Resumed]
     program.now += LEAP_S / 2
     program.run(5)
     assert client.playing
-    assert len(program.told(client, Disconnected)) == 1, "the wait was made up for"
+    assert len(program.events_of(client, Disconnected)) == 1, "the wait was made up for"
     assert client.stats.divergences == 0
 
 
@@ -162,7 +162,7 @@ def test_a_refused_client_gets_the_reason(game: Game, says: str) -> None:
     program = Program(game)
     client = program.join("Ann")
     program.run(1)
-    (left,) = program.told(client, Left)
+    (left,) = program.events_of(client, Left)
     assert isinstance(left, Left)
     assert says in left.reason
     assert client.closed
@@ -179,7 +179,7 @@ def test_a_game_that_begins_anew_is_waited_for() -> None:
     program.run(4)
     assert client.playing
     assert client.entity == entity
-    lost, back = program.told(client, Disconnected, Resumed, Joined, Left)[1:]
+    lost, back = program.events_of(client, Disconnected, Resumed, Joined, Left)[1:]
     assert isinstance(lost, Disconnected)
     assert lost.reason == "new rules"
     assert lost.wait_s >= 2
@@ -192,7 +192,7 @@ def test_a_refused_client_gets_the_reason_over_a_link_too() -> None:
     program.join("Ann")
     second = program.join("Bob", link="typical")
     program.run(3)
-    (left,) = program.told(second, Left)
+    (left,) = program.events_of(second, Left)
     assert isinstance(left, Left)
     assert left.code == messages.FULL
 

@@ -39,7 +39,7 @@ def secure(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
         yield "{}:{}".format(*process.address())
 
 
-async def said(url: str) -> str:
+async def error_of(url: str) -> str:
     """Returns the error of both clients for an address, which is the same."""
     with pytest.raises(ConnectError) as polling:
         await asyncio.to_thread(Client.connect, url, timeout=END_S)
@@ -54,16 +54,16 @@ async def test_no_server_is_there() -> None:
     with socket.create_server(("127.0.0.1", 0)) as listener:
         port = listener.getsockname()[1]
     wanted = f"URL: no server there (connection refused); start one with: sovereign-server --port {port}"
-    assert await said(f"ws://127.0.0.1:{port}") == wanted
+    assert await error_of(f"ws://127.0.0.1:{port}") == wanted
 
 
 @pytest.mark.parametrize("url", ["example.org:8765", "http://example.org:8765"])
 async def test_an_invalid_address(url: str) -> None:
-    assert await said(url) == "'URL': scheme isn't ws or wss; a server's address looks like ws://localhost:8765"
+    assert await error_of(url) == "'URL': scheme isn't ws or wss; a server's address looks like ws://localhost:8765"
 
 
 async def test_a_host_that_does_not_exist() -> None:
-    found = await said("ws://nobody.invalid:8765")
+    found = await error_of("ws://nobody.invalid:8765")
     assert found.startswith("URL: cannot be reached (")
     assert found.endswith("); is the address right?")
 
@@ -96,13 +96,13 @@ def test_the_server_is_about_to_start_again() -> None:
 
 
 async def test_tls_on_one_side_only(plain: str, secure: str) -> None:
-    found = await said(f"wss://{plain}")
+    found = await error_of(f"wss://{plain}")
     assert found == f"URL: no secure connection, the server does not speak TLS; try ws://{plain}"
-    assert (await said(f"ws://{secure}")).endswith("; if the server speaks TLS, use wss://")
+    assert (await error_of(f"ws://{secure}")).endswith("; if the server speaks TLS, use wss://")
 
 
 async def test_a_certificate_that_is_not_trusted(secure: str) -> None:
-    found = await said(f"wss://{secure}")
+    found = await error_of(f"wss://{secure}")
     assert found.startswith("URL: no secure connection, the server's certificate is not trusted (")
     assert found.endswith(
         '); if it is one of your own: connect(url, tls=ssl.create_default_context(cafile="cert.pem"))'

@@ -70,7 +70,7 @@ class Editor:
         self.entity, self.resume, self.returns = 0, b"", 0
         self.own: list[Cell] = []
         self.waiting: dict[int, tuple[Cell, int]] = {}
-        self.told: list[int] = []
+        self.verdicts: list[int] = []
         self.used = 0
         """Inputs that the server has used, over all lives of the server."""
         self.places: set[int] = set()
@@ -86,8 +86,8 @@ class Editor:
                     if isinstance(message, Welcome):
                         self.welcome(message)
                     elif isinstance(message, Snapshot):
-                        self.hear(message)
-                        await self.say(link, message.tick)
+                        self.take(message)
+                        await self.act(link, message.tick)
 
     def welcome(self, welcome: Welcome) -> None:
         """Takes a welcome. With a resume token, the entity must be the same as before."""
@@ -97,7 +97,7 @@ class Editor:
         self.entity, self.resume = welcome.entity, welcome.resume
         self.own, self.waiting = [], {}
 
-    def hear(self, snapshot: Snapshot) -> None:
+    def take(self, snapshot: Snapshot) -> None:
         self.used += snapshot.statuses.count(messages.USED)
         self.places |= {state[X] for state in self.states(snapshot) if state[ID] == self.entity}
         if not self.own:
@@ -105,7 +105,7 @@ class Editor:
             x, y, z = (part // BLOCK for part in state[X : X + 3])
             self.own = [(x, y, z + 3), (x, y, z + 4), (x, y + 1, z + 3)]
         for number, verdict in np.frombuffer(snapshot.verdicts, VERDICT).tolist():
-            self.told.append(verdict)
+            self.verdicts.append(verdict)
             self.cells.answered(*self.waiting.pop(number), verdict)
 
     def states(self, snapshot: Snapshot) -> list[list[int]]:
@@ -113,7 +113,7 @@ class Editor:
         rows: list[list[int]] = decode_parts(snapshot.segments, len(self.scene.templates))[1].tolist()
         return rows
 
-    async def say(self, link: ClientConnection, tick: int) -> None:
+    async def act(self, link: ClientConnection, tick: int) -> None:
         """Sends an input (east and west, to keep the world busy) and every third tick an edit."""
         move = 127 if tick // 16 % 2 else 129
         await link.send(encode(Inputs(tick + 2, tick, bytes((move, 0, 0)))))
@@ -251,7 +251,7 @@ async def fill_up(server: ServerProcess, address: tuple[str, int], cells: Cells,
     async with editing(address, editors):
         await seen(lambda: cells.done > 20)
         limit((data / "world.db-wal").stat().st_size)
-        await seen(lambda: messages.UNSAVED in editors[0].told)
+        await seen(lambda: messages.UNSAVED in editors[0].verdicts)
         figures = await loop.run_in_executor(None, stats, address)
         assert figures["save_trouble"]
         assert not figures["ready"]

@@ -28,7 +28,7 @@ def rig(scene: Path) -> Iterator[bench.Rig]:
         running.close()
 
 
-def said(program: str) -> tuple[Stderr, int]:
+def run(program: str) -> tuple[Stderr, int]:
     """Runs a program. Returns its stderr and its exit code."""
     errors = Stderr()
     process = subprocess.Popen([sys.executable, "-c", program], stderr=errors.pipe)
@@ -50,7 +50,7 @@ def said(program: str) -> tuple[Stderr, int]:
 def test_the_last_line_is_the_cause_and_all_is_passed_on(
     program: str, cause: str, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    errors, code = said(program)
+    errors, code = run(program)
     assert errors.cause(code) == cause
     shown = capfd.readouterr().err
     assert (cause in shown) == ("wrote no error" not in cause)

@@ -17,8 +17,8 @@ from server.persistence.database import read
 from server.persistence.store import Store
 from shared import messages
 from shared.messages import Hello, Snapshot, Welcome
-from tests.server.test_keeping import Stored
-from tests.server.test_rules import Told
+from tests.server.test_persisted_state import Stored
+from tests.server.test_rules import Recorder
 from tests.server.test_store import SCENE, copied, keep, play, until
 from tests.server.test_store_faults import found_in
 from tests.tables import FakeLink
@@ -31,7 +31,7 @@ def fails(*args: Any, **given: Any) -> Any:
 
 
 @pytest.mark.parametrize(
-    ("owner", "name", "told"),
+    ("owner", "name", "calls"),
     [
         (GameApi, "set", []),  # before `on_join`
         (Roster, "issue", ["join", "leave"]),
@@ -39,18 +39,18 @@ def fails(*args: Any, **given: Any) -> Any:
     ],
 )
 def test_a_join_that_fails_leaves_nothing_behind(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, owner: Any, name: str, told: list[str]
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, owner: Any, name: str, calls: list[str]
 ) -> None:
-    rules = Told()
+    rules = Recorder()
     table = Stored(tmp_path, rules)
     witness = table.join()
-    rules.told.clear()
+    rules.calls.clear()
     with monkeypatch.context() as patch:
         patch.setattr(owner, name, fails)
         link = table.connect(ANN)
         table.tick()
     assert link.closings == [(messages.INTERNAL, "internal error")]
-    assert [what for what, *_ in rules.told] == told
+    assert [what for what, *_ in rules.calls] == calls
     assert table.game.faults.total == 1
     assert list(table.game.players) == [witness.session.entity] == table.game.api.entities()
     assert list(table.game.api.kept.attributes) == []

@@ -30,7 +30,7 @@ def back(table: Table, resume: bytes) -> FakeLink:
     return link
 
 
-def heard(table: Table, link: FakeLink) -> None:
+def acknowledge(table: Table, link: FakeLink) -> None:
     """Makes the client acknowledge a snapshot, so the server knows that it has got its welcome."""
     link.say(Inputs(table.tick_number + 1, table.tick_number, bytes(3)))
 
@@ -39,7 +39,7 @@ def test_a_player_that_reconnects_in_time_goes_on_as_before(table: Table) -> Non
     link = table.connect(Hello(messages.VERSION, {}, "Ann"))
     table.tick()
     me = link.session.entity
-    heard(table, link)
+    acknowledge(table, link)
     link.say(Inputs(table.tick_number + 2, table.tick_number, bytes((127, 0, 0)) * 3))
     table.lose(link)
     table.tick(40)
@@ -68,10 +68,10 @@ def test_a_player_that_reconnects_too_late_joins_anew(table: Table) -> None:
 def test_a_token_is_good_once(table: Table) -> None:
     link = table.join()
     me, first = link.session.entity, token(link)
-    heard(table, link)
+    acknowledge(table, link)
     table.lose(link)
     again = back(table, first)
-    heard(table, again)
+    acknowledge(table, again)
     table.lose(again)
     table.tick()
     assert back(table, first).session.entity not in (0, me)
@@ -81,7 +81,7 @@ def test_a_token_is_good_once(table: Table) -> None:
 def test_a_welcome_that_was_lost_on_its_way_costs_nothing(table: Table) -> None:
     link = table.join()
     me, first = link.session.entity, token(link)
-    heard(table, link)
+    acknowledge(table, link)
     table.lose(link)
     table.lose(back(table, first))  # the connection is lost before the client gets its new token
     table.tick()
@@ -146,7 +146,7 @@ def test_a_slow_connection_is_no_fault_of_the_player(table: Table) -> None:
 def test_a_command_that_is_sent_again_is_done_once_and_answered_again(table: Table) -> None:
     link = table.join()
     table.tick(64)
-    heard(table, link)
+    acknowledge(table, link)
     link.say(order(1, 0, 18, 16, 1, 5))
     table.tick()
     table.lose(link)
@@ -170,7 +170,7 @@ def test_a_player_without_an_acknowledgement_is_kept_for_a_moment_only() -> None
     """Otherwise clients that join and disconnect again and again would fill the world with entities."""
     table = Table(resume_s=10.0)
     silent, known = table.join(), table.join()
-    heard(table, known)
+    acknowledge(table, known)
     table.lose(silent)
     table.lose(known)
     table.tick(int(UNACKNOWLEDGED_S / table.tick_s) + 1)
@@ -184,7 +184,7 @@ def test_a_player_without_an_acknowledgement_is_kept_for_a_moment_only() -> None
 def test_a_reconnect_to_a_full_server_takes_over_the_own_place() -> None:
     table = Table(Limits(clients_max=1), resume_s=10.0)
     link = table.join()
-    heard(table, link)
+    acknowledge(table, link)
     again = back(table, token(link))  # before the loss is noticed
     assert again.session.entity == link.session.entity
     assert link.refusal()[0] == messages.TAKEN_OVER
@@ -195,7 +195,7 @@ def test_reconnecting_players_make_room_on_a_full_server() -> None:
     table = Table(Limits(clients_max=3), resume_s=10.0)
     links = [table.join() for _ in range(3)]
     for link in (links[1], links[0]):
-        heard(table, link)
+        acknowledge(table, link)
         table.lose(link)
         table.tick()
     newcomer = table.join()

@@ -18,30 +18,30 @@ from tests.tables import HELLO, FakeLink, Table, gone, order, whole
 from tests.worlds import scene
 
 
-class Told(Rules):
+class Recorder(Rules):
     """Rules that record the calls of their hooks."""
 
     def __init__(self) -> None:
-        self.told: list[tuple[Any, ...]] = []
+        self.calls: list[tuple[Any, ...]] = []
 
     def on_start(self) -> None:
-        self.told.append(("start",))
+        self.calls.append(("start",))
 
     def on_join(self, player: Player) -> None:
-        self.told.append(("join", player.entity, player.name, player.entity in self.game))
+        self.calls.append(("join", player.entity, player.name, player.entity in self.game))
 
     def on_leave(self, player: Player) -> None:
-        self.told.append(("leave", player.entity, player.entity in self.game))
+        self.calls.append(("leave", player.entity, player.entity in self.game))
 
     def on_command(self, player: Player, name: str, payload: Any) -> bool | None:
-        self.told.append(("command", player.entity, name, payload))
+        self.calls.append(("command", player.entity, name, payload))
         return name != "no"
 
     def on_contact(self, a: int, b: int) -> None:
-        self.told.append(("contact", a, b, self.game.tick))
+        self.calls.append(("contact", a, b, self.game.tick))
 
     def on_fell_out(self, entity: int) -> bool | None:
-        self.told.append(("fell", entity))
+        self.calls.append(("fell", entity))
         return None
 
     def can_edit(self, player: Player, x: int, y: int, z: int, kind: int) -> bool:
@@ -49,12 +49,12 @@ class Told(Rules):
 
 
 @pytest.fixture
-def rules() -> Told:
-    return Told()
+def rules() -> Recorder:
+    return Recorder()
 
 
 @pytest.fixture
-def table(rules: Told) -> Table:
+def table(rules: Recorder) -> Table:
     return Table(rules=rules)
 
 
@@ -78,15 +78,15 @@ def verdict(link: FakeLink, number: int) -> int:
     return int(found)
 
 
-def test_join_and_leave_hooks_run_while_the_entity_exists(table: Table, rules: Told) -> None:
+def test_join_and_leave_hooks_run_while_the_entity_exists(table: Table, rules: Recorder) -> None:
     link = table.connect(Hello(messages.VERSION, {}, "Ann"))
     table.tick()
     table.lose(link)
     table.tick()
-    assert rules.told == [("start",), ("join", 1, "Ann", True), ("leave", 1, True)]
+    assert rules.calls == [("start",), ("join", 1, "Ann", True), ("leave", 1, True)]
 
 
-def test_commands_come_with_their_data_and_are_answered(table: Table, rules: Told) -> None:
+def test_commands_come_with_their_data_and_are_answered(table: Table, rules: Recorder) -> None:
     link = table.join()
     table.tick(16)  # the edits of two seconds
     data = {"at": [1, 2.5, None], "why": "because"}
@@ -98,7 +98,7 @@ def test_commands_come_with_their_data_and_are_answered(table: Table, rules: Tol
         order(5, 0, 18, 16, 1, 6),
     )
     table.tick()
-    assert [told for told in rules.told if told[0] == "command"] == [
+    assert [call for call in rules.calls if call[0] == "command"] == [
         ("command", 1, "yes", data),
         ("command", 1, "no", None),
     ]
@@ -115,27 +115,27 @@ def test_without_rules_a_command_is_not_possible() -> None:
     assert verdict(link, 1) == messages.INVALID
 
 
-def test_a_contact_is_reported_once_when_it_begins(table: Table, rules: Told) -> None:
+def test_a_contact_is_reported_once_when_it_begins(table: Table, rules: Recorder) -> None:
     game = table.game.api
     table.tick()
     a, b = game.spawn("runner", (10.0, 16.0, 1.0)), game.spawn("runner", (12.0, 16.0, 1.0))
     table.tick(2)
-    assert not [told for told in rules.told if told[0] == "contact"]
+    assert not [call for call in rules.calls if call[0] == "contact"]
     game.steer(a, 1, 0)
     table.tick(40)  # walks against the other one and goes on
-    ((_, *pair, begun),) = [told for told in rules.told if told[0] == "contact"]
+    ((_, *pair, begun),) = [call for call in rules.calls if call[0] == "contact"]
     assert pair == [a, b]
     assert game.position(a)[0] == 11.375
     game.steer(a, -1, 0)
     table.tick(10)
     game.steer(a, 1, 0)
     table.tick(20)
-    contacts = [told for told in rules.told if told[0] == "contact"]
+    contacts = [call for call in rules.calls if call[0] == "contact"]
     assert len(contacts) == 2
     assert contacts[1][3] > begun + 10
 
 
-def test_a_contact_is_not_missed_in_a_tick_with_a_join(table: Table, rules: Told) -> None:
+def test_a_contact_is_not_missed_in_a_tick_with_a_join(table: Table, rules: Recorder) -> None:
     game = table.game.api
     table.tick()
     a, b = game.spawn("runner", (10.0, 16.0, 1.0)), game.spawn("runner", (12.0, 16.0, 1.0))
@@ -143,7 +143,7 @@ def test_a_contact_is_not_missed_in_a_tick_with_a_join(table: Table, rules: Told
     while not game.touching(a):
         table.tick()
     table.join()  # the record of the step is written before its contacts are looked for
-    assert [told[:3] for told in rules.told if told[0] == "contact"] == [("contact", a, b)]
+    assert [call[:3] for call in rules.calls if call[0] == "contact"] == [("contact", a, b)]
 
 
 def test_touching_returns_contacts_however_long_they_last(table: Table) -> None:
@@ -157,11 +157,11 @@ def test_touching_returns_contacts_however_long_they_last(table: Table) -> None:
         game.touching(99)
 
 
-def test_an_entity_that_falls_out_is_handled_by_the_rules_or_returns(table: Table, rules: Told) -> None:
+def test_an_entity_that_falls_out_is_handled_by_the_rules_or_returns(table: Table, rules: Recorder) -> None:
     link = table.join()
     table.game.world.place(link.session.entity, (16.0, 16.0, -3.0))
     table.tick(2)
-    assert ("fell", 1) in rules.told
+    assert ("fell", 1) in rules.calls
     assert table.game.world.position(1)[2] >= 1.0
 
 
@@ -339,8 +339,8 @@ def test_values_that_only_python_holds_equal_are_sent(table: Table) -> None:
     for value in ([1], [True], [1.0], (1.0,)):
         game.share("value", value)
         table.tick()
-    told = [shared.values["value"] for shared in link.got(Shared)]
-    assert [(value, type(value[0])) for value in told] == [([1], int), ([True], bool), ([1.0], float)]
+    values = [shared.values["value"] for shared in link.got(Shared)]
+    assert [(value, type(value[0])) for value in values] == [([1], int), ([True], bool), ([1.0], float)]
 
 
 def test_too_long_values_are_refused_by_name(table: Table) -> None:

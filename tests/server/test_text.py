@@ -25,7 +25,7 @@ from shared import messages
 from shared.checks import SceneError
 from shared.messages import Hello, Welcome
 from shared.scene import Scene, Template, load_scene
-from tests.server.test_keeping import Stored
+from tests.server.test_persisted_state import Stored
 from tests.server.test_store import SCENE
 from tests.tables import Table
 

@@ -18,7 +18,7 @@ from shared.checks import SceneError
 from shared.scene import Scene, load_scene
 from sovereign_netcode.playtest import Match
 from tests.client_sdk.test_wrong_values import Playing
-from tests.server.test_keeping import Stored
+from tests.server.test_persisted_state import Stored
 from tests.server.test_store import until
 from tests.server.test_wrong_values import RUNNER, Played, marks
 from tests.tables import Table, order
@@ -217,20 +217,20 @@ def caught(act: Callable[[], Any]) -> Callable[[], str]:
 
 def in_a_thread(act: Callable[[], Any]) -> str:
     """Returns the error of a call in another thread."""
-    said: list[str] = []
-    thread = threading.Thread(target=lambda: said.append(caught(act)()), name="worker")
+    errors: list[str] = []
+    thread = threading.Thread(target=lambda: errors.append(caught(act)()), name="worker")
     thread.start()
     thread.join()
-    return said[0]
+    return errors[0]
 
 
 def in_a_callback(act: Callable[[], Any]) -> str:
     """Returns the error of a call in a callback of an event loop."""
 
     async def run() -> str:
-        said: asyncio.Future[str] = asyncio.get_running_loop().create_future()
-        asyncio.get_running_loop().call_later(0, lambda: said.set_result(caught(act)()))
-        return await said
+        error: asyncio.Future[str] = asyncio.get_running_loop().create_future()
+        asyncio.get_running_loop().call_later(0, lambda: error.set_result(caught(act)()))
+        return await error
 
     return asyncio.run(run())
 
@@ -243,9 +243,9 @@ def in_a_callback(act: Callable[[], Any]) -> str:
 def test_a_change_from_elsewhere_is_refused(name: str, elsewhere: Callable[[Any], str], where: str) -> None:
     table = Played()
     before = marks(table)
-    said = elsewhere(lambda: ACTS[name](table))
-    assert said.startswith(f"{name}: called {where}")
-    assert f"game.soon(game.{name}, ...)" in said
+    error = elsewhere(lambda: ACTS[name](table))
+    assert error.startswith(f"{name}: called {where}")
+    assert f"game.soon(game.{name}, ...)" in error
     assert marks(table) == before
     ACTS[name](table)  # in the thread that ticks, without an event loop, a change is allowed
 
@@ -295,41 +295,41 @@ def test_a_call_by_soon_happens_in_the_next_tick(name: str, elsewhere: Callable[
 
 def test_soon_keeps_the_order_takes_arguments_and_defers_calls_added_meanwhile() -> None:
     table = Table()
-    stage, said = table.game.api, []
+    stage, calls = table.game.api, []
 
     def note(*what: Any) -> None:
-        said.append((stage.tick, *what))
+        calls.append((stage.tick, *what))
         if what == (1,):
             stage.soon(note, "later")
 
     stage.soon(note, 1)
     stage.soon(note, 2, "b")
     stage.soon(functools.partial(note, 3))
-    assert said == []
+    assert calls == []
     table.tick(3)
-    assert said == [(1, 1), (1, 2, "b"), (1, 3), (2, "later")]
+    assert calls == [(1, 1), (1, 2, "b"), (1, 3), (2, "later")]
 
 
 class Ordered(Rules):
     def __init__(self) -> None:
-        self.said: list[str] = []
+        self.calls: list[str] = []
 
     def on_start(self) -> None:
-        self.said.append("start")
+        self.calls.append("start")
 
     def on_join(self, player: Player) -> None:
-        self.said.append("join")
+        self.calls.append("join")
 
     def on_tick(self) -> None:
-        self.said.append("tick")
+        self.calls.append("tick")
 
 
 def test_soon_comes_after_the_start_and_ahead_of_the_other_hooks() -> None:
     rules = Ordered()
     table = Table(rules=rules)
-    table.game.api.soon(rules.said.append, "soon")
+    table.game.api.soon(rules.calls.append, "soon")
     table.join()
-    assert rules.said == ["start", "soon", "join", "tick"]
+    assert rules.calls == ["start", "soon", "join", "tick"]
 
 
 def test_a_failing_call_by_soon_is_counted_and_stops_nothing(caplog: pytest.LogCaptureFixture) -> None:

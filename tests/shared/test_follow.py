@@ -46,7 +46,7 @@ from tests.worlds import EAST, JUMP, WEST, build, floor, steps
 SIDE = SEGMENT * BLOCK
 
 
-class Told:
+class Mirrored:
     """A stepped world, and a second world that knows only what was sent of the first."""
 
     def __init__(self, world: World) -> None:
@@ -55,13 +55,13 @@ class Told:
         self.other = World(world.scene, compiled=world.compiled)
         self.other.put(world.states())
         self.other.rebase(world.tick)
-        self.turns = self.news = self.bytes = 0
+        self.turns = self.sent_turns = self.bytes = 0
 
-    def tell(self) -> None:
+    def send(self) -> None:
         """Sends the changes of the latest step to the other world, segment by segment, over the wire format."""
         self.turns += len(self.world.changed)
         shares, _ = self.packs.pack(())
-        self.news += sum(len(share.ids) for share in shares)
+        self.sent_turns += sum(len(share.ids) for share in shares)
         parts = [join_part(share.segment, 1, share.packed) for share in shares]
         self.bytes += sum(map(len, parts))
         templates = len(self.world.scene.templates)
@@ -97,8 +97,8 @@ def test_a_crowd_that_is_sent_equals_the_crowd(name: str, rate: int, integrator:
     in every tick."""
     rng = random.Random(f"{name} {rate}")
     table: dict[str, Any] = load_scene(name).to_table() | {"tick_rate": rate, "integrator": integrator}
-    told = Told(crowd(Scene.from_table(table), 30, rng, compiled))
-    world = told.world
+    mirrored = Mirrored(crowd(Scene.from_table(table), 30, rng, compiled))
+    world = mirrored.world
     for _ in range(300 if compiled else 60):
         wishes = {
             entity: Input(rng.randint(-89, 89), rng.randint(-89, 89), rng.randint(0, 1))
@@ -121,23 +121,23 @@ def test_a_crowd_that_is_sent_equals_the_crowd(name: str, rate: int, integrator:
         except SceneError:
             pass
         world.step(wishes)
-        told.tell()
-        told.check()
-    assert 50 < told.news < told.turns * 0.6
+        mirrored.send()
+        mirrored.check()
+    assert 50 < mirrored.sent_turns < mirrored.turns * 0.6
 
 
 @pytest.mark.parametrize("pause", [2, 7, 64])
 def test_several_ticks_in_which_nothing_happens_are_as_good_as_one(pause: int, compiled: bool) -> None:
-    told = Told(build(gravity=1.0, compiled=compiled))
+    mirrored = Mirrored(build(gravity=1.0, compiled=compiled))
     for i in range(3):
-        told.world.spawn("stone", (3 * i, 0, 25))
-        told.world.set_velocity(i + 1, (i / 8, -1 / 8, i))
-    told.world.step()
-    told.tell()
-    steps(told.world, pause)
-    told.tell()
-    assert told.news == 3, "only that they exist"
-    told.check()
+        mirrored.world.spawn("stone", (3 * i, 0, 25))
+        mirrored.world.set_velocity(i + 1, (i / 8, -1 / 8, i))
+    mirrored.world.step()
+    mirrored.send()
+    steps(mirrored.world, pause)
+    mirrored.send()
+    assert mirrored.sent_turns == 3, "only that they exist"
+    mirrored.check()
 
 
 def events(world: World, entity: int) -> int:
@@ -152,13 +152,13 @@ def test_each_event_of_an_entity_is_sent_once(compiled: bool) -> None:
     me = world.spawn("box", (0, 0, 0))
     world.step()
     assert events(world, me) & WHOLE
-    told, found = Told(world), []
+    mirrored, found = Mirrored(world), []
     for tick in range(400):
         input_ = {0: EAST, 80: EAST._replace(buttons=1), 84: EAST}.get(tick)
         world.step(None if input_ is None else {me: input_})
         found.append(events(world, me))
-        told.tell()
-        told.check()
+        mirrored.send()
+        mirrored.check()
     assert [what for what in found if what][:7] == [
         TOLD,  # walks
         STOP_X,  # reaches the wall
@@ -174,15 +174,15 @@ def test_holding_a_course_costs_nothing(compiled: bool) -> None:
     world = build([floor(0, 30)], compiled=compiled)
     me = world.spawn("box", (-20, 5, 0))
     steps(world, 10, {me: EAST})
-    told = Told(world)
+    mirrored = Mirrored(world)
     for _ in range(200):
         world.step({me: EAST})
-        told.tell()
-    assert (told.turns, told.news, told.bytes) == (200, 0, 0)
+        mirrored.send()
+    assert (mirrored.turns, mirrored.sent_turns, mirrored.bytes) == (200, 0, 0)
     world.step({me: JUMP})
-    told.tell()
-    assert told.bytes == 17, "5 for the part, 7 for the head, 5 for the tail"
-    told.check()
+    mirrored.send()
+    assert mirrored.bytes == 17, "5 for the part, 7 for the head, 5 for the tail"
+    mirrored.check()
 
 
 @pytest.mark.parametrize("n", [0, 1, 2, 40, 1500])
@@ -206,20 +206,20 @@ def test_changes_are_packed_in_the_order_of_ids_segment_by_segment(n: int, compi
     arrays = SimpleNamespace(**{name: kernel.lent(each) for name, each in lists.items()})
     world = SimpleNamespace(arrays=arrays, tick=7, kernel=kernel)
     shares, due = TickEncoder(world, 4).pack(acted)  # type: ignore[arg-type]
-    told: dict[Cell, list[Int64s]] = {}
+    sent: dict[Cell, list[Int64s]] = {}
     everywhere: set[Cell] = set()
     for row in sorted(matrix[rows], key=lambda row: int(row[ID])):
         x, y, z = (row[X:VX] // SIDE).tolist()
         everywhere.add((x, y, z))
         if row[CHANGED] & 2 * WHOLE - 1:
-            told.setdefault((x, y, z), []).append(row)
+            sent.setdefault((x, y, z), []).append(row)
     assert due == {(x, y, z) for x, y, z in everywhere if (x + 3 * y + 5 * z + 7) % 4 == 0}
-    assert {share.segment for share in shares} == told.keys()
-    assert len(shares) == len(told)
+    assert {share.segment for share in shares} == sent.keys()
+    assert len(shares) == len(sent)
     for segment, ids, whole, packed in shares:
         heads = tails = b""
-        sent_whole = [row for row in told[segment] if row[CHANGED] & WHOLE]
-        for row in told[segment]:
+        sent_whole = [row for row in sent[segment] if row[CHANGED] & WHOLE]
+        for row in sent[segment]:
             events = int(row[CHANGED]) & 2 * WHOLE - 1
             if events < WHOLE:
                 heads += struct.pack("<IB", row[ID], events)
@@ -228,7 +228,7 @@ def test_changes_are_packed_in_the_order_of_ids_segment_by_segment(n: int, compi
                     tails += struct.pack("<i", row[X + axis] % SIDE) if events & STOP_X << axis else b""
         assert packed == (heads, tails, encode_rows(np.array(sent_whole).reshape(-1, len(COLUMNS)), acted))
         assert whole == [row[ID] for row in sent_whole]
-        assert sorted(ids) == [row[ID] for row in told[segment]]
+        assert sorted(ids) == [row[ID] for row in sent[segment]]
 
 
 # -- what no server sends -------------------------------------------------------------------------------------

@@ -17,61 +17,61 @@ def refused(page: Page | None) -> tuple[int, str]:
 
 
 def test_an_address_gets_its_share_and_pages_beyond_it_and_then_nothing() -> None:
-    door = Admission(Limits(connections_per_address=2))
+    admission = Admission(Limits(connections_per_address=2))
     for _ in range(2):
-        assert door.arrive("1.2.3.4")
-        assert door.answer(JOIN, "1.2.3.4", 0.0) is None
+        assert admission.arrive("1.2.3.4")
+        assert admission.answer(JOIN, "1.2.3.4", 0.0) is None
     for _ in range(SPARE_PER_ADDRESS):
-        assert door.arrive("1.2.3.4")
-        status, text = refused(door.answer(JOIN, "1.2.3.4", 0.0))
+        assert admission.arrive("1.2.3.4")
+        status, text = refused(admission.answer(JOIN, "1.2.3.4", 0.0))
         assert (status, text) == (429, "too many connections from your address (2 are allowed)")
-        assert refused(door.answer(HEALTH, "1.2.3.4", 0.0)) == (200, "ok")
-    assert not door.arrive("1.2.3.4")
-    assert door.arrive("1.2.3.5"), "another address is not concerned"
-    assert door.refused == {"address": SPARE_PER_ADDRESS + 1}
+        assert refused(admission.answer(HEALTH, "1.2.3.4", 0.0)) == (200, "ok")
+    assert not admission.arrive("1.2.3.4")
+    assert admission.arrive("1.2.3.5"), "another address is not concerned"
+    assert admission.refused == {"address": SPARE_PER_ADDRESS + 1}
     for _ in range(1 + SPARE_PER_ADDRESS):
-        door.leave("1.2.3.4")
-    assert door.arrive("1.2.3.4")
-    assert door.answer(JOIN, "1.2.3.4", 0.0) is None
+        admission.leave("1.2.3.4")
+    assert admission.arrive("1.2.3.4")
+    assert admission.answer(JOIN, "1.2.3.4", 0.0) is None
 
 
 def test_an_ended_connection_leaves_nothing_behind() -> None:
-    door = Admission(Limits(connections_per_address=1))
+    admission = Admission(Limits(connections_per_address=1))
     for n in range(1000):
         address = f"10.0.{n >> 8}.{n & 255}"
-        assert door.arrive(address)
-        door.leave(address)
-    assert (door.total, len(door._by_network)) == (0, 0)
+        assert admission.arrive(address)
+        admission.leave(address)
+    assert (admission.total, len(admission._by_network)) == (0, 0)
 
 
 def test_all_connections_together_have_a_limit() -> None:
-    door = Admission(Limits(connections_max=3))
-    assert all(door.arrive("127.0.0.1") for _ in range(3 + SPARE))
-    status, text = refused(door.answer(JOIN, "127.0.0.1", 0.0))
+    admission = Admission(Limits(connections_max=3))
+    assert all(admission.arrive("127.0.0.1") for _ in range(3 + SPARE))
+    status, text = refused(admission.answer(JOIN, "127.0.0.1", 0.0))
     assert (status, text) == (503, "the server is full (3 connections)")
-    assert refused(door.answer(HEALTH, "127.0.0.1", 0.0))[0] == 200, "a full server still serves pages"
-    assert not door.arrive("127.0.0.1")
-    assert not door.arrive("1.2.3.4")
+    assert refused(admission.answer(HEALTH, "127.0.0.1", 0.0))[0] == 200, "a full server still serves pages"
+    assert not admission.arrive("127.0.0.1")
+    assert not admission.arrive("1.2.3.4")
 
 
 def test_joins_have_a_rate_and_a_burst_of_two_seconds() -> None:
-    door = Admission(Limits(joins_per_s=10.0))
+    admission = Admission(Limits(joins_per_s=10.0))
 
     def joins(now: float) -> int:
         n = 0
-        while door.answer(JOIN, "1.2.3.4", now) is None:
+        while admission.answer(JOIN, "1.2.3.4", now) is None:
             n += 1
         return n
 
     assert (joins(100.0), joins(100.0), joins(100.5), joins(103.0), joins(1000.0)) == (20, 0, 5, 20, 20)
-    assert refused(door.answer(JOIN, "1.2.3.4", 1000.0))[0] == 503
-    assert door.answer(JOIN, "127.0.0.1", 1000.0) is None
-    assert refused(door.answer(HEALTH, "1.2.3.4", 1000.0))[0] == 200
+    assert refused(admission.answer(JOIN, "1.2.3.4", 1000.0))[0] == 503
+    assert admission.answer(JOIN, "127.0.0.1", 1000.0) is None
+    assert refused(admission.answer(HEALTH, "1.2.3.4", 1000.0))[0] == 200
 
 
 def test_a_rate_below_one_in_two_seconds_still_allows_joins() -> None:
-    door = Admission(Limits(joins_per_s=0.1))
-    found = [door.answer(JOIN, "1.2.3.4", now) is None for now in (0.0, 1.0, 9.0, 10.5, 11.0, 21.0)]
+    admission = Admission(Limits(joins_per_s=0.1))
+    found = [admission.answer(JOIN, "1.2.3.4", now) is None for now in (0.0, 1.0, 9.0, 10.5, 11.0, 21.0)]
     assert found == [True, False, False, True, False, True]
 
 
@@ -79,9 +79,9 @@ def test_this_machine_is_limited_only_on_request() -> None:
     exempt = Admission(Limits(connections_per_address=1))
     limited = Admission(Limits(connections_per_address=1, loopback_exempt=False))
     for address in ("127.0.0.1", "::1", "::ffff:127.0.0.1"):
-        for door in (exempt, limited):
-            door.arrive(address)
-            door.arrive(address)
+        for admission in (exempt, limited):
+            admission.arrive(address)
+            admission.arrive(address)
         assert exempt.answer(JOIN, address, 0.0) is None
         assert refused(limited.answer(JOIN, address, 0.0))[0] == 429
 
@@ -117,8 +117,8 @@ def test_ipv6_counts_by_the_network_that_one_customer_has() -> None:
     ],
 )
 def test_browsers_come_from_known_pages(allowed: tuple[str, ...], origin: str | None, host: str, welcome: bool) -> None:
-    door = Admission(origins=allowed)
-    page = door.answer(Request("GET", "/", host, origin, upgrade=True), "1.2.3.4", 0.0)
+    admission = Admission(origins=allowed)
+    page = admission.answer(Request("GET", "/", host, origin, upgrade=True), "1.2.3.4", 0.0)
     assert (page is None) is welcome
     if page is not None:
         assert page.status == 403
@@ -126,14 +126,14 @@ def test_browsers_come_from_known_pages(allowed: tuple[str, ...], origin: str | 
 
 def test_a_draining_server_says_when_to_reconnect() -> None:
     wait: list[float] = []
-    door = Admission(closing=lambda: wait[0] if wait else None)
-    assert door.answer(JOIN, "127.0.0.1", 0.0) is None
+    admission = Admission(closing=lambda: wait[0] if wait else None)
+    assert admission.answer(JOIN, "127.0.0.1", 0.0) is None
     wait.append(3.2)
-    page = door.answer(JOIN, "127.0.0.1", 0.0)
+    page = admission.answer(JOIN, "127.0.0.1", 0.0)
     assert refused(page) == (503, "the server is going down")
     assert page is not None
     assert page.headers == (("Retry-After", "3"),)
-    assert refused(door.answer(HEALTH, "127.0.0.1", 0.0))[0] == 200
+    assert refused(admission.answer(HEALTH, "127.0.0.1", 0.0))[0] == 200
 
 
 @pytest.mark.parametrize(
@@ -149,7 +149,7 @@ def test_a_draining_server_says_when_to_reconnect() -> None:
     ],
 )
 def test_figures_are_not_for_everyone(figures: str, seen_from: list[str]) -> None:
-    door = Admission(pages=Pages(private={"/stats": lambda: Page(200, b"{}")}), figures=figures)
+    admission = Admission(pages=Pages(private={"/stats": lambda: Page(200, b"{}")}), figures=figures)
     for address in (
         "127.0.0.1",
         "::1",
@@ -161,7 +161,7 @@ def test_figures_are_not_for_everyone(figures: str, seen_from: list[str]) -> Non
         "2a00::1",
         "",
     ):
-        page = door.answer(Request("GET", "/stats", "127.0.0.1", None, upgrade=False), address, 0.0)
+        page = admission.answer(Request("GET", "/stats", "127.0.0.1", None, upgrade=False), address, 0.0)
         assert page is not None
         assert page.status == (200 if address in seen_from else 403), address
 
@@ -181,34 +181,38 @@ OTHER_HOSTS = [
 @pytest.mark.parametrize("path", ["/", "/live", "/live/0", "/stats", "/metrics", "/healthz", "/readyz", "/nothing"])
 def test_pages_are_refused_by_a_host_name_that_is_not_the_servers_own(path: str) -> None:
     figures = {path: lambda: Page(200, b"figures")}
-    door = Admission(pages=Pages(private=figures), hosts=("127.0.0.1", "Play.example"))
+    admission = Admission(pages=Pages(private=figures), hosts=("127.0.0.1", "Play.example"))
     for host in OWN_HOSTS:
-        assert refused(door.answer(Request("GET", path, host, None, upgrade=False), "127.0.0.1", 0.0))[0] == 200, host
-    assert door.refused == {}
+        assert refused(admission.answer(Request("GET", path, host, None, upgrade=False), "127.0.0.1", 0.0))[0] == 200, (
+            host
+        )
+    assert admission.refused == {}
     for host in OTHER_HOSTS:
-        status, text = refused(door.answer(Request("GET", path, host, None, upgrade=False), "127.0.0.1", 0.0))
+        status, text = refused(admission.answer(Request("GET", path, host, None, upgrade=False), "127.0.0.1", 0.0))
         assert (status, text) == (
             421, f"{host!r} is not a name of this server; its operator can add it to allowed_hosts",
         ), host  # fmt: skip
-    assert door.refused == {"host": len(OTHER_HOSTS)}
+    assert admission.refused == {"host": len(OTHER_HOSTS)}
 
 
 def test_an_operator_can_allow_every_host_name_for_pages_but_not_for_players() -> None:
-    door = Admission(hosts=("*",))
+    admission = Admission(hosts=("*",))
     for host in OTHER_HOSTS:
-        assert refused(door.answer(Request("GET", "/healthz", host, None, upgrade=False), "127.0.0.1", 0.0))[0] == 200
+        assert (
+            refused(admission.answer(Request("GET", "/healthz", host, None, upgrade=False), "127.0.0.1", 0.0))[0] == 200
+        )
         if host != "*":
             player = Request("GET", "/", host, f"http://{host}", upgrade=True)
-            assert refused(door.answer(player, "127.0.0.1", 0.0))[0] == 403, host
+            assert refused(admission.answer(player, "127.0.0.1", 0.0))[0] == 403, host
 
 
 def test_a_client_that_is_no_browser_may_call_the_server_as_it_likes() -> None:
-    door = Admission()
-    assert door.answer(Request("GET", "/", "evil.example:8765", None, upgrade=True), "127.0.0.1", 0.0) is None
+    admission = Admission()
+    assert admission.answer(Request("GET", "/", "evil.example:8765", None, upgrade=True), "127.0.0.1", 0.0) is None
 
 
 def test_browsers_come_from_the_own_pages_by_every_own_name() -> None:
-    door = Admission(hosts=("play.example",))
+    admission = Admission(hosts=("play.example",))
     for host, origin, welcome in (
         ("play.example:8765", "http://play.example:8765", True),
         ("PLAY.example", "https://play.EXAMPLE", True),
@@ -216,7 +220,7 @@ def test_browsers_come_from_the_own_pages_by_every_own_name() -> None:
         ("play.example", "http://evil.example", False),
         ("evil.example", "http://evil.example", False),
     ):
-        assert (door.answer(Request("GET", "/", host, origin, upgrade=True), "1.2.3.4", 0.0) is None) is welcome
+        assert (admission.answer(Request("GET", "/", host, origin, upgrade=True), "1.2.3.4", 0.0) is None) is welcome
 
 
 def test_a_long_name_is_cut_in_the_answer() -> None:

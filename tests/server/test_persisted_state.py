@@ -10,7 +10,7 @@ from server.players.persisted_state import restored, whole
 from server.rules import Rules
 from shared import messages
 from shared.messages import Hello, Inputs, Shared, Welcome
-from tests.server.test_rules import Told, attributes
+from tests.server.test_rules import Recorder, attributes
 from tests.server.test_store import until
 from tests.tables import FakeLink, Table, gone, order
 
@@ -58,9 +58,9 @@ def played(table: Stored) -> tuple[FakeLink, bytes]:
     return link, link.got(Welcome)[-1].resume
 
 
-def goes_on(table: Stored, before: FakeLink, token: bytes, rules: Told) -> None:
+def goes_on(table: Stored, before: FakeLink, token: bytes, rules: Recorder) -> None:
     """Checks that the game goes on as it was."""
-    assert rules.told == []
+    assert rules.calls == []
     assert table.game.world.blocks.get(18, 16, 1) == 5
     link = table.connect(Hello(messages.VERSION, {}, "", resume=token))
     table.tick(2)
@@ -78,16 +78,16 @@ def goes_on(table: Stored, before: FakeLink, token: bytes, rules: Told) -> None:
 
 
 def test_a_contact_from_before_a_restart_does_not_begin_again(tmp_path: Path) -> None:
-    first, told = Stored(tmp_path, Told()), Told()
+    first, rules = Stored(tmp_path, Recorder()), Recorder()
     a, b = (first.game.api.spawn("runner", (x, 16.0, 1.0)) for x in (10.0, 10.0 - 0.625))
     first.tick(2)
     first.stop()
-    second = Stored(tmp_path, told)
+    second = Stored(tmp_path, rules)
     second.game.api.steer(a, 0, 1)
     second.tick(8)
     assert second.game.world.position(a)[1] > 16.0
     assert second.game.api.touching(a) == [b]
-    assert told.told == []
+    assert rules.calls == []
     second.stop()
 
 
@@ -96,7 +96,7 @@ def test_after_a_stop_the_game_goes_on(tmp_path: Path) -> None:
     link, token = played(first)
     hashed = first.game.world.state_hash()
     first.stop()
-    rules = Told()
+    rules = Recorder()
     again = Stored(tmp_path, rules)
     assert again.game.world.state_hash() == hashed
     goes_on(again, link, token, rules)
@@ -118,10 +118,10 @@ def test_a_player_that_does_not_reconnect_after_a_restart_leaves(tmp_path: Path)
 
 def test_a_new_world_begins_and_an_old_one_does_not_begin_again(tmp_path: Path) -> None:
     for expected in ([("start",)], []):
-        rules = Told()
+        rules = Recorder()
         table = Stored(tmp_path, rules)
         table.tick(3)
-        assert rules.told == expected
+        assert rules.calls == expected
         table.stop()
 
 

@@ -41,105 +41,105 @@ class Parts:
         return len(parts), b"".join(parts)
 
 
-def looking(see: int = 2) -> ClientView:
-    sight = ClientView()
-    sight.move(tuple(ROW), see)
-    return sight
+def seeing(see: int = 2) -> ClientView:
+    view = ClientView()
+    view.move(tuple(ROW), see)
+    return view
 
 
-def take(sight: ClientView, log: Log, tick: int, room: int) -> list[Cell]:
+def take(view: ClientView, log: Log, tick: int, room: int) -> list[Cell]:
     log.asked.clear()
-    n, parts = sight.take(log, tick, room)  # type: ignore[arg-type]
+    n, parts = view.take(log, tick, room)  # type: ignore[arg-type]
     taken = [ROW[first] for first, _ in groupby(parts)]
     assert len(taken) == n
     return taken
 
 
 def test_known_is_the_tick_up_to_which_every_seen_segment_has_been_sent() -> None:
-    sight, log = looking(), Log(dict.fromkeys(ROW, 10))
-    assert sight.known == -2
-    assert take(sight, log, 5, 20) == [OWN, NEAR]
-    assert sight.known == -2, "nothing is known of one segment"
-    assert take(sight, log, 6, 100) == [FAR, OWN, NEAR] or sight.complete
-    assert sight.known == 6
+    view, log = seeing(), Log(dict.fromkeys(ROW, 10))
+    assert view.known == -2
+    assert take(view, log, 5, 20) == [OWN, NEAR]
+    assert view.known == -2, "nothing is known of one segment"
+    assert take(view, log, 6, 100) == [FAR, OWN, NEAR] or view.complete
+    assert view.known == 6
     log.sizes[FAR] = 1000
-    assert FAR not in take(sight, log, 7, 20)
-    assert sight.known == 6
-    assert FAR in take(sight, log, 9, 2000)
-    assert sight.known == 9
+    assert FAR not in take(view, log, 7, 20)
+    assert view.known == 6
+    assert FAR in take(view, log, 9, 2000)
+    assert view.known == 9
 
 
 def test_a_segment_that_comes_into_view_limits_known_from_then_on() -> None:
-    sight, log = ClientView(), Log(dict.fromkeys(ROW, 10))
-    sight.move((OWN,), 2, 4)
-    take(sight, log, 5, 100)
-    assert sight.known == 5
-    sight.move(tuple(ROW), 2, 8)
-    assert FAR not in take(sight, log, 8, 20)
-    assert sight.known == 7
-    assert FAR in take(sight, log, 9, 2000)
-    assert sight.known == 9
-    sight.forget()
-    assert sight.known == -2
+    view, log = ClientView(), Log(dict.fromkeys(ROW, 10))
+    view.move((OWN,), 2, 4)
+    take(view, log, 5, 100)
+    assert view.known == 5
+    view.move(tuple(ROW), 2, 8)
+    assert FAR not in take(view, log, 8, 20)
+    assert view.known == 7
+    assert FAR in take(view, log, 9, 2000)
+    assert view.known == 9
+    view.forget()
+    assert view.known == -2
 
 
 def test_everything_goes_where_it_fits_first_whole_and_then_its_changes() -> None:
-    sight, log = looking(), Log(dict.fromkeys(ROW, 10))
-    assert sorted(take(sight, log, 5, 100)) == ROW
+    view, log = seeing(), Log(dict.fromkeys(ROW, 10))
+    assert sorted(take(view, log, 5, 100)) == ROW
     assert set(log.asked) == {(segment, KEYFRAME) for segment in ROW}
-    assert sorted(take(sight, log, 6, 100)) == ROW
+    assert sorted(take(view, log, 6, 100)) == ROW
     assert set(log.asked) == {(segment, 5) for segment in ROW}
 
 
 def test_the_own_segment_always_goes_and_one_more_however_little_room_there_is() -> None:
-    sight, log = looking(), Log(dict.fromkeys(ROW, 1000))
+    view, log = seeing(), Log(dict.fromkeys(ROW, 1000))
     others = set()
     for tick in range(1, 200):
-        own, other = take(sight, log, tick, 10)
+        own, other = take(view, log, tick, 10)
         assert own == OWN
         others.add(other)
-        assert sight.waits(tick) < 8
+        assert view.waits(tick) < 8
     assert others == {NEAR, FAR}
 
 
 def test_a_waiting_segment_is_sent_since_its_last_tick_and_none_starves() -> None:
-    sight, log = looking(), Log(dict.fromkeys(ROW, 10))
-    take(sight, log, 1, 100)
+    view, log = seeing(), Log(dict.fromkeys(ROW, 10))
+    take(view, log, 1, 100)
     latest = dict.fromkeys(ROW, 1)
     longest = dict.fromkeys(ROW, 0)
     for tick in range(2, 300):
-        for segment in take(sight, log, tick, 20):
+        for segment in take(view, log, tick, 20):
             longest[segment] = max(longest[segment], tick - latest[segment])
             latest[segment] = tick
-        assert not sight.lost_track(tick + 1, HISTORY)
+        assert not view.lost_track(tick + 1, HISTORY)
     assert longest[OWN] == 1
     assert longest[OWN] <= longest[NEAR] <= longest[FAR] < 8
 
 
 def test_a_part_is_asked_for_since_the_tick_it_was_sent_last() -> None:
-    sight, log = looking(), Log(dict.fromkeys(ROW, 10))
-    take(sight, log, 1, 100)
+    view, log = seeing(), Log(dict.fromkeys(ROW, 10))
+    take(view, log, 1, 100)
     sent = dict.fromkeys(ROW, 1)
     for tick in range(2, 50):
-        chosen = take(sight, log, tick, 20)
+        chosen = take(view, log, tick, 20)
         assert dict(log.asked) == sent
         sent |= dict.fromkeys(chosen, tick)
 
 
 @pytest.mark.parametrize("ticks", [HISTORY, HISTORY + 1])
 def test_a_client_that_is_too_far_behind_has_lost_track(ticks: int) -> None:
-    sight, log = looking(), Log(dict.fromkeys(ROW, 10))
-    take(sight, log, 1, 100)
-    assert sight.lost_track(1 + ticks, HISTORY) == (ticks > HISTORY)
-    sight.forget()
-    assert not sight.lost_track(1 + ticks, HISTORY)
-    take(sight, log, 1 + ticks, 100)
+    view, log = seeing(), Log(dict.fromkeys(ROW, 10))
+    take(view, log, 1, 100)
+    assert view.lost_track(1 + ticks, HISTORY) == (ticks > HISTORY)
+    view.forget()
+    assert not view.lost_track(1 + ticks, HISTORY)
+    take(view, log, 1 + ticks, 100)
     assert {since for _, since in log.asked} == {KEYFRAME}
 
 
 def test_only_sent_segments_that_are_no_longer_seen_are_dropped() -> None:
-    sight, log = looking(), Log(dict.fromkeys(ROW, 10))
-    take(sight, log, 1, 10)  # the client knows its own segment and one more
-    sight.move(((20, 0, 0),), 2)
-    assert sight.drops == [OWN, NEAR]
-    assert sight.sees == {(20, 0, 0)}
+    view, log = seeing(), Log(dict.fromkeys(ROW, 10))
+    take(view, log, 1, 10)  # the client knows its own segment and one more
+    view.move(((20, 0, 0),), 2)
+    assert view.drops == [OWN, NEAR]
+    assert view.sees == {(20, 0, 0)}
