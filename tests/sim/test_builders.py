@@ -54,7 +54,7 @@ LAN, TYPICAL = Link(0.001), Link(0.05, 0.01, 0.01)
         *long((TYPICAL, "flat", 20), (TYPICAL, "hills", 20), (LAN, "flat", 20), (LAN, "hills", 20)),
     ],
 )
-def test_builders_do_not_diverge_and_hear_of_every_edit(path: Link, scene: str, seconds: float) -> None:
+def test_builders_do_not_diverge_and_get_every_verdict(path: Link, scene: str, seconds: float) -> None:
     match = Match(load_scene(scene), 12)
     policies = [Building(seed) for seed in range(5)]
     players = [match.join(policy, path) for policy in policies]

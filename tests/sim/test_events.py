@@ -84,7 +84,7 @@ class Born(Rules):
     "path",
     long_but([Link(), PRESETS["wifi"]], [Link(), Link(0.02), *PRESETS.values()]),
 )
-def test_an_entity_is_there_when_an_event_tells_of_it(path: Link) -> None:
+def test_an_entity_is_known_before_an_event_names_it(path: Link) -> None:
     match, core = Match(FLAT, seed=1, rules=Born()), Watched()
     match.join(wander, path, core)
     match.run(20)
@@ -93,7 +93,7 @@ def test_an_entity_is_there_when_an_event_tells_of_it(path: Link) -> None:
 
 
 @pytest.mark.parametrize("rate", [30e3, *long(60e3)])
-def test_an_entity_is_there_when_an_event_tells_of_it_where_not_all_fits_into_a_snapshot(rate: float) -> None:
+def test_an_entity_is_known_before_an_event_names_it_if_snapshots_are_full(rate: float) -> None:
     rules = Born()
     rules.crowd = 120
     match, core = Match(FLAT, seed=2, rules=rules), Watched()
@@ -111,7 +111,7 @@ def test_an_entity_is_there_when_an_event_tells_of_it_where_not_all_fits_into_a_
     assert late < 5 * 32, "events wait, but not for long"
 
 
-def test_an_entity_is_there_when_an_event_told_while_one_was_away_speaks_of_it() -> None:
+def test_an_entity_is_known_before_an_event_from_a_reconnect_names_it() -> None:
     match, core = Match(FLAT, seed=3, rules=Born()), Watched(patience_s=30.0)
     player = match.join(wander, PRESETS["regional"], core)
     playing(match, player)
@@ -129,7 +129,7 @@ def test_an_entity_is_there_when_an_event_told_while_one_was_away_speaks_of_it()
 
 
 @pytest.mark.parametrize("path", long_but([Link(), PRESETS["lan"], PRESETS["thin"]], [Link(), *PRESETS.values()]))
-def test_joined_is_the_first_event_and_what_was_said_before_comes_behind_it(path: Link) -> None:
+def test_joined_is_the_first_event_and_earlier_game_events_follow_it(path: Link) -> None:
     match = Match(FLAT, seed=4, rules=Born())
     player = match.join(still, path)
     match.run(5)
@@ -140,7 +140,7 @@ def test_joined_is_the_first_event_and_what_was_said_before_comes_behind_it(path
     assert [event.tick for event in told] == sorted(event.tick for event in told)
 
 
-def test_who_is_not_let_in_hears_of_nothing_but_that() -> None:
+def test_a_refused_client_gets_only_the_refusal() -> None:
     match = Match(FLAT, seed=5, limits=Limits(clients_max=1), rules=Born())
     first = match.join(still)
     playing(match, first)
@@ -149,7 +149,7 @@ def test_who_is_not_let_in_hears_of_nothing_but_that() -> None:
     assert [type(event) for event in second.events] == [Left]
 
 
-def test_back_again_comes_before_what_was_said_meanwhile() -> None:
+def test_resumed_comes_before_the_game_events_sent_meanwhile() -> None:
     match = Match(FLAT, seed=6, rules=Born())
     player = match.join(still, PRESETS["typical"], Core("Ann", patience_s=30.0))
     playing(match, player)
@@ -172,15 +172,15 @@ class Loud(Rules):
     per_tick = 20
 
     def on_start(self) -> None:
-        self.said = 0
+        self.number = 0
 
     def on_join(self, player: Seat) -> None:
-        self.game.set(player.entity, "first", self.said)
+        self.game.set(player.entity, "first", self.number)
 
     def on_tick(self) -> None:
         for _ in range(self.per_tick):
-            self.game.send("n", self.said)
-            self.said += 1
+            self.game.send("n", self.number)
+            self.number += 1
 
     def on_command(self, player: Seat, name: str, payload: Any) -> None:
         pass
@@ -205,7 +205,7 @@ def check(match: Match, player: Player, *, dropped: bool) -> None:
     assert any(missing for missing, _ in told) is dropped
 
 
-def test_a_game_that_did_not_ask_for_a_while_gets_all_events() -> None:
+def test_a_game_that_polls_after_a_while_gets_all_events() -> None:
     match = Match(FLAT, seed=7, rules=Loud())
     player = match.join(still, Link(0.02))
     playing(match, player)
@@ -214,7 +214,7 @@ def test_a_game_that_did_not_ask_for_a_while_gets_all_events() -> None:
     check(match, player, dropped=False)
 
 
-def test_of_more_than_can_wait_the_client_says_how_many_are_missing() -> None:
+def test_if_too_many_events_wait_the_client_reports_the_missing_ones() -> None:
     rules = Loud()
     rules.per_tick = 200
     match = Match(FLAT, seed=8, limits=Limits(outbox_max=100_000), rules=rules)
@@ -232,7 +232,7 @@ def test_of_more_than_can_wait_the_client_says_how_many_are_missing() -> None:
 @pytest.mark.parametrize(
     ("preset", "seconds"), [("thin", 10), *long(("outage", 10), ("dip", 90), ("thin", 90), ("outage", 90))]
 )
-def test_of_more_than_goes_over_a_line_the_client_hears_how_many_are_missing(preset: str, seconds: float) -> None:
+def test_if_a_link_is_too_slow_for_the_events_the_missing_ones_are_reported(preset: str, seconds: float) -> None:
     rules = Loud()
     match = Match(FLAT, seed=9, rules=rules)
     player = match.join(still, PRESETS[preset])
@@ -245,13 +245,13 @@ def test_of_more_than_goes_over_a_line_the_client_hears_how_many_are_missing(pre
     check(match, player, dropped=preset != "outage")
     told = [event.data for event in player.events if isinstance(event, Happened)]
     missed = sum(event.count for event in player.events if isinstance(event, EventsDropped))
-    assert told[-1] == rules.said - 1
+    assert told[-1] == rules.number - 1
     assert len(told) + missed >= told[-1] - told[0] + 1
     assert match.game.counters.events_dropped == missed
 
 
 @pytest.mark.parametrize("per_tick", [20, *long(1)])
-def test_after_lost_connections_the_client_hears_how_many_are_missing(per_tick: int) -> None:
+def test_after_lost_connections_the_missing_events_are_reported(per_tick: int) -> None:
     rules = Loud()
     rules.per_tick = per_tick
     match = Match(FLAT, seed=10, limits=Limits(outbox_max=100), rules=rules)

@@ -88,14 +88,14 @@ def test_snapshots_are_as_fresh_as_the_link_delivers(
     ("preset", "seconds"),
     [("thin", 10), *long(("lan", 60), ("typical", 60), ("dip", 60), ("thin", 60))],
 )
-def test_where_the_system_cannot_tell_what_is_on_the_way_the_acknowledgements_do(
+def test_without_the_systems_count_acknowledgements_keep_snapshots_fresh(
     preset: str, seconds: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    told = sorted(ages(preset, seconds))
+    counted = sorted(ages(preset, seconds))
     monkeypatch.setattr(Player, "outstanding", lambda player: None)
     acknowledged = sorted(ages(preset, seconds))
-    p99 = int(0.99 * len(told))
-    assert acknowledged[p99] <= told[p99] + 3.5 * TICK_MS
+    p99 = int(0.99 * len(counted))
+    assert acknowledged[p99] <= counted[p99] + 3.5 * TICK_MS
 
 
 @pytest.mark.parametrize("seconds", [45, *long(80)])
@@ -113,7 +113,7 @@ def test_a_thin_link_stays_connected_and_sees_fresh_snapshots(seconds: float) ->
 
 
 @pytest.mark.parametrize("seconds", [8, *long(20)])
-def test_on_a_thin_link_nobody_is_starved(seconds: float) -> None:
+def test_on_a_thin_link_no_segment_is_starved(seconds: float) -> None:
     """Ten players see each other. Even the entity that waits longest was sent within the last second."""
     match = Match(load_scene("hills"), 16)
     players = [match.join(wander, PRESETS["thin"]) for _ in range(10)]
@@ -132,7 +132,7 @@ def test_on_a_thin_link_nobody_is_starved(seconds: float) -> None:
 
 
 @pytest.mark.parametrize("seconds", [50, *long(300)])
-def test_corrections_tell_their_story(seconds: float) -> None:
+def test_corrections_have_their_fields_distance_and_cause(seconds: float) -> None:
     match = Match(load_scene("hills"), 14)
     player = match.join(wander, PRESETS["far"])
     settled(match, player)
@@ -146,7 +146,7 @@ def test_corrections_tell_their_story(seconds: float) -> None:
         assert event.blocks < 5
 
 
-def test_the_same_seed_tells_the_same_story() -> None:
+def test_the_same_seed_gives_the_same_events() -> None:
     def story() -> list[object]:
         match = Match(load_scene("hills"), 15)
         players = [match.join(wander, PRESETS[preset]) for preset in ("wifi", "far")]

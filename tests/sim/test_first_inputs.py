@@ -19,7 +19,7 @@ def walking(core: Core, rng: random.Random) -> Input:
 
 
 @pytest.mark.parametrize("seed", long_but([0, 1], range(5)))
-def test_first_inputs_that_come_late_are_the_cause_of_what_they_cause(seed: int) -> None:
+def test_late_first_inputs_are_named_as_the_cause_of_corrections(seed: int) -> None:
     """A key is held while joining, and the link stalls when the first inputs leave. The server has no earlier input to
     repeat."""
     match = Match(load_scene("flat"), seed)

@@ -123,7 +123,7 @@ def test_outstanding_counts_what_is_not_acknowledged() -> None:
     assert wire.outstanding() == 0
 
 
-def test_what_is_on_a_wire_when_it_is_cut_never_comes() -> None:
+def test_packets_on_a_wire_that_is_cut_never_arrive() -> None:
     time, got = Time(), list[bytes]()
     wire = TcpStream(time, LinkEvents(Link(0.1), 1), 1, got.append)
     wire.send(b"before")
@@ -135,7 +135,7 @@ def test_what_is_on_a_wire_when_it_is_cut_never_comes() -> None:
     assert got == [b"before"]
 
 
-def test_what_has_not_arrived_is_told_in_order_whatever_was_lost() -> None:
+def test_waiting_messages_are_listed_in_order_with_any_losses() -> None:
     for seed in range(20):
         time, got = Time(), list[bytes]()
         wire = TcpStream(time, LinkEvents(Link(0.02, 0.01, 0.3), 1), seed, got.append)
@@ -168,7 +168,7 @@ def test_spikes_are_the_same_for_both_directions_and_last_about_a_second() -> No
     assert 0.130 < path.rtt_s + 2 * max(seen) <= 0.151
 
 
-def test_what_is_sent_during_an_outage_comes_after_it() -> None:
+def test_messages_sent_during_an_outage_arrive_after_it() -> None:
     path = replace(Link(0.02), outage=(3.0, 0.12))
     stream = Stream(path, 32, 60, 320)
     worst = max(stream.delays)

@@ -193,7 +193,7 @@ class Seen(Rules):
                 self.game.place(entity, (place[0] - 30, 60, 8))
 
 
-def test_an_entity_that_is_placed_where_all_is_sent_anew_is_never_drawn_elsewhere() -> None:
+def test_an_entity_that_is_placed_into_a_new_segment_is_never_drawn_elsewhere() -> None:
     rules = Seen()
     match = Match(FLAT, seed=6, rules=rules)
     player = join(match, Link(0.02))
@@ -235,7 +235,7 @@ def drawn_in_loopback(fps: float, link: str | Link | None, delay: int) -> set[fl
 
 
 @pytest.mark.parametrize(("fps", "delay"), long_but([(24.0, 3)], product([24.0, 60.0, 144.0], [0, 1, 3])))
-def test_i_am_never_drawn_between_where_i_was_and_where_i_was_put(fps: float, delay: int) -> None:
+def test_the_own_entity_is_never_drawn_between_its_old_and_its_new_place(fps: float, delay: int) -> None:
     assert drawn_in_loopback(fps, None, delay) <= {64.0, 74.0}
 
 
@@ -246,7 +246,7 @@ def test_i_am_never_drawn_between_where_i_was_and_where_i_was_put(fps: float, de
         product(["lan", "regional", "typical", "wifi", Link(0.002), Link(0.016)], [0, 3]),
     ),
 )
-def test_i_am_never_drawn_between_on_any_line(link: str | Link, delay: int) -> None:
+def test_the_own_entity_is_never_drawn_between_on_any_link(link: str | Link, delay: int) -> None:
     assert drawn_in_loopback(60.0, link, delay) == {64.0, 74.0}
 
 
@@ -256,7 +256,7 @@ class Pushed(Moved):
     places = ((64, 66, 8), (65.5, 66, 8))
 
 
-def test_a_short_way_is_no_correction_to_be_smoothed() -> None:
+def test_a_placement_over_a_short_distance_is_not_smoothed() -> None:
     match = Match(FLAT, seed=7, rules=Pushed())
     player = join(match, Link(0.03))
     match.run(3)

@@ -56,7 +56,7 @@ class Counted(Core):
 
 
 @pytest.mark.parametrize("preset", ["typical", *long("lan", "wifi")])
-def test_who_sleeps_until_something_is_due_wakes_up_once_per_tick_and_ping(preset: str) -> None:
+def test_a_program_that_sleeps_until_the_next_update_wakes_once_per_tick_and_ping(preset: str) -> None:
     match, core = Match(load_scene("hills"), 6), Counted()
     player = match.join(wander, PRESETS[preset], core)
     joined(match, player)
@@ -124,7 +124,7 @@ def test_the_input_delay_changes_in_mid_play_without_a_correction() -> None:
 
 
 @pytest.mark.parametrize("preset", ["typical", *long("far")])
-def test_a_command_tells_what_was_drawn_when_it_was_given(preset: str) -> None:
+def test_a_command_carries_the_view_tick_of_the_last_drawn_picture(preset: str) -> None:
     """At 60 frames/s, a command carries the view tick of the picture drawn last, not that of the update in between. It
     is never 100 ms beyond what is known."""
     match = Match(load_scene("flat"), 21)

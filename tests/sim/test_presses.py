@@ -166,7 +166,7 @@ def test_a_press_ahead_of_a_pause_is_not_remembered_for_the_time_after_it(pause_
     assert downs in ([], [last + 1]), "in the next tick, if it has an input"
 
 
-def test_a_press_while_nothing_is_heard_is_not_remembered() -> None:
+def test_a_press_while_the_server_is_silent_is_not_remembered() -> None:
     match = Match(FLAT, seed=6)
     player = match.join(kept, Link(0.02), Sent())
     core = playing(player)
@@ -185,7 +185,7 @@ def test_a_press_while_nothing_is_heard_is_not_remembered() -> None:
     assert not any(buttons for tick, buttons in core.buttons.items() if tick > last)
 
 
-def test_a_press_before_one_has_joined_does_not_count() -> None:
+def test_a_press_before_the_join_does_not_count() -> None:
     client = Loopback(Game(FLAT)).join("Ann")
     for frame in range(60 * 5):
         client.poll(frame / 60)

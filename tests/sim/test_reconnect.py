@@ -21,14 +21,14 @@ def joined(match: Match, player: Player) -> None:
     match.run_until(lambda: player.core.state == "playing", 30)
 
 
-def told(player: Player, *kinds: type) -> list[object]:
+def events_of(player: Player, *kinds: type) -> list[object]:
     return [event for event in player.events if isinstance(event, kinds)]
 
 
 @pytest.mark.parametrize(
     ("preset", "seed"), [("typical", 1), *long(("lan", 1), ("far", 1), ("lan", 2), ("typical", 2), ("far", 2))]
 )
-def test_who_is_cut_off_goes_on_with_the_same_entity(preset: str, seed: int) -> None:
+def test_a_player_whose_connection_is_lost_goes_on_with_the_same_entity(preset: str, seed: int) -> None:
     match = Match(load_scene("hills"), seed)
     player = match.join(wander, PRESETS[preset], Core("Ann", patience_s=10))
     witness = match.join(wander, PRESETS["lan"])
@@ -46,8 +46,8 @@ def test_who_is_cut_off_goes_on_with_the_same_entity(preset: str, seed: int) -> 
     match.run(10)
     assert player.core.entity == entity
     assert match.game.counters.joined == 2
-    assert len(told(player, Disconnected)) == len(told(player, Resumed)) == 3
-    assert not told(player, Left)
+    assert len(events_of(player, Disconnected)) == len(events_of(player, Resumed)) == 3
+    assert not events_of(player, Left)
     assert player.core.stats.divergences == 0
     # Afterwards the client plays as before: its world is the server's.
     assert all(event.cause != "nondeterminism" for event in player.events if isinstance(event, Corrected))
@@ -57,7 +57,7 @@ def test_who_is_cut_off_goes_on_with_the_same_entity(preset: str, seed: int) -> 
     assert prediction.confirmed.tick > truth.tick - 64
 
 
-def test_what_was_ordered_meanwhile_is_done_once() -> None:
+def test_commands_sent_meanwhile_are_carried_out_once() -> None:
     match = Match(load_scene("flat"), 3)
     player = match.join(lambda core, rng: core.input, Link(0.05), Core(patience_s=10))
     joined(match, player)
@@ -79,7 +79,7 @@ def test_what_was_ordered_meanwhile_is_done_once() -> None:
     assert player.core.stats.divergences == 0
 
 
-def test_whose_entity_was_not_kept_joins_anew() -> None:
+def test_a_player_whose_entity_was_not_kept_joins_anew() -> None:
     match = Match(load_scene("flat"), 4, limits=Limits(resume_s=0.1))
     player = match.join(wander, Link(0.05), Core(patience_s=10))
     joined(match, player)
@@ -90,7 +90,7 @@ def test_whose_entity_was_not_kept_joins_anew() -> None:
     match.run_until(lambda: player.core.state == "playing", 10)
     assert player.core.entity not in (0, entity)
     assert [event.entity for event in player.events if isinstance(event, Joined)] == [entity, player.core.entity]
-    assert not told(player, Resumed)
+    assert not events_of(player, Resumed)
     assert [event for event in player.events if isinstance(event, Answered)] == [
         Answered(number, False, "the connection was lost")
     ]
@@ -98,7 +98,7 @@ def test_whose_entity_was_not_kept_joins_anew() -> None:
     assert player.core.stats.divergences == 0
 
 
-def test_who_has_no_patience_or_was_told_to_go_does_not_come_back() -> None:
+def test_a_client_without_patience_or_closed_for_good_does_not_reconnect() -> None:
     match = Match(load_scene("flat"), 5)
     impatient = match.join(wander, Link(0.05), Core(patience_s=0))
     rude = match.join(wander, Link(0.05), Core(patience_s=10))
@@ -109,11 +109,11 @@ def test_who_has_no_patience_or_was_told_to_go_does_not_come_back() -> None:
     match.run(5)
     for player in (impatient, rude):
         assert player.core.state == "closed"
-        assert len(told(player, Left)) == 1
-        assert not told(player, Disconnected)
+        assert len(events_of(player, Left)) == 1
+        assert not events_of(player, Disconnected)
 
 
-def test_who_was_too_slow_to_say_hello_again_tries_once_more() -> None:
+def test_a_reconnect_whose_hello_was_too_slow_is_tried_again() -> None:
     match = Match(load_scene("flat"), 6)
     player = match.join(wander, Link(0.05), Core(patience_s=10))
     joined(match, player)
@@ -126,7 +126,7 @@ def test_who_was_too_slow_to_say_hello_again_tries_once_more() -> None:
     player.disconnect()
     match.run_until(lambda: player.core.state == "playing", 10)
     assert player.core.entity == entity
-    assert not told(player, Left)
+    assert not events_of(player, Left)
 
 
 def test_waits_grow_spread_and_end() -> None:

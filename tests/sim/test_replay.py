@@ -187,7 +187,7 @@ def test_the_script_names_the_tick_that_differs(
     assert "differs at tick 33" in capsys.readouterr().out
 
 
-def test_the_script_refuses_what_is_no_recording(tmp_path: File, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_script_refuses_a_file_that_is_no_recording(tmp_path: File, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "text").write_text("hello", "utf-8")
     assert replay.main([str(tmp_path / "text")]) == 2
     assert replay.main([str(tmp_path / "nowhere")]) == 2

@@ -116,7 +116,7 @@ def test_stop_after_stop() -> None:
         assert used_share(match, player, 2) == 1.0
 
 
-def test_after_a_stop_what_is_pressed_now_is_what_counts() -> None:
+def test_after_a_stop_the_present_input_counts() -> None:
     """Inputs that were sent ahead while the server stood still are withdrawn, so they are not used later."""
     match = Match(FLAT, 1)
     player = match.join(lambda core, rng: core.input, NEAR)
@@ -163,7 +163,7 @@ def test_any_frame_rate_plays(rate: int, fps: float) -> None:
         *long((128, 1.0, 0), (240, 0.42, 0), (240, 1.0, 60), (128, 0.5, 0), (32, 1.0, 0), (20, 1.0, 0)),
     ],
 )
-def test_a_long_way_plays_at_any_rate(rate: int, rtt_s: float, fps: float) -> None:
+def test_a_long_link_plays_at_any_rate(rate: int, rtt_s: float, fps: float) -> None:
     match = Match(dataclasses.replace(FLAT, tick_rate=rate), 3)
     player = match.join(wander, Link(rtt_s / 2))
     player.frame_s = 1 / fps if fps else 0.0

@@ -47,7 +47,9 @@ def above_oracle(row: lead_trial.Row) -> float:
         ("thin", 0.010, 3.0, 1.0),
     ],
 )
-def test_must_hold(preset: str, late: float, added_ticks: float, above_ticks: float, seed: int, minutes: float) -> None:
+def test_lateness_and_latency_are_within_their_limits(
+    preset: str, late: float, added_ticks: float, above_ticks: float, seed: int, minutes: float
+) -> None:
     row = played(preset, seed, minutes)
     assert row["fair_late_share"] <= late
     assert row["fair_latency_ms"] <= added_ticks * TICK_MS
