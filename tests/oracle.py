@@ -181,7 +181,7 @@ class Oracle:
         )
 
     def _others(self, body: Body, wish: Fraction) -> list[Box]:
-        """Yields the boxes of the solid entities that could stop a body within its reach."""
+        """Returns the boxes of the solid entities that could stop a body within its reach."""
         if not self.pairs or not self.kinds[body.kind].solid:
             return []
         x, y, z = body.near
@@ -222,6 +222,6 @@ class Oracle:
 
 
 def _cells(low: list[Fraction], high: list[Fraction]) -> list[Block]:
-    """Yields the blocks that the open box between two corners overlaps."""
+    """Returns the blocks that the open box between two corners overlaps."""
     spans = [range(math.floor(a), math.ceil(b)) for a, b in zip(low, high, strict=True)]
     return [(x, y, z) for z in spans[2] for y in spans[1] for x in spans[0]]

@@ -79,7 +79,7 @@ def scripted_server(script: Callable[[socket.socket], object]) -> Iterator[str]:
 
 
 def accept(sock: socket.socket) -> Peer:
-    """Runs the server's side of the handshake."""
+    """Runs the server's side of the handshake. Returns the peer."""
     peer = Peer()
     while not any(isinstance(event, Request) for event in peer.receive(sock.recv(65536))):
         pass

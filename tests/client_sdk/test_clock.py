@@ -51,7 +51,8 @@ class Loop:
         self._need, self._delay, self._reported = need, delay, 0
 
     def run(self, inputs: int) -> "Loop":
-        """Runs `inputs` ticks. Inputs that arrived in one burst are reported at once, `delay` ticks later."""
+        """Runs `inputs` ticks. Inputs that arrived in one burst are reported at once, `delay` ticks later. Returns
+        itself."""
         for i in range(len(self.phases), len(self.phases) + inputs):
             self.jumps += self.timeline.steer(self.lead, self.clock, i / RATE)
             self.phases.append(self.timeline.phase)
@@ -64,7 +65,7 @@ class Loop:
         return self
 
     def speeds(self) -> Iterator[float]:
-        """Yields the change of the phase in each tick."""
+        """Returns the change of the phase in each tick."""
         return (after - before for before, after in pairwise(self.phases))
 
 

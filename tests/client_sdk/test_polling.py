@@ -28,7 +28,7 @@ def url() -> Iterator[str]:
 
 
 def play(client: Client, until: Callable[[], bool], seconds: float = 20.0) -> list[Event]:
-    """Runs a game's loop until a condition holds."""
+    """Runs a game's loop until a condition holds. Returns the events."""
     events: list[Event] = []
     deadline = time.monotonic() + seconds
     while not until():

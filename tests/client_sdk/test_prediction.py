@@ -63,7 +63,8 @@ class Pair:
             self.server.step({e: input_ if e == ME else others for e in self.server.entities["id"].tolist()})
 
     def tell(self, since: int = 0, segments: Iterable[Cell] = (HERE, BESIDE), **fields: Any) -> str:
-        """Applies a snapshot of these segments to the client, with all changes."""
+        """Applies a snapshot of these segments to the client, with all changes. Returns the result of
+        `Confirmed.apply`."""
         parts = [
             msgpack.unpackb(encode_part(segment, since, self.server.in_segment(segment), **fields))
             for segment in segments

@@ -34,7 +34,7 @@ def test_the_lock_pins_by_content_and_names_no_registry() -> None:
 
 @pytest.fixture
 def installed(tmp_path: Path) -> Path:
-    """Yields a directory with the example and its two packages."""
+    """Returns a directory with the example and its two packages."""
     npm = shutil.which("npm")
     if npm is None or shutil.which("node") is None:
         pytest.skip("there is no Node.js with npm on this machine")

@@ -18,7 +18,7 @@ from tests.lengths import long_but
 
 
 def skeleton() -> Rules:
-    """The game that `scripts/new-game` writes."""
+    """Returns the game that `scripts/new-game` writes."""
     space: dict[str, type[Rules]] = {}
     exec(new_game.RULES.format(name="mine", title="Mine"), space)
     return space["Mine"]()

@@ -21,7 +21,7 @@ CAUSES = {"late input", "other entity", "server act", "unknown edit", "missing t
 
 
 def played(count: int, seconds: float, seed: int, path: Link) -> tuple[Match, list[Player], io.BytesIO]:
-    """Returns a recorded game with a number of bots."""
+    """Plays a recorded game with `count` bots. Returns the match, its players and the recording."""
     match = Match(load_scene(Tag.scene), seed, rules=Tag())
     recording = io.BytesIO()
     match.game.world.record(recording)

@@ -61,7 +61,7 @@ def installed(package: str) -> bool:
 
 
 def top_level(package: str) -> Iterator[Path]:
-    """Returns the files and folders of a distribution in `site-packages`."""
+    """Yields the files and folders of a distribution in `site-packages`."""
     for path in importlib.metadata.files(package) or ():
         if path.parts[0] not in ("..", "__pycache__"):
             yield Path(str(path.locate())).parents[len(path.parts) - 1] / path.parts[0]

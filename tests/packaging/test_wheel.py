@@ -53,7 +53,7 @@ class Installed(NamedTuple):
         return run(self.folder, str(self.python.parent / name), *arguments)
 
     def served(self, *flags: str) -> AbstractContextManager[str]:
-        """Yields the URL of an installed server in the user's folder."""
+        """Returns a context with the URL of an installed server in the user's folder."""
         return real_server(*flags, program=(str(self.python.parent / "sovereign-server"),), folder=self.folder)
 
 

@@ -13,7 +13,7 @@ _HEADING_OR_FENCE = re.compile(r"^#+ ([^\n]+)$|^```(\w*)[^\n]*\n(.*?)^```$", re.
 
 
 def programs(language: str = "python") -> dict[str, str]:
-    """All blocks of a language in the pages, in order; each heading has one at most."""
+    """Returns all blocks of a language in the pages, in order, by their heading; each heading has one at most."""
     found: dict[str, str] = {}
     for page in PAGES:
         heading = ""
@@ -26,7 +26,7 @@ def programs(language: str = "python") -> dict[str, str]:
 
 
 def headings(page: Path) -> set[str]:
-    """The anchors of a page, as GitHub makes them."""
+    """Returns the anchors of a page, as GitHub makes them."""
     titles = [title for title, _, _ in _HEADING_OR_FENCE.findall(page.read_text("utf-8")) if title]
     anchors = [re.sub(r"[^\w\- ]", "", title.lower()).replace(" ", "-") for title in titles]
     assert len(anchors) == len(set(anchors)), f"{page.name}: the same heading twice"
@@ -34,7 +34,7 @@ def headings(page: Path) -> set[str]:
 
 
 def section(page: Path, title: str) -> str:
-    """The text under a heading of the second level, up to the next one."""
+    """Returns the text under a heading of the second level, up to the next one."""
     _, heading, text = page.read_text("utf-8").partition(f"\n## {title}\n")
     assert heading, f"{page.name}: no heading {title!r}"
     return text.partition("\n## ")[0]

@@ -21,7 +21,7 @@ each_page = pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 
 @cache
 def definitions(path: Path) -> frozenset[str]:
-    """The names that a source file defines: `f`, `Class`, `CONSTANT`, `Class.method`, `Class.attribute`."""
+    """Returns the names that a source file defines: `f`, `Class`, `CONSTANT`, `Class.method`, `Class.attribute`."""
     found: set[str] = set()
     for node in ast.parse(path.read_text("utf-8")).body:
         found.update(_names(node))
@@ -33,7 +33,7 @@ def definitions(path: Path) -> frozenset[str]:
 
 
 def _names(node: ast.AST, of: str = "") -> list[str]:
-    """The names that a statement defines, or the attributes of the object `of` that it assigns."""
+    """Returns the names that a statement defines, or the attributes of the object `of` that it assigns."""
     if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef):
         return [] if of else [node.name]
     targets = node.targets if isinstance(node, ast.Assign) else [node.target] if isinstance(node, ast.AnnAssign) else []

@@ -19,7 +19,7 @@ CALLED_BY_THE_GAME = {"discard"}
 
 
 def first_cells(text: str) -> list[str]:
-    """The code in the first cells of a text's tables, without arguments."""
+    """Returns the code in the first cells of a text's tables, without arguments."""
     cells = [line.split("|")[1] for line in text.splitlines() if line.startswith("|")]
     return [re.sub(r"\W.*", "", code) for cell in cells for code in re.findall(r"`([^`]+)`", cell)]
 

@@ -16,7 +16,7 @@ def cube(centre: Cell, radius: int) -> set[Cell]:
 
 
 def moved(sees: set[Cell], centre: Cell, see: int = 1, keep: int = 2) -> tuple[list[Cell], list[Cell]]:
-    """Returns the segments after one update."""
+    """Applies one update to `sees`. Returns the added and the dropped segments."""
     added, dropped = update(sees, around(centre, see, EVERYWHERE), keep)
     sees.difference_update(dropped)
     sees.update(added)

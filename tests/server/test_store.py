@@ -204,7 +204,7 @@ def contents(directory: Path) -> dict[str, bytes]:
 
 
 def refused(directory: Path, scene: object = SCENE) -> str:
-    """The message with which a directory is refused; what is in it must stay as it is."""
+    """Checks that a directory is refused and stays as it is. Returns the message."""
     before = contents(directory)
     with pytest.raises(StoreError) as error:
         Store(directory, scene, compiled=False)  # type: ignore[arg-type]

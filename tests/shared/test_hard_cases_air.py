@@ -19,7 +19,7 @@ EXACT_GRAVITY, EXACT_JUMP = Fraction(225, 16), Fraction(15, 2)
 
 
 def flyer(compiled: bool, integrator: str, rate: int, gravity: Fraction, jump: Fraction) -> tuple[World, int]:
-    """Returns an entity on a floor at z = 0 that presses jump in the next tick only."""
+    """Returns a world and an entity on a floor at z = 0 that presses jump in the next tick only."""
     templates = (Template("flyer", (0, 0, 0), (1, 1, 1), walk_speed=3, jump_speed=float(jump)),)
     world = build(
         [floor()], compiled=compiled, integrator=integrator, tick_rate=rate, gravity=float(gravity),

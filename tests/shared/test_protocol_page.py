@@ -30,7 +30,7 @@ def blocks(kind: str) -> list[tuple[str, str]]:
 
 
 def lines(text: str) -> list[tuple[bytes, str]]:
-    """Yields bytes and note of each line. Bytes without a note belong to the line before."""
+    """Returns bytes and note of each line. Bytes without a note belong to the line before."""
     found: list[tuple[bytes, str]] = []
     for line in text.splitlines():
         digits, _, note = line.partition("   ")
@@ -43,7 +43,7 @@ def lines(text: str) -> list[tuple[bytes, str]]:
 
 
 def table(*heads: str) -> list[list[str]]:
-    """Yields the cells of each row of the one table that begins with these headings."""
+    """Returns the cells of each row of the one table that begins with these headings."""
     pattern = re.escape("| " + " | ".join(heads)) + r".*\n\|[-|]+\n((?:\|.*\n)+)"
     (found,) = re.findall(pattern, PAGE)
     return [[cell.strip() for cell in re.split(r"(?<!\\)\|", row.strip("|"))] for row in found.splitlines()]
