@@ -84,7 +84,7 @@ class Deaf(Core):
 
 
 def joined() -> tuple[Match, Deaf]:
-    """Returns a match with one walker who has played for 5 s."""
+    """Plays with one walker for 5 s. Returns the match and its core."""
     match, core = Match(load_scene("flat"), 1), Deaf()
 
     def policy(core: Core, rng: Random) -> Input:

@@ -46,7 +46,7 @@ def sent(
     gone: list[int] | None = None,
     edits: list[tuple[int, int]] | None = None,
 ) -> tuple[DecodedDelta, list[State]]:
-    """Returns a part as a peer decodes it."""
+    """Returns a part and its states as a peer decodes them."""
     rows = np.array(states, np.int64).reshape(-1, CELL)
     part = msgpack.unpackb(encode_part(segment, ago, rows, gone or [], edits or [], check=9))
     parts, decoded, _ = decode_parts([part], 255)
