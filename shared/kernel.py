@@ -26,6 +26,7 @@ from typing import Any
 from shared.inputs import JUMP, MOVE_MAX
 from shared.jit import decorators
 from shared.layout import (
+    AIR,
     AWAKE,
     BUTTONS,
     CANDIDATE,
@@ -44,6 +45,7 @@ from shared.layout import (
     GO_X,
     GO_Y,
     GRAVITY,
+    GROUND,
     ID,
     JUMP_SPEED,
     LAUNCH,
@@ -60,13 +62,16 @@ from shared.layout import (
     N_WOKEN,
     NEXT,
     NOWHERE,
+    OVERSPEED,
     PAIRS,
     PREV,
     RATE,
     REACH_HI,
     REACH_LO,
     SIZE_X,
+    SLOW_DOWN,
     SOLID,
+    SPEED_UP,
     STOP_X,
     STOP_Y,
     STOP_Z,
@@ -74,11 +79,13 @@ from shared.layout import (
     TEMPLATE_COLUMNS,
     TERMINAL,
     TOLD,
+    TOP_SQUARE,
     TURN,
     VX,
     VY,
     VZ,
     WALKS,
+    WEIGHT,
     WHOLE,
     WIDTH_SHIFT,
     Arrays,
@@ -366,6 +373,47 @@ def displacement(p: Any, velocity_sum: int) -> int:
 
 
 @inlined
+def length(x: int, y: int) -> int:
+    """Returns the length of a vector, rounded down. Its parts are below 2^31."""
+    x = abs(x)
+    y = abs(y)
+    square = x * x + y * y
+    root = max(x, y) + (min(x, y) + 1) // 2  # at least the length, so that Newton's method falls to the result
+    while root > 0:
+        closer = (root + square // root) // 2
+        if closer >= root:
+            break
+        root = closer
+    return root
+
+
+@inlined
+def pace(t: Any, kind: int, falling: int, walks: bool, vx: int, vy: int) -> int:
+    """Returns by how much the horizontal velocity can change in this tick, in velocity steps.
+
+    `t` has the templates, `kind` is the start of the entity's row there, and `walks` says whether it has a direction.
+    """
+    column = SLOW_DOWN
+    if walks:
+        column = OVERSPEED if vx * vx + vy * vy > t[kind + TOP_SQUARE] else SPEED_UP
+    rate: int = t[kind + (GROUND if falling == 0 else AIR) + column]
+    return rate
+
+
+@inlined
+def toward(v: int, wish: int, rate: int, away: int) -> int:
+    """Returns one part of a velocity that approaches a wished one by at most `rate`.
+
+    `away` is the length of the whole difference. The step is rounded to the nearest whole number, so it never vanishes
+    along all axes and never passes the wish. It is the same for mirrored vectors.
+    """
+    if away <= rate:
+        return wish
+    step = (2 * abs(wish - v) * rate + away) // (2 * away)
+    return v + step if wish > v else v - step
+
+
+@inlined
 def stands_on_block(w: Arrays, x0: int, y0: int, x1: int, y1: int, z: int) -> bool:
     """Returns whether a solid block touches the underside of a box on an area, not only at an edge."""
     if z & (BLOCK - 1) != 0:
@@ -466,7 +514,7 @@ def turn(w: Arrays, row: int, key: int, tick: int) -> bool:
         vx = w.walk[walk + east]
         vy = w.walk[walk + north]
     from_vz = vz
-    if p[GRAVITY] != 0:
+    if t[kind + WEIGHT] != 0:
         jumps = e[at + BUTTONS] & JUMP != 0 and t[kind + JUMP_SPEED] != 0
         if falling == 0 or jumps:
             if stands_on_block(w, x0, y0, x1, y1, z0) or (meets and stands_on_entity(w, row, x0, y0, x1, y1, z0)):
@@ -479,8 +527,19 @@ def turn(w: Arrays, row: int, key: int, tick: int) -> bool:
                 events = FALL
         from_vz = vz
         if falling != 0:
-            vz = max(vz - p[GRAVITY], -p[TERMINAL])
+            vz = max(vz - t[kind + WEIGHT], -p[TERMINAL])
         if p[MEAN] == 0:
+            from_vz = vz
+    if t[kind + TOP_SQUARE] != 0:
+        if t[kind + WALKS] == 0:
+            vx = 0
+            vy = 0
+        rate = pace(t, kind, falling, walks, e[at + VX], e[at + VY])
+        away = length(vx - e[at + VX], vy - e[at + VY])
+        vx = toward(e[at + VX], vx, rate, away)
+        vy = toward(e[at + VY], vy, rate, away)
+        if t[kind + WEIGHT] == 0:
+            vz = toward(vz, 0, t[kind + GROUND + SLOW_DOWN], abs(vz))
             from_vz = vz
 
     moved = False
@@ -536,14 +595,14 @@ def turn(w: Arrays, row: int, key: int, tick: int) -> bool:
     if went_x != dx:
         if told or went_x != 0 or e[at + VX] != 0:
             events |= STOP_X
-    elif vx != e[at + VX] and not told:
+    elif vx != e[at + VX] and not told and (t[kind + TOP_SQUARE] == 0 or e[at + VX] == 0):
         events |= GO_X
     if went_y != dy:
         if told or went_y != 0 or e[at + VY] != 0:
             events |= STOP_Y
-    elif vy != e[at + VY] and not told:
+    elif vy != e[at + VY] and not told and (t[kind + TOP_SQUARE] == 0 or e[at + VY] == 0):
         events |= GO_Y
-    if moved or told or events != 0 or vz != e[at + VZ]:
+    if moved or told or events != 0 or vz != e[at + VZ] or vx != e[at + VX] or vy != e[at + VY]:
         e[at + VX] = vx
         e[at + VY] = vy
         e[at + VZ] = vz
@@ -657,7 +716,8 @@ def write(w: Arrays, row: int, states: Any, i: int, tick: int) -> None:
     awake = e[at + FLAGS] & AWAKE
     for k in range(CELL):
         e[at + k] = states[i + k]
-    e[at + FLAGS] = e[at + FLAGS] & FALLING | awake
+    falls = FALLING if w.templates[e[at + TEMPLATE] * TEMPLATE_COLUMNS + WEIGHT] != 0 else 0
+    e[at + FLAGS] = e[at + FLAGS] & falls | awake
     mark(w, row, tick, WHOLE)
     relink(w, row)
     wake(w, row, -1)
@@ -723,22 +783,41 @@ def advance(w: Arrays, row: int, events: int, turns: Any, i: int) -> None:
         e[at + MOVE_X] = min(max(turns[i + 2], -MOVE_MAX), MOVE_MAX)
         e[at + MOVE_Y] = min(max(turns[i + 3], -MOVE_MAX), MOVE_MAX)
         e[at + BUTTONS] = turns[i + 4]
-    if t[kind + WALKS] != 0:
-        walk = e[at + TEMPLATE] * MOVES + MOVE_MAX
-        if events & (TOLD | GO_X) != 0:
-            vx = w.walk[walk + e[at + MOVE_X]]
-        if events & (TOLD | GO_Y) != 0:
-            vy = w.walk[walk + e[at + MOVE_Y]]
     if events & LAUNCH != 0:
         vz = t[kind + JUMP_SPEED]
     if events & (LAUNCH | FALL) != 0:
         falling = FALLING
+    go_x = events & (TOLD | GO_X) != 0
+    go_y = events & (TOLD | GO_Y) != 0
+    walk = e[at + TEMPLATE] * MOVES + MOVE_MAX
+    if t[kind + TOP_SQUARE] != 0:
+        wish_x = 0
+        wish_y = 0
+        walks = False
+        if t[kind + WALKS] != 0:
+            walks = e[at + MOVE_X] != 0 or e[at + MOVE_Y] != 0
+            wish_x = w.walk[walk + e[at + MOVE_X]]
+            wish_y = w.walk[walk + e[at + MOVE_Y]]
+        rate = pace(t, kind, falling, walks, vx, vy)
+        away = length(wish_x - vx, wish_y - vy)
+        if vx != 0 or go_x:  # without an event, an axis along which the entity rests is blocked
+            vx = toward(vx, wish_x, rate, away)
+        if vy != 0 or go_y:
+            vy = toward(vy, wish_y, rate, away)
+    elif t[kind + WALKS] != 0:
+        if go_x:
+            vx = w.walk[walk + e[at + MOVE_X]]
+        if go_y:
+            vy = w.walk[walk + e[at + MOVE_Y]]
     from_vz = vz
-    if p[GRAVITY] != 0:
+    if t[kind + WEIGHT] != 0:
         if falling != 0:
-            vz = max(vz - p[GRAVITY], -p[TERMINAL])
+            vz = max(vz - t[kind + WEIGHT], -p[TERMINAL])
         if p[MEAN] == 0:
             from_vz = vz
+    elif t[kind + TOP_SQUARE] != 0:
+        vz = toward(vz, 0, t[kind + GROUND + SLOW_DOWN], abs(vz))
+        from_vz = vz
     x = e[at + X]
     y = e[at + Y]
     z = e[at + Z]

@@ -30,22 +30,30 @@ AWAKE = 2
 EVENT_BITS = 9
 """Number of bits for the events of a turn."""
 STOP_X, STOP_Y, STOP_Z, GO_X, GO_Y, FALL, LAUNCH, TOLD, WHOLE = (1 << bit for bit in range(EVENT_BITS))
-"""Events of a turn. STOP_X, STOP_Y, STOP_Z: it stopped along that axis. GO_X, GO_Y: it walks again as its input says.
-FALL: nothing supports it any more. LAUNCH: it jumped. TOLD: it has a new input. WHOLE: it was written from outside, or
-came into another segment, so its whole state is needed."""
+"""Events of a turn. STOP_X, STOP_Y, STOP_Z: it stopped along that axis. GO_X, GO_Y: it begins to move along that axis
+without a new input, as its input says. FALL: nothing supports it any more. LAUNCH: it jumped. TOLD: it has a new input.
+WHOLE: it was written from outside, or came into another segment, so its whole state is needed."""
 TURN = 8
 """Number of columns of an explicit turn: id (for the kernel: row, or -1), events, input (3), position (3)."""
 
-LO_X, LO_Y, LO_Z, SIZE_X, SIZE_Y, SIZE_Z, SOLID, WALKS, JUMP_SPEED = range(9)
+LO_X, LO_Y, LO_Z, SIZE_X, SIZE_Y, SIZE_Z, SOLID, WALKS, JUMP_SPEED, WEIGHT, TOP_SQUARE, GROUND, AIR = (
+    *range(12), 14,
+)  # fmt: skip
 """Columns of a template's row. LO and SIZE: low corner of the box relative to the position, and its sides, in grid
-steps. SOLID, WALKS: 0 or 1. JUMP_SPEED: in velocity steps."""
-TEMPLATE_COLUMNS = 9
+steps. SOLID, WALKS: 0 or 1. JUMP_SPEED: in velocity steps. WEIGHT: change of the velocity by gravity, in velocity steps
+per tick; 0: the entity floats. TOP_SQUARE: square of the greatest walking speed in velocity steps; 0: the horizontal
+velocity follows the input at once, and the columns behind have no meaning. GROUND: the first of three columns, each
+the greatest change of the horizontal velocity in velocity steps per tick: with an input (SPEED_UP), without one
+(SLOW_DOWN), and above the walking speed (OVERSPEED). AIR: the first of the three for an entity that falls."""
+SPEED_UP, SLOW_DOWN, OVERSPEED = range(3)
+"""Offsets from the columns GROUND and AIR."""
+TEMPLATE_COLUMNS = 17
 """Number of columns of a template's row."""
 
 GRAVITY, TERMINAL, RATE, EXACT, MEAN, PAIRS, FLOOR = range(7)
-"""Places of a scene's numbers in `Arrays.parameters`. GRAVITY: velocity steps per tick. TERMINAL: greatest fall speed,
-in velocity steps. RATE: ticks per second. EXACT: 128 / RATE if that is a whole number, else 0. MEAN: 1 for the
-integrator "mean". PAIRS: 1 if solid entities stop each other. FLOOR: lowest z of the scene, in blocks."""
+"""Places of a scene's numbers in `Arrays.parameters`. GRAVITY: 1 if gravity acts on any template. TERMINAL: greatest
+fall speed, in velocity steps. RATE: ticks per second. EXACT: 128 / RATE if that is a whole number, else 0. MEAN: 1 for
+the integrator "mean". PAIRS: 1 if solid entities stop each other. FLOOR: lowest z of the scene, in blocks."""
 REACH_LO, REACH_HI = 7, 10
 """Places in `Arrays.parameters` of how far any template's box reaches below and above its position, three numbers each,
 in grid steps."""
@@ -82,7 +90,7 @@ class Arrays(NamedTuple):
     """
 
     entities: Any  # [rows * 16]
-    templates: Any  # [templates * 9]
+    templates: Any  # [templates * 17]
     walk: Any  # [templates * 255] velocity for a move intent of -127..127
     parameters: Any  # [13]
     solid: Any  # uint32 [segments * 1024] bit x of word z << 5 | y within the segment

@@ -18,91 +18,26 @@ from shared import layout
 from shared.bounds import TICK_RATE_MAX
 from shared.checks import Cell, SceneError, Vec, boolean, cell, choice, finite, items, shown, text, vector, whole
 from shared.inputs import MOVE_MAX
+from shared.template import Template, own_numbers
 from shared.units import RANGE_BLOCKS, SEGMENT, SPEED, rounded, to_position, to_velocity
+
+__all__ = ["INTEGRATORS", "SCENES", "Scene", "Template", "load_scene"]
 
 TEMPLATES_MAX = 255
 """Limit of the templates of a scene."""
 SEGMENTS_MAX = 1 << 16
 """Limit of the segments of a scene."""
-BOX_MAX = 32.0
-"""Longest side, and longest offset, of a template's box, in blocks."""
 REACH_MAX = 1024.0
 """Greatest reach of a player, in blocks."""
 INTEGRATORS = ("mean", "semi")
 """Choices of `Scene.integrator`."""
-SHOWN = ("interpolated", "predicted")
-"""Choices of `Template.shown`."""
 
 OPTIONAL: frozenset[str] = frozenset()
 """Fields of scenes and templates that a table leaves out if they have their default, so that scenes without them keep
-their bytes and their fingerprint."""
+their bytes and their fingerprint. A field that is None is left out, too."""
 
 SCENES = Path(__file__).parent / "scenes"
 """Folder of the scenes that come with the package."""
-
-
-def _own_numbers(owner: Any) -> None:
-    """Replaces numpy's numbers in the fields of a dataclass by Python's own, because MessagePack holds no others."""
-    for f in fields(owner):
-        value = getattr(owner, f.name)
-        if isinstance(value, np.generic):
-            object.__setattr__(owner, f.name, value.item())
-
-
-@dataclass(frozen=True)
-class Template:
-    """A named set of properties that entities share. Lengths in blocks, speeds in blocks/s.
-
-    Args:
-        name: name of the template.
-        box_offset: displacement of the box's corner from the entity's position.
-        box_size: sides of the box; a negative side extends the box to the other direction, as the project's first
-            proposal did for y.
-        walk_speed: speed with which an entity follows its input; 0: it ignores inputs and keeps its velocity.
-        jump_speed: upward speed of a jump; 0: an entity cannot jump.
-        solid: whether entities of this template and other solid ones stop each other, and stand on each other. Blocks
-            stop every entity.
-        shown: how clients draw such entities, apart from their own: "interpolated" (a little in the past) or
-            "predicted" (now, if their inputs do not change).
-
-    Raises:
-        SceneError: a value is not valid; the message names it.
-    """
-
-    name: str
-    box_offset: Vec = (-0.3, -0.3, 0.0)
-    box_size: Vec = (0.6, 0.6, 1.8)
-    walk_speed: float = 0.0
-    jump_speed: float = 0.0
-    solid: bool = True
-    shown: str = "interpolated"
-
-    def __post_init__(self) -> None:
-        _own_numbers(self)
-        at = f"templates.{text(self.name, 'templates.name')}"
-        offset = vector(self.box_offset, f"{at}.box_offset")
-        size = vector(self.box_size, f"{at}.box_size")
-        for axis, offset_k, size_k in zip("xyz", offset, size, strict=True):
-            if to_position(size_k, f"{at}.box_size.{axis}") == 0:
-                raise SceneError(f"{at}.box_size.{axis} = {size_k!r}: must not be zero")
-            if abs(size_k) > BOX_MAX or abs(offset_k) > BOX_MAX:
-                raise SceneError(f"{at}.box: {axis} reaches further than {BOX_MAX:g} blocks")
-        for name in ("walk_speed", "jump_speed"):
-            if to_velocity(getattr(self, name), f"{at}.{name}") < 0:
-                raise SceneError(f"{at}.{name} = {getattr(self, name)!r}: must not be negative")
-        boolean(self.solid, f"{at}.solid")
-        choice(self.shown, f"{at}.shown", SHOWN)
-        object.__setattr__(self, "box_offset", offset)
-        object.__setattr__(self, "box_size", size)
-
-    def row(self) -> list[int]:
-        """Returns the row of `layout.Arrays.templates`. The box gets its low corner and positive sides."""
-        low, sides = [], []
-        for axis, offset, size in zip("xyz", self.box_offset, self.box_size, strict=True):
-            ends = sorted((to_position(offset, axis), to_position(offset, axis) + to_position(size, axis)))
-            low.append(ends[0])
-            sides.append(ends[1] - ends[0])
-        return [*low, *sides, self.solid, self.walk_speed > 0, to_velocity(self.jump_speed, "jump_speed")]
 
 
 @dataclass(frozen=True)
@@ -152,7 +87,7 @@ class Scene:
         return f"<Scene {self.name!r}, {blocks} blocks, {self.tick_rate} ticks/s>"
 
     def __post_init__(self) -> None:
-        _own_numbers(self)
+        own_numbers(self)
         text(self.name, "name")
         whole(self.tick_rate, "tick_rate", 1, TICK_RATE_MAX)
         for name in ("gravity", "terminal_speed"):
@@ -201,6 +136,11 @@ class Scene:
         if len(set(names)) < len(names):
             raise SceneError(f"templates: two have the same name ({', '.join(names)})")
         self.template(self.player, "player")
+        for template in self.templates:
+            weight = template.rates(self.gravity, self.tick_rate)[0]
+            if weight > 0 and to_velocity(self.terminal_speed, "terminal_speed") == 0:
+                at = f"templates.{template.name}.gravity = {template.gravity!r}"
+                raise SceneError(f"{at}: terminal_speed = {self.terminal_speed!r} lets nothing fall")
 
     @classmethod
     def from_table(cls, table: Mapping[str, Any]) -> "Scene":
@@ -284,10 +224,11 @@ class Scene:
 
     def kernel_tables(self) -> tuple[layout.Int64s, layout.Int64s, layout.Int64s]:
         """Returns templates, walk velocities and parameters for `layout.Arrays`; each number is rounded once."""
-        templates = np.array([template.row() for template in self.templates], np.int64)
+        rows = [[*template.row(), *template.rates(self.gravity, self.tick_rate)] for template in self.templates]
+        templates = np.array(rows, np.int64)
         walk = np.array([_walk_velocities(template.walk_speed) for template in self.templates], np.int64)
         p = np.zeros(layout.PARAMETERS, np.int64)
-        p[layout.GRAVITY] = rounded(self.gravity * SPEED / self.tick_rate)
+        p[layout.GRAVITY] = (templates[:, layout.WEIGHT] > 0).any()
         p[layout.TERMINAL] = to_velocity(self.terminal_speed, "terminal_speed")
         p[layout.RATE] = self.tick_rate
         p[layout.EXACT] = 128 // self.tick_rate if 128 % self.tick_rate == 0 else 0
@@ -344,7 +285,11 @@ def _template(entry: object) -> Template:
 def _table(owner: Any) -> dict[str, Any]:
     """Returns the fields of a dataclass by name, without the optional ones that have their default."""
     values = [(f, _plain(getattr(owner, f.name))) for f in fields(owner)]
-    return {f.name: value for f, value in values if f.name not in OPTIONAL or value != _plain(f.default)}
+    return {
+        f.name: value
+        for f, value in values
+        if value is not None and (f.name not in OPTIONAL or value != _plain(f.default))
+    }
 
 
 def _plain(value: Any) -> Any:

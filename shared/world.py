@@ -23,9 +23,9 @@ from shared import blocks, layout, terrain
 from shared.checks import Cell, SceneError, boolean, shown, vector, whole
 from shared.free_places import OverlapError, box_at, free_place, taken
 from shared.inputs import Input
-from shared.layout import FLAGS, ID, TEMPLATE, VX, X
+from shared.layout import FLAGS, ID, MOVE_X, TEMPLATE, VX, X
 from shared.states import ID_MAX, checked_states
-from shared.units import BLOCK, to_positions, to_velocity
+from shared.units import BLOCK, SPEED, SPEED_MAX, to_positions, to_velocity
 from shared.world_changes import UncheckedWorld
 
 __all__ = ["OverlapError", "World"]
@@ -135,7 +135,7 @@ class World(UncheckedWorld):
         if self._next_id > ID_MAX:
             raise SceneError("ids: used up")
         entity = self._next_id
-        self._put([(entity, kind, self._thrown(speed[2]), *at, *speed, 0, 0, 0)])
+        self._put([(entity, kind, self._thrown(kind, speed[2]), *at, *speed, 0, 0, 0)])
         return entity
 
     def spawn_many(self, template: str, positions: npt.ArrayLike) -> range:
@@ -187,10 +187,29 @@ class World(UncheckedWorld):
             MissingError: there is no such entity.
             SceneError: a value is not finite or out of range.
         """
-        state = list(self.state(entity))
-        state[VX : VX + 3] = _velocity(velocity)
-        state[FLAGS] |= self._thrown(state[VX + 2])
-        self._put([tuple(state)])
+        state = self.state(entity)
+        self._set_velocity(state, _velocity(velocity))
+
+    def add_velocity(self, entity: int, velocity: tuple[float, float, float]) -> None:
+        """Adds to the velocity of an entity, in blocks/s. An upward velocity makes gravity act on it.
+
+        Each part of the sum is limited to 1024 blocks/s (`units.SPEED_MAX`). An entity that walks keeps the horizontal
+        part only if its template has an acceleration or a friction; otherwise its input sets that part in the next
+        tick.
+
+        Raises:
+            MissingError: there is no such entity.
+            SceneError: a value is not finite or out of range.
+        """
+        state = self.state(entity)
+        parts = zip(state[VX : VX + 3], _velocity(velocity), strict=True)
+        fastest = round(SPEED_MAX * SPEED)
+        self._set_velocity(state, [min(max(part + more, -fastest), fastest) for part, more in parts])
+
+    def _set_velocity(self, state: tuple[int, ...], velocity: list[int]) -> None:
+        """Writes a state with another velocity, in velocity steps."""
+        flags = state[FLAGS] | self._thrown(state[TEMPLATE], velocity[2])
+        self._put([(*state[:FLAGS], flags, *state[X:VX], *velocity, *state[MOVE_X:])])
 
     def set_template(self, entity: int, template: str) -> None:
         """Changes the template of an entity, and so its box and its abilities.

@@ -227,9 +227,14 @@ class UncheckedWorld(WorldState):
         self._entities[row, ID] = 0
         (self._limbo if self._entities[row, FLAGS] & layout.AWAKE else self._free).append(row)
 
-    def _thrown(self, speed: int) -> int:
-        """Returns the flags for a vertical speed: an entity that moves up falls, even if something supports it."""
-        return FALLING if speed > 0 and self.parameters[layout.GRAVITY] else 0
+    def _thrown(self, template: int, speed: int) -> int:
+        """Returns the flags for a vertical speed: an entity that moves up falls, even if something supports it.
+
+        Args:
+            template: number of the entity's template.
+            speed: vertical speed in velocity steps.
+        """
+        return FALLING if speed > 0 and self.templates[template, layout.WEIGHT] else 0
 
     def _wake_segment(self, index: Cell) -> None:
         """Wakes the entities that overlap or touch a segment."""

@@ -7,6 +7,7 @@ Only `fractions.Fraction` decides. The integer test `near` merely skips what is 
     1  supported?   a solid block or a solid entity touches the underside exactly, with an area
     2  input        walkers: horizontal velocity = intent x walk speed; jump only when supported
     3  gravity      v' = max(v - g dt, -v_t), with the flag up
+       grip         kinds with acceleration or friction: the horizontal velocity approaches that of step 2
     4  move         z, x, y: displacement rounded once to 2^-24 block, clamped to the first face newly reached
     5  flag         cleared only when a downward motion was stopped
 """
@@ -39,6 +40,10 @@ class Kind:
     walk: Fraction
     jump: Fraction
     solid: bool
+    gravity: Fraction | None = None
+    acceleration: Fraction | None = None
+    friction: Fraction | None = None
+    air_control: Fraction | None = None
 
     def corners(self) -> Box:
         """The low and the high corner of the box. A negative side extends it the other way."""
@@ -84,7 +89,7 @@ class Oracle:
     ) -> None:
         self.kinds = kinds
         self.dt = Fraction(1, rate)
-        self.fall = nearest(gravity / rate, SPEED_STEP)
+        self.gravity = gravity
         self.terminal = nearest(terminal, SPEED_STEP)
         self.mean = mean
         self.pairs = pairs
@@ -95,6 +100,11 @@ class Oracle:
         self.fell: list[int] = []
         self._corners = [self._rounded(kind) for kind in kinds]
         self._reach = 2 + max(math.ceil(abs(part)) for low, high in self._corners for part in (*low, *high))
+
+    def fall(self, kind: int) -> Fraction:
+        """The change of the speed by gravity in a tick."""
+        own = self.kinds[kind].gravity
+        return nearest((self.gravity if own is None else own) * self.dt, SPEED_STEP)
 
     def is_solid(self, block: Block) -> bool:
         """Returns whether a block stops things. A place that is not loaded stops them; the void does not."""
@@ -138,10 +148,13 @@ class Oracle:
         kind = self.kinds[body.kind]
         low, high = body.corners
         v = body.velocity
-        if kind.walk > 0:
-            v[0], v[1] = (nearest(kind.walk * part / 127, SPEED_STEP) for part in body.move)
+        wished = [nearest(kind.walk * part / 127, SPEED_STEP) for part in body.move]
+        grips = kind.friction is not None or (kind.acceleration is not None and kind.walk > 0)
+        if kind.walk > 0 and not grips:
+            v[:2] = wished
         old = v[2]
-        if self.fall > 0:
+        fall = self.fall(body.kind)
+        if fall > 0:
             jump = nearest(kind.jump, SPEED_STEP) if body.buttons & 1 else Fraction(0)
             if self._supported(body, low, high):
                 if jump > 0:
@@ -150,9 +163,16 @@ class Oracle:
             else:
                 body.falling = True
             if body.falling:
-                v[2] = max(v[2] - self.fall, -self.terminal)
+                v[2] = max(v[2] - fall, -self.terminal)
             if not self.mean:
                 old = v[2]
+        if grips:
+            self._grip(kind, v, wished, body.falling and fall > 0, any(body.move) and kind.walk > 0)
+            if fall == 0:
+                rate = nearest(
+                    (kind.friction if kind.friction is not None else kind.acceleration or 0) * self.dt, SPEED_STEP
+                )
+                old = v[2] = max(v[2] - rate, Fraction(0)) if v[2] > 0 else min(v[2] + rate, Fraction(0))
         wish = [
             nearest(v[0] * self.dt, STEP),
             nearest(v[1] * self.dt, STEP),
@@ -169,6 +189,28 @@ class Oracle:
                 if k == 2 and wish[k] < 0:
                     body.falling = False
         body.near = [math.floor(part) for part in body.position]
+
+    def _grip(self, kind: Kind, v: list[Fraction], wished: list[Fraction], flies: bool, walks: bool) -> None:
+        """Lets a horizontal velocity approach the wished one."""
+        share = Fraction(1)
+        if flies:
+            share = kind.air_control if kind.air_control is not None else Fraction(kind.walk > 0)
+
+        def rate(value: Fraction | None) -> Fraction | None:
+            return None if value is None else nearest(value * share * self.dt, SPEED_STEP)
+
+        faster = rate(kind.acceleration)
+        slower = rate(kind.friction) if kind.friction is not None else faster
+        limit = faster if walks else slower
+        if walks and v[0] ** 2 + v[1] ** 2 > (nearest(kind.walk, SPEED_STEP) + 2 * SPEED_STEP) ** 2:
+            limit = slower or faster
+        way = [int((wish - now) / SPEED_STEP) for wish, now in zip(wished, v[:2], strict=True)]
+        square = way[0] ** 2 + way[1] ** 2
+        if limit is None or square <= (limit / SPEED_STEP) ** 2:
+            v[:2] = wished
+        else:
+            for k in range(2):
+                v[k] += nearest(way[k] * limit / math.isqrt(square), SPEED_STEP)
 
     def _supported(self, body: Body, low: list[Fraction], high: list[Fraction]) -> bool:
         if low[2].denominator == 1:

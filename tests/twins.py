@@ -6,7 +6,9 @@ difference, with the seed and the tick in the message.
 
 import random
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from fractions import Fraction
+from typing import Any
 
 import numpy as np
 
@@ -37,6 +39,8 @@ class Twins:
     def __init__(self, seed: int, *, compiled: bool, bodies: int = 10, ticks: int = 30) -> None:
         self.seed = seed
         self.random = random.Random(seed)
+        self.options = random.Random(f"options {seed}")
+        """Chance for what was added later, so that a seed of old makes the world of old."""
         self.ticks = self.random.randint(ticks // 2, ticks)
         r = self.random
         self.center = [r.choice(FAR) // SEGMENT * SEGMENT for _ in range(3)]
@@ -86,6 +90,8 @@ class Twins:
                     solid=r.random() < 0.8,
                 )
             )
+        if self.options.random() < 0.6:
+            templates = [replace(template, **self._motion(template.walk_speed)) for template in templates]
         return Scene(
             "twins",
             tuple(templates),
@@ -96,6 +102,23 @@ class Twins:
             entity_collision=r.random() < 0.8,
             origin=(0, 0, self.center[2] // SEGMENT - r.choice((0, 1, 1))),
         )
+
+    def _motion(self, walk_speed: float) -> dict[str, Any]:
+        """Options of a template's motion."""
+        o = self.options
+        accelerations = (0.5, 7.0, 30.0, 900.0, o.uniform(0.1, 90))
+        motion: dict[str, Any] = {
+            "gravity": o.choice((None, None, 0.0, 3.0, 40.0)),
+            "acceleration": o.choice((None, *accelerations)),
+            "friction": o.choice((None, None, 0.0, *accelerations)),
+        }
+        if motion["acceleration"] is not None or (motion["friction"] is not None and walk_speed == 0):
+            motion["air_control"] = o.choice((None, 0.0, 0.5, 1.0))
+        return motion
+
+    def _falls(self, kind: int) -> bool:
+        """Whether gravity acts on a kind."""
+        return self.oracle.fall(kind) > 0
 
     def _terrain(self) -> None:
         """Makes one to eight segments around the centre, with random blocks near it, often on a floor."""
@@ -150,7 +173,7 @@ class Twins:
             kind,
             [nearest(Fraction(part), GRID) for part in position],
             [nearest(Fraction(part), Fraction(1, SPEED)) for part in velocity],
-            falling=self.scene.gravity > 0 and velocity[2] * SPEED >= 0.5,
+            falling=self._falls(kind) and velocity[2] * SPEED >= 0.5,
         )
         taken = self.oracle.taken(body)
         try:
@@ -198,6 +221,7 @@ class Twins:
         try:
             self.world.set_template(entity, self.scene.templates[body.kind].name)
             assert not taken, f"{entity} became {body.kind}"
+            body.falling = body.falling and self._falls(body.kind)
         except OverlapError:
             assert taken, f"{entity} may not become {body.kind}"
             body.kind = before
@@ -208,10 +232,16 @@ class Twins:
             return
         speed = self.random.choice(SPEEDS)
         x, y, z = (self.random.uniform(-speed, speed) for _ in range(3))
-        self.world.set_velocity(entity, (x, y, z))
         body = self.oracle.bodies[entity]
-        body.velocity = [nearest(Fraction(part), Fraction(1, SPEED)) for part in (x, y, z)]
-        body.falling = body.falling or (self.scene.gravity > 0 and body.velocity[2] > 0)
+        velocity = [nearest(Fraction(part), Fraction(1, SPEED)) for part in (x, y, z)]
+        if self.options.random() < 0.5:
+            self.world.add_velocity(entity, (x, y, z))
+            sums = (a + b for a, b in zip(body.velocity, velocity, strict=True))
+            velocity = [min(max(part, Fraction(-1024)), Fraction(1024)) for part in sums]
+        else:
+            self.world.set_velocity(entity, (x, y, z))
+        body.velocity = velocity
+        body.falling = body.falling or (self._falls(body.kind) and body.velocity[2] > 0)
 
     def _edit(self) -> None:
         """Fills or clears a small box of blocks. The edit is refused as a whole if a solid entity is in the way."""
@@ -329,6 +359,10 @@ def _kind(template: Template) -> Kind:
         Fraction(template.walk_speed),
         Fraction(template.jump_speed),
         template.solid,
+        *(
+            None if value is None else Fraction(value)
+            for value in (template.gravity, template.acceleration, template.friction, template.air_control)
+        ),
     )
 
 

@@ -1,10 +1,11 @@
-/* The step of shared/kernel.py in C: the same algorithm on the same arrays, as a measure of the kernel's speed.
+/* The step of shared/kernel.py in C: the same algorithm on the same arrays, as a measure of the kernel's speed. It has
+   no acceleration and no friction.
    step_c.py builds and calls it. Only scripts/bench.py uses it, and checks that both reach the same hash. */
 #include <stdint.h>
 
 typedef int64_t i64;
 enum {ID, TEMPLATE, FLAGS, X, Y, Z, VX, VY, VZ, MOVE_X, MOVE_Y, BUTTONS, CELL, NEXT, PREV, CHANGED, WIDTH};
-enum {LO_X, SIZE_X = 3, SOLID = 6, WALKS, JUMP_SPEED, TEMPLATE_COLUMNS};
+enum {LO_X, SIZE_X = 3, SOLID = 6, WALKS, JUMP_SPEED, WEIGHT, TEMPLATE_COLUMNS = 17};
 enum {GRAVITY, TERMINAL, RATE, EXACT, MEAN, PAIRS, FLOOR, REACH_LO, REACH_HI = 10};
 enum {N_AWAKE, N_WOKEN, N_CHANGED, N_FELL, N_LATER, N_HOMELESS, N_STEPPED};
 enum {FALLING = 1, AWAKE = 2, JUMP = 1, MOVES = 255, MOVE_MAX = 127, NOWHERE = 0, CANDIDATE = 7};
@@ -178,14 +179,14 @@ static int turn(W *w, i64 row, i64 key, i64 tick) {
         vy = walk[e[MOVE_Y]];
     }
     i64 from_vz = vz;
-    if (p[GRAVITY]) {
+    if (t[WEIGHT]) {
         jumps = e[BUTTONS] & JUMP && t[JUMP_SPEED];
         if (!falling || jumps) {
             if (!supported(w, row, meets, x0, y0, x1, y1, z0)) falling = FALLING;
             else if (jumps) { vz = t[JUMP_SPEED]; falling = FALLING; }
         }
         from_vz = vz;
-        if (falling) vz = MAX(vz - p[GRAVITY], -p[TERMINAL]);
+        if (falling) vz = MAX(vz - t[WEIGHT], -p[TERMINAL]);
         if (!p[MEAN]) from_vz = vz;
     }
     if (from_vz || vz || vx || vy) {

@@ -179,11 +179,22 @@ class GameApi:
     def throw(self, entity: int, velocity: Vec) -> None:
         """Sets the velocity of an entity in blocks/s.
 
-        An entity that walks keeps only the vertical part beyond the next tick; its input then sets the other two.
+        The horizontal part then decays by the acceleration and the friction of the entity's template. An entity that
+        walks and has neither keeps only the vertical part beyond the next tick; its input then sets the other two.
         """
         self.turn.check("throw")
         entity = self._known(entity)
         self._world.set_velocity(entity, velocity)
+        self.log.note_act(entity)
+
+    def push(self, entity: int, velocity: Vec) -> None:
+        """Adds to the velocity of an entity in blocks/s: knockback, an explosion, a jump pad, a dash.
+
+        The horizontal part decays as after `throw`. Each part of the sum is limited to 1024 blocks/s.
+        """
+        self.turn.check("push")
+        entity = self._known(entity)
+        self._world.add_velocity(entity, velocity)
         self.log.note_act(entity)
 
     def change(self, entity: int, template: str) -> None:

@@ -3,6 +3,7 @@ library."""
 
 import contextlib
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from typing import NamedTuple
 
 from shared.inputs import Input, clamp
@@ -14,11 +15,12 @@ MARKS = (1, 100, 500, 1000, TICKS)
 
 
 class Script(NamedTuple):
-    """A scene, the number of entities, and whether the world is edited on the way."""
+    """A scene, the number of entities, whether the world is edited on the way, and whether entities are pushed."""
 
     scene: Callable[[], Scene]
     entities: int
     edits: bool = False
+    pushes: bool = False
 
 
 def crowd_scene(integrator: str = "mean", tick_rate: int = 32) -> Scene:
@@ -40,6 +42,19 @@ def crowd_scene(integrator: str = "mean", tick_rate: int = 32) -> Scene:
     )  # fmt: skip
 
 
+def impulse_scene() -> Scene:
+    """The crowd's pit with entities that speed up, slow down, float, and fall by a gravity of their own."""
+    scene = crowd_scene(tick_rate=60)
+    templates = (
+        Template("player", walk_speed=4.0, jump_speed=8.0, acceleration=30.0, friction=14.0, air_control=0.3),
+        Template("crate", (-0.5, -0.5, 0), (1, 1, 1), friction=6.0),
+        Template("glider", walk_speed=5.5, jump_speed=6.0, acceleration=9.0, gravity=5.0, air_control=0.0),
+        Template("drone", (-0.4, -0.4, 0), (0.8, 0.8, 0.8), walk_speed=6.0, acceleration=7.0, friction=1.0, gravity=0),
+        Template("knocked", walk_speed=3.0, jump_speed=8.0, friction=11.0, solid=False),
+    )
+    return replace(scene, templates=templates)
+
+
 SCRIPTS = {
     "arena": Script(lambda: load_scene("arena"), 20),
     "flat": Script(lambda: load_scene("flat"), 40),
@@ -47,6 +62,7 @@ SCRIPTS = {
     "topdown": Script(lambda: load_scene("topdown"), 20),
     "crowd": Script(crowd_scene, 60),
     "edits": Script(lambda: crowd_scene("semi", 20), 30, edits=True),
+    "impulses": Script(impulse_scene, 50, pushes=True),
 }
 
 
@@ -73,6 +89,10 @@ def run(name: str, *, compiled: bool, ticks: int = TICKS) -> Iterator[tuple[int,
     for tick in range(1, ticks + 1):
         if script.edits and tick % 5 == 0:
             _edit(world, dice)
+        if script.pushes and tick % 3 == 0:
+            ids = _entities(world)
+            push = (dice.below(257) - 128) / 8, (dice.below(257) - 128) / 8, (dice.below(65) - 32) / 4
+            world.add_velocity(ids[dice.below(len(ids))], push)
         inputs = {}
         for entity in _entities(world):
             if dice.below(30) == 0:

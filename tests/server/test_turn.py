@@ -192,6 +192,7 @@ ACTS: dict[str, Callable[[Played], Any]] = {
     "remove": lambda t: t.api.remove(RUNNER),
     "place": lambda t: t.api.place(RUNNER, (8, 8, 1)),
     "throw": lambda t: t.api.throw(RUNNER, (0, 0, 1)),
+    "push": lambda t: t.api.push(RUNNER, (0, 0, 1)),
     "change": lambda t: t.api.change(RUNNER, "cube"),
     "steer": lambda t: t.api.steer(RUNNER, 1, 0),
     "set_block": lambda t: t.api.set_block(8, 8, 5, 1),

@@ -82,6 +82,7 @@ CASES: list[tuple[str, str, Act, list[Any]]] = [
     ("remove player", "entity = 1: is a player's", lambda g, bad: g.remove(bad), [PLAYER, np.int64(PLAYER)]),
     ("place", "position", lambda g, bad: g.place(RUNNER, bad), [*THREE, (0, 0, NAN), ("1", 0, 0)]),
     ("throw", "velocity", lambda g, bad: g.throw(RUNNER, bad), [*THREE, (0, 0, NAN), (0, 0, 2000)]),
+    ("push", "velocity", lambda g, bad: g.push(RUNNER, bad), [*THREE, (0, 0, NAN), (0, 0, 2000)]),
     ("change", "template = ", lambda g, bad: g.change(RUNNER, bad), TEMPLATE),
     ("steer player", "entity = 1: is a player's", lambda g, bad: g.steer(bad, 1, 0), [PLAYER]),
     ("steer x", "x = ", lambda g, bad: g.steer(RUNNER, bad, 0), [NAN, math.inf, "1", None, [1]]),
@@ -121,6 +122,7 @@ BY_ENTITY: dict[str, Act] = {
     "remove": lambda g, e: g.remove(e),
     "place": lambda g, e: g.place(e, (8, 8, 1)),
     "throw": lambda g, e: g.throw(e, (0, 0, 1)),
+    "push": lambda g, e: g.push(e, (0, 0, 1)),
     "change": lambda g, e: g.change(e, "cube"),
     "steer": lambda g, e: g.steer(e, 1, 0),
     "set": lambda g, e: g.set(e, "mood", 1),
@@ -160,6 +162,7 @@ def test_numbers_of_numpy_do_what_pythons_do() -> None:
         runner = whole(RUNNER)
         game.place(runner, np.array((10, 10, 2), np.int64))
         game.throw(runner, (real(1), real(0), real(4)))
+        game.push(runner, (real(1), real(0), real(4)))
         game.steer(runner, real(1), whole(0), jump=True)
         game.change(runner, "cube")
         game.set(runner, "mood", "cross")

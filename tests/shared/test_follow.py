@@ -6,7 +6,6 @@ from itertools import product
 from types import SimpleNamespace
 from typing import Any
 
-import msgpack
 import numpy as np
 import pytest
 
@@ -37,40 +36,14 @@ from shared.layout import (
     X,
 )
 from shared.scene import Scene, load_scene
-from shared.snapshot import TickEncoder, decode_parts, encode_rows, join_part
+from shared.snapshot import TickEncoder, encode_rows
 from shared.units import BLOCK, SEGMENT
 from shared.world import OverlapError, World
 from tests.lengths import long_but
+from tests.mirrored import Mirrored
 from tests.worlds import EAST, JUMP, WEST, build, floor, steps
 
 SIDE = SEGMENT * BLOCK
-
-
-class Mirrored:
-    """A stepped world, and a second world that knows only what was sent of the first."""
-
-    def __init__(self, world: World) -> None:
-        self.world = world
-        self.packs = TickEncoder(world, 1)
-        self.other = World(world.scene, compiled=world.compiled)
-        self.other.put(world.states())
-        self.other.rebase(world.tick)
-        self.turns = self.sent_turns = self.bytes = 0
-
-    def send(self) -> None:
-        """Sends the changes of the latest step to the other world, segment by segment, over the wire format."""
-        self.turns += len(self.world.changed)
-        shares, _ = self.packs.pack(())
-        self.sent_turns += sum(len(share.ids) for share in shares)
-        parts = [join_part(share.segment, 1, share.packed) for share in shares]
-        self.bytes += sum(map(len, parts))
-        templates = len(self.world.scene.templates)
-        _, states, turns = decode_parts(list(map(msgpack.unpackb, parts)), templates, self.world.kernel)
-        self.other.put(states)
-        assert self.other.follow(turns, self.world.tick - self.other.tick, self.world.tick)
-
-    def check(self) -> None:
-        assert self.other.states().tolist() == self.world.states().tolist()
 
 
 def crowd(made: Scene, n: int, rng: random.Random, compiled: bool) -> World:

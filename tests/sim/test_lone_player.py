@@ -1,13 +1,15 @@
 """A lone player is never corrected, whatever the network does, because both sides compute the same."""
 
 import random
+from dataclasses import replace
 
 import pytest
 
 from client_sdk.core import Core
 from client_sdk.events import Answered, Corrected
+from client_sdk.netsim.links import PRESETS
 from shared.inputs import JUMP, Input
-from shared.scene import load_scene
+from shared.scene import Scene, load_scene
 from shared.units import BLOCK
 from shared.world import World
 from sovereign_netcode.playtest import Link, Match, Player
@@ -37,6 +39,19 @@ class Tour:
         return self._input
 
 
+class Hike(Tour):
+    """Does the tour in a world without a pit."""
+
+    def __call__(self, core: Core, rng: random.Random) -> Input:
+        assert core.prediction is not None
+        state = core.prediction.predicted.state(core.entity)
+        self.pressed += (self._input.move_x != 0 and state[6] == 0) or (self._input.move_y != 0 and state[7] == 0)
+        self.jumped += state[8] > 0
+        if rng.random() < 0.04:
+            self._input = Input(rng.randint(-89, 89), rng.randint(-89, 89), rng.choice((0, JUMP)))
+        return self._input
+
+
 def play(scene: str, path: Link, ticks: int, seed: int = 1) -> tuple[Match, Player, Tour]:
     match, tour = Match(load_scene(scene), seed), Tour()
     player = match.join(tour, path)
@@ -61,6 +76,51 @@ def test_no_correction_under_latency_and_jitter(latency_ms: int, ticks: int, lea
     assert tour.pressed > least
     assert tour.jumped > least
     assert player.closed is None
+
+
+def heavy(tick_rate: int = 32) -> Scene:
+    """The scene hills with a player that speeds up and slows down, and hardly steers in the air."""
+    scene = load_scene("hills")
+    player = replace(scene.templates[0], acceleration=20.0, friction=8.0, air_control=0.3, gravity=14.0)
+    return replace(scene, templates=(player, *scene.templates[1:]), tick_rate=tick_rate)
+
+
+@pytest.mark.parametrize(
+    ("preset", "tick_rate", "ticks"),
+    [
+        *((preset, 32, 400) for preset in PRESETS), ("far", 20, 300), ("typical", 60, 500),
+        *long(*((preset, 32, 20_000) for preset in PRESETS)),
+    ],
+)  # fmt: skip
+def test_a_player_with_acceleration_is_corrected_for_late_inputs_only(preset: str, tick_rate: int, ticks: int) -> None:
+    match, tour = Match(heavy(tick_rate), 3), Hike()
+    player = match.join(tour, PRESETS[preset])
+    match.run_until(lambda: player.core.state == "playing", 20)
+    late_before = player.core.stats.inputs_late
+    match.run(ticks / tick_rate)
+    causes = [event.cause for event in player.events if isinstance(event, Corrected)]
+    assert set(causes) <= {"late input"}
+    if player.core.stats.inputs_late == late_before:
+        assert not causes
+    assert player.core.stats.divergences == 0
+    assert tour.pressed > 0
+    assert tour.jumped > 0
+
+
+def test_a_push_by_the_rules_is_one_server_act_and_its_decay_is_predicted() -> None:
+    match = Match(heavy(), 3)
+    player = match.join(lambda core, rng: Input(127, 0), PRESETS["regional"])
+    match.run_until(lambda: player.core.state == "playing", 20)
+    match.run(1)
+    before = player.core.stats.corrections
+    for _ in range(4):
+        with match.game.api.turn:
+            match.game.api.push(player.core.entity, (-12.0, 5.0, 4.0))
+        match.run(2.5)
+    causes = [event.cause for event in player.events if isinstance(event, Corrected)]
+    assert causes == ["server act"] * 4
+    assert player.core.stats.corrections - before == 4
+    assert player.core.stats.divergences == 0
 
 
 def test_the_confirmed_world_is_the_servers_world() -> None:
