@@ -51,7 +51,7 @@ def scene(fill: Iterable[Fill] = (), **changes: Any) -> Scene:
     return Scene(**(values | changes))
 
 
-def build(fill: Iterable[Fill] = (), *, compiled: bool = False, **changes: Any) -> World:
+def build(fill: Iterable[Fill] = (), *, compiled: bool | None = None, **changes: Any) -> World:
     """Returns a world of `scene(fill, **changes)` with all its segments loaded."""
     world = World(scene(fill, **changes), compiled=compiled)
     world.load_terrain()

@@ -1,11 +1,13 @@
 """Bad links on real sockets: a server process, a proxy and asyncio clients, compared with simulated time.
 
-All three links are measured at once for a few seconds, each with a server of its own. The limits hold on a busy
-machine: the figure of the simulation, times a factor, plus `NOISE_MS`.
+All three links are measured at once for a few seconds, each with a server of its own. A short run measures one of
+them. The limits hold on a busy machine: the figure of the simulation, times a factor, plus `NOISE_MS`.
 """
 
 import asyncio
+import contextlib
 import copy
+import itertools
 import random
 import time
 from collections import Counter
@@ -25,6 +27,7 @@ from shared.scene import load_scene
 from shared.world import World
 from sovereign_netcode.playtest import Match
 from tests.client_sdk.servers import real_server
+from tests.lengths import long
 from tests.proxy import HIDDEN_BYTES, PACKET_BYTES, Proxy
 
 pytestmark = [pytest.mark.e2e, pytest.mark.alone]
@@ -192,26 +195,29 @@ async def all_at_once(urls: dict[str, str]) -> dict[str, Figures]:
     return dict(zip(urls, found, strict=True))
 
 
+ALL = tuple(LINKS)
+
+
 @pytest.fixture(scope="module")
-def both() -> dict[str, tuple[Figures, Figures]]:
+def both(request: pytest.FixtureRequest) -> dict[str, tuple[Figures, Figures]]:
     """Returns the simulated and the measured figures of each link."""
-    expected = {name: simulated(link) for name, link in LINKS.items()}  # this compiles the kernel, too
-    with real_server("--scene", "flat") as a, real_server("--scene", "flat") as b, real_server("--scene", "flat") as c:
-        found = asyncio.run(all_at_once(dict(zip(LINKS, (a, b, c), strict=True))))
-    for name in LINKS:
+    expected = {name: simulated(LINKS[name]) for name in request.param}  # this compiles the kernel, too
+    with contextlib.ExitStack() as servers:
+        urls = {name: servers.enter_context(real_server("--scene", "flat")) for name in expected}
+        found = asyncio.run(all_at_once(urls))
+    for name in expected:
         print(f"\n{name:8} simulated {expected[name]}\n{'':8} measured  {found[name]}")
-    return {name: (expected[name], found[name]) for name in LINKS}
+    return {name: (expected[name], found[name]) for name in expected}
 
 
-@pytest.mark.parametrize("name", LINKS)
-def test_no_client_is_lost_and_every_correction_is_explained(
-    both: dict[str, tuple[Figures, Figures]], name: str
-) -> None:
-    for figures in both[name]:
+@pytest.mark.parametrize("both", [("dip",), *long((ALL,))], indirect=True)
+def test_no_client_is_lost_and_every_correction_is_explained(both: dict[str, tuple[Figures, Figures]]) -> None:
+    for figures in itertools.chain(*both.values()):
         assert not [event for event in figures.events if isinstance(event, (Diverged, Left))]
         assert set(figures.corrections) <= {"late input", "other entity"}
 
 
+@pytest.mark.parametrize("both", long((ALL,)), indirect=True)
 def test_typical_is_as_simulated(both: dict[str, tuple[Figures, Figures]]) -> None:
     simulated, measured = both["typical"]
     assert 90 <= measured.rtt_ms <= simulated.rtt_ms + NOISE_MS
@@ -221,6 +227,7 @@ def test_typical_is_as_simulated(both: dict[str, tuple[Figures, Figures]]) -> No
     assert measured.late_share <= 3 * simulated.late_share + 0.05
 
 
+@pytest.mark.parametrize("both", [("dip",), *long((ALL,))], indirect=True)
 def test_in_a_dip_the_latest_wins_and_then_all_is_as_before(both: dict[str, tuple[Figures, Figures]]) -> None:
     simulated, measured = both["dip"]
     start, end = DIP_S
@@ -232,6 +239,7 @@ def test_in_a_dip_the_latest_wins_and_then_all_is_as_before(both: dict[str, tupl
     assert measured.age_ms(0.9, end + 0.5) <= 1.5 * simulated.age_ms(0.9, end + 0.5) + NOISE_MS
 
 
+@pytest.mark.parametrize("both", long((ALL,)), indirect=True)
 def test_an_outage_delays_snapshots_and_held_keys_survive_it(both: dict[str, tuple[Figures, Figures]]) -> None:
     simulated, measured = both["outage"]
     for figures in (simulated, measured):

@@ -194,6 +194,7 @@ def test_a_command_says_what_it_lacks(wheel: Path, tmp_path: Path) -> None:
         assert f"needs {module}, which is not installed here: pip install 'PATH[{extra}]'" in done.stderr, done.stderr
 
 
+@pytest.mark.slow
 def test_a_game_is_begun_tested_and_served(installed: Installed) -> None:
     said = installed.command("sovereign-new-game", "king_of_the_hill")
     assert "sovereign_netcode.server --game king_of_the_hill:KingOfTheHill" in said
@@ -235,6 +236,7 @@ def test_five_bots(installed: Installed) -> None:
     assert "failed:" not in said
 
 
+@pytest.mark.slow
 def test_types_are_checked(installed: Installed) -> None:
     (installed.folder / "mine.py").write_text(
         "import server\n"

@@ -89,7 +89,7 @@ def test_a_reconnect_that_fails_may_be_tried_again(tmp_path: Path, monkeypatch: 
 
 
 def stored(directory: Path, keep: Callable[[], Any], checkpoint_s: float = 60.0) -> Store:
-    store = Store(directory / "data", SCENE, compiled=False, checkpoint_s=checkpoint_s)
+    store = Store(directory / "data", SCENE, checkpoint_s=checkpoint_s)
     store.start(keep)
     return store
 
@@ -130,7 +130,7 @@ def test_a_checkpoint_that_fails_costs_no_tick_and_is_tried_again(
         until(lambda: store.idle)
     assert store.checkpoint_s.count >= 1
     assert store.close()
-    again = Store(tmp_path / "data", SCENE, compiled=False)
+    again = Store(tmp_path / "data", SCENE)
     assert ((again.world.tick, again.world.state_hash()), again.kept) == (last, "kept")
     again.close()
 
@@ -184,7 +184,7 @@ def test_a_tick_whose_record_fails_goes_on_and_is_made_up_for(
     table.game.api.set_block(3, 3, 3, 5)  # a tick without changes might not be written at once
     table.tick()
     assert [record.levelno for record in caplog.records if "cannot save" in record.message] == [logging.ERROR]
-    copy = Store(copied(tmp_path / "data", tmp_path / "copy"), table.game.scene, compiled=False)
+    copy = Store(copied(tmp_path / "data", tmp_path / "copy"), table.game.scene)
     assert copy.restored == (table.tick_number, table.game.world.state_hash().hex())
     copy.close()
     table.stop()

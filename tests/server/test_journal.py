@@ -42,7 +42,7 @@ FLOOR = [worlds.floor(0)]
 
 def recorded(file: io.BytesIO) -> RecordedWorld:
     """Returns a world with a floor, two movers and a stone, recorded from tick 3 on."""
-    world = RecordedWorld(worlds.scene(FLOOR), compiled=False)
+    world = RecordedWorld(worlds.scene(FLOOR))
     world.load_terrain()
     world.set_block(5, 5, 0, 9)
     for place in ((0, 0, 0), (4, 0, 0), (0, 4, 0.5)):
@@ -55,7 +55,7 @@ def recorded(file: io.BytesIO) -> RecordedWorld:
 
 
 def read(data: bytes) -> tuple[list[Moment], Recording]:
-    recording = Recording(io.BytesIO(data), compiled=False)
+    recording = Recording(io.BytesIO(data))
     return list(recording), recording
 
 
@@ -102,7 +102,7 @@ def test_every_call_is_replayed_to_the_same_hash_at_every_tick() -> None:
     world = recorded(file)
     hashes = play(world)
     world.end_recording()
-    recording = Recording(io.BytesIO(file.getvalue()), compiled=False)
+    recording = Recording(io.BytesIO(file.getvalue()))
     assert (recording.world.tick, recording.scene) == (3, world.scene)
     found, last = [], None
     for moment in recording:
@@ -120,7 +120,7 @@ def test_every_call_is_replayed_to_the_same_hash_at_every_tick() -> None:
 
 def test_the_id_after_the_last_is_kept_even_if_its_owner_is_gone() -> None:
     file = io.BytesIO()
-    world = RecordedWorld(worlds.scene(FLOOR), compiled=False)
+    world = RecordedWorld(worlds.scene(FLOOR))
     world.load_terrain()
     world.remove(world.spawn("box", (0, 0, 0)))
     world.record(file)
@@ -164,7 +164,7 @@ def test_two_pens_write_the_same_and_each_ends_on_its_own() -> None:
     file = io.BytesIO()
     world = recorded(file)
     world.step({1: worlds.EAST})
-    copy = World(world.scene, compiled=False)
+    copy = World(world.scene)
     copy.restore(world)
 
     class Second(Observer):
@@ -183,9 +183,7 @@ def test_two_pens_write_the_same_and_each_ends_on_its_own() -> None:
     for record, found in zip(pen.records, hashes, strict=True):
         redo(copy, record)  # a replay compares the marks from the first tick on
         assert copy.state_hash() == found
-    assert [moment.world.state_hash() for moment in Recording(io.BytesIO(file.getvalue()), compiled=False)][
-        1:-1
-    ] == hashes
+    assert [moment.world.state_hash() for moment in Recording(io.BytesIO(file.getvalue()))][1:-1] == hashes
 
 
 def test_a_refused_edit_is_recorded_only_where_it_may_have_woken_someone() -> None:
@@ -233,7 +231,7 @@ class Full:
 
 
 def test_a_full_disk_ends_the_recording_and_not_the_world() -> None:
-    world = RecordedWorld(worlds.scene(FLOOR), compiled=False)
+    world = RecordedWorld(worlds.scene(FLOOR))
     world.load_terrain()
     errors: list[OSError] = []
     world.record(Full(2000), errors.append)
@@ -353,7 +351,7 @@ def test_a_record_left_out_doubled_or_exchanged_is_found(draw: st.DataObject) ->
 def test_a_replay_that_comes_out_otherwise_names_the_tick(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "run"
     path.write_bytes(DATA)
-    assert [moment.world.tick for moment in replay(path, compiled=False)][-2:] == [1001, 1001]
+    assert [moment.world.tick for moment in replay(path)][-2:] == [1001, 1001]
     step = World.step
 
     def slip(world: World, inputs: dict[int, Input]) -> None:
@@ -361,7 +359,7 @@ def test_a_replay_that_comes_out_otherwise_names_the_tick(tmp_path: Path, monkey
 
     monkeypatch.setattr(World, "step", slip)
     with pytest.raises(DivergedError, match="entities that changed") as error:
-        list(replay(path, compiled=False))
+        list(replay(path))
     assert error.value.tick == 12
 
 

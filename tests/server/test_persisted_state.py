@@ -20,7 +20,7 @@ class Stored(Table):
 
     def __init__(self, directory: Path, rules: Rules | None = None) -> None:
         super().__init__(rules=rules, resume_s=2.0)
-        self.store = Store(directory, self.game.scene, power=False, compiled=False)
+        self.store = Store(directory, self.game.scene, power=False)
         self.game = Game(
             self.game.scene,
             limits=Limits(resume_s=2.0),

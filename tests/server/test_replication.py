@@ -227,7 +227,7 @@ def test_an_entity_that_was_placed_out_of_a_segment_is_flagged_in_the_other_and_
 
 
 def test_each_placed_entity_is_noted_whatever_placed_it() -> None:
-    game = Game(row_of_segments(), compiled=False)
+    game = Game(row_of_segments())
     world, stage = game.world, game.api
     thing, pushed = stage.spawn("box", (5, 5, 1)), stage.spawn("box", (9, 5, 1))
     game.tick(0.0, 0.0)
@@ -323,7 +323,7 @@ class Model:
     """A client in the plainest form: it applies messages to a world. It is the server's link, too."""
 
     def __init__(self, scene: Scene) -> None:
-        self.world = World(scene, compiled=False)
+        self.world = World(scene)
         self.blocks: dict[Cell, Kinds] = {}
         self.coming: dict[Cell, bytearray] = {}
         self.edits: dict[Cell, list[np.ndarray]] = {}
@@ -398,7 +398,7 @@ class Stalling:
     def __init__(self, seed: int) -> None:
         self.rng = random.Random(seed)
         limits = Limits(terrain_chunk_bytes=16, terrain_bytes_per_tick=64, stalled_s=1e9, silence_s=1e9)
-        self.game = Game(row_of_segments(), limits=limits, compiled=False)
+        self.game = Game(row_of_segments(), limits=limits)
         self.model = Model(self.game.scene)
         self.now = 0.0
         self.session: Session = self.game.open(self.model, 0.0)

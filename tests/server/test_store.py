@@ -44,7 +44,7 @@ def opened(tmp_path: Path) -> Iterator[Callable[..., Store]]:
     found: list[Store] = []
 
     def open_one(directory: Path = tmp_path / "data", *, start: bool = True, checkpoint_s: float = 60) -> Store:
-        store = Store(directory, SCENE, compiled=False, checkpoint_s=checkpoint_s)
+        store = Store(directory, SCENE, checkpoint_s=checkpoint_s)
         found.append(store)
         if start:
             store.start(keep)
@@ -192,7 +192,7 @@ def test_a_large_world_is_hashed_by_its_checkpoints_only(
 def test_a_directory_belongs_to_one_server(opened: Callable[..., Store], tmp_path: Path) -> None:
     store = opened()
     with pytest.raises(StoreError, match="another server is using it"):
-        Store(tmp_path / "data", SCENE, compiled=False)
+        Store(tmp_path / "data", SCENE)
     assert store.close()
     assert opened(start=False).close()
     assert opened().close()
@@ -207,7 +207,7 @@ def refused(directory: Path, scene: object = SCENE) -> str:
     """Checks that a directory is refused and stays as it is. Returns the message."""
     before = contents(directory)
     with pytest.raises(StoreError) as error:
-        Store(directory, scene, compiled=False)  # type: ignore[arg-type]
+        Store(directory, scene)  # type: ignore[arg-type]
     assert contents(directory) == before
     assert "\n" not in str(error.value)
     return str(error.value)
@@ -263,7 +263,7 @@ def test_an_unusable_directory_is_refused_and_left_as_it_is(opened: Callable[...
     assert "it is missing, and world.db-wal is there" in refused(tmp_path / "lost")
     (tmp_path / "file").write_text("")
     with pytest.raises(StoreError, match="cannot be used"):
-        Store(tmp_path / "file", SCENE, compiled=False)
+        Store(tmp_path / "file", SCENE)
     said = refused(good, worlds.scene([worlds.floor(0)], gravity=9.0, tick_rate=32))
     assert "saved with another scene (different: gravity, tick_rate)" in said
     assert path in said
@@ -283,7 +283,7 @@ def test_a_replay_with_another_result_says_what_to_do(
 
 def test_a_world_belongs_to_its_game(tmp_path: Path) -> None:
     def opens(game: str, directory: Path = tmp_path) -> bool:
-        return Store(directory, SCENE, game=game, compiled=False).close()
+        return Store(directory, SCENE, game=game).close()
 
     assert opens("tag:Tag")
     assert opens("tag:Tag")
@@ -299,14 +299,14 @@ def test_a_world_belongs_to_its_game(tmp_path: Path) -> None:
 
 
 def test_a_world_of_the_first_schema_takes_the_game_that_comes(tmp_path: Path) -> None:
-    assert Store(tmp_path, SCENE, compiled=False).close()
+    assert Store(tmp_path, SCENE).close()
     altered(tmp_path, "ALTER TABLE world DROP COLUMN game", "PRAGMA user_version = 1")
-    store = Store(tmp_path, SCENE, game="a:B", compiled=False)
+    store = Store(tmp_path, SCENE, game="a:B")
     store.start(keep)
     store.world.step()
     assert store.close()
     with pytest.raises(StoreError, match="was saved by a server of the game a:B"):
-        Store(tmp_path, SCENE, compiled=False)
+        Store(tmp_path, SCENE)
 
 
 def test_an_older_schema_is_migrated(

@@ -25,7 +25,7 @@ FRAME = FRAME_HEAD + PAGE
 def torn(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Torn]:
     """The directory of a server that was killed after 60 ticks, each of which was acknowledged."""
     directory = tmp_path_factory.mktemp("torn")
-    store = Store(directory / "data", SCENE, compiled=False)
+    store = Store(directory / "data", SCENE)
     store.start(keep)
     yield Torn(store, directory)
     store.close()
@@ -137,7 +137,7 @@ def test_a_world_without_a_mark_is_taken_and_gets_one(
 ) -> None:
     copy = damaged_copy(torn, tmp_path, "world.mark", b"")
     (copy / "world.mark").unlink()
-    store = Store(copy, SCENE, compiled=False)
+    store = Store(copy, SCENE)
     assert store.restored == (torn.last, torn.hashes[torn.last].hex())
     store.start(keep)
     store.world.step()
@@ -164,7 +164,7 @@ def test_only_a_power_cut_without_fsync_may_cost_the_end(
 ) -> None:
     boots = {True: b"\1" * 16, False: b"\2" * 16}
     monkeypatch.setattr(mark, "boot", lambda: boots[True])
-    store = Store(tmp_path / "data", SCENE, compiled=False, power=power)
+    store = Store(tmp_path / "data", SCENE, power=power)
     store.start(keep)
     torn = Torn(store, tmp_path)
     store.close()
@@ -188,7 +188,7 @@ def test_a_system_that_does_not_report_its_boot_is_trusted_less(monkeypatch: pyt
 def test_a_world_of_schema_version_2_is_brought_to_today(tmp_path: Path) -> None:
     former_world = Path(__file__).parent.parent / "golden" / "former" / "world"
     shutil.copytree(former_world, tmp_path / "data")
-    store = Store(tmp_path / "data", SCENE, compiled=False)
+    store = Store(tmp_path / "data", SCENE)
     assert (store.world.tick, store.notes[-1]) == (101, (101, "told"))
     hashed = store.world.state_hash()
     store.start(keep)
@@ -206,4 +206,4 @@ def test_a_damaged_world_of_schema_version_2_is_named(tmp_path: Path, column: st
     }[column]
     altered(tmp_path / "data", statement())
     with pytest.raises(StoreError, match="damaged"):
-        Store(tmp_path / "data", SCENE, compiled=False)
+        Store(tmp_path / "data", SCENE)

@@ -24,7 +24,7 @@ HEAD = 32
 
 @pytest.fixture
 def store(tmp_path: Path) -> Iterator[Store]:
-    found = Store(tmp_path / "data", SCENE, compiled=False)
+    found = Store(tmp_path / "data", SCENE)
     found.start(keep)
     yield found
     found.close()
@@ -32,7 +32,7 @@ def store(tmp_path: Path) -> Iterator[Store]:
 
 def found_in(directory: Path) -> tuple[int, bytes]:
     """Returns tick and hash of the world in a directory, which is then removed."""
-    again = Store(directory, SCENE, compiled=False)
+    again = Store(directory, SCENE)
     try:
         return again.world.tick, again.world.state_hash()
     finally:
@@ -224,7 +224,7 @@ def test_a_crash_in_the_middle_of_making_up_finds_the_world_before_or_after(
 
 def test_a_file_at_its_limit_finds_room_in_the_old_log(disk: Disk, tmp_path: Path) -> None:
     disk.pages = 24
-    store = Store(tmp_path / "data", SCENE, compiled=False)
+    store = Store(tmp_path / "data", SCENE)
     store.start(keep)
     rng = random.Random(1)
     stepping(store, rng, lambda: bool(store.trouble))
@@ -255,13 +255,13 @@ def test_a_disk_that_does_not_answer_is_given_up(
 
 
 def test_the_end_of_a_store_in_trouble_tries_once_more(disk: Disk, tmp_path: Path) -> None:
-    store = Store(tmp_path / "data", SCENE, compiled=False)
+    store = Store(tmp_path / "data", SCENE)
     store.start(keep)
     rng = random.Random(1)
     saved = into_trouble(store, disk, rng)
     assert not store.close()
     assert found_in(copied(tmp_path / "data", tmp_path / "then")) == saved
-    store = Store(tmp_path / "data", SCENE, compiled=False)
+    store = Store(tmp_path / "data", SCENE)
     store.start(keep)
     disk.error = None
     play(store, 30, rng)

@@ -36,7 +36,7 @@ def everywhere(rules: Rules) -> list[Callable[[], Any]]:
     """Returns all ways to start a game with rules."""
     return [
         lambda: Match(FLAT, 1, rules=rules),
-        lambda: Game(FLAT, rules=rules, compiled=False),
+        lambda: Game(FLAT, rules=rules),
         lambda: prepared(rules, FLAT),
         lambda: check_rules(rules),
     ]
