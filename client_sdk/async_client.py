@@ -237,9 +237,10 @@ class AsyncClient(BaseClient):
         now = time.monotonic()
         core = self.core
         try:
+            core.controls.resolve(core.scene)
             if self._before_update is not None and core.state == "playing":
                 self._before_update(core)
-        finally:  # asyncio reports an exception of `before_update`; the client goes on
+        finally:  # asyncio reports an exception of `before_update` or a wrong button; the client goes on
             self._advance(now)
 
     def _advance(self, now: float) -> None:

@@ -1,10 +1,11 @@
 """The part that `Client` and `AsyncClient` have in common: the player's side of a core."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, cast
 
 from client_sdk.core import Core
 from client_sdk.stats import Stats
+from shared.buttons import Names
 from shared.inputs import make_input
 
 if TYPE_CHECKING:
@@ -84,20 +85,27 @@ class BaseClient:
     def link(self, link: "str | Link | None") -> None:
         set_link(self.core, link)
 
-    def set_input(self, x: float, y: float, *, jump: bool = False) -> None:
+    def set_input(
+        self, x: float, y: float, *, jump: bool = False, buttons: Names = (), aim: Sequence[float] | None = None
+    ) -> None:
         """Sets the player's input from now on. May be called at any time, also several times per tick.
 
-        A jump that is set and taken back between two ticks counts in the next tick.
+        A button that is pressed and released between two ticks counts in the next tick. `Scene.buttons` and `Scene.aim`
+        say what there is. Before the client knows the scene, buttons by name and an aim are kept; if the scene has no
+        such button or no aim, the first `update` that knows it raises the `ValueError` instead, once.
 
         Args:
             x: east part of the direction. The length of (x, y) is the share of full speed; above 1 counts as 1.
             y: north part of the direction.
             jump: whether to jump as soon as the entity can.
+            buttons: the buttons that are held: names, as in ("dash",), or a table of names and truth values, as in
+                {"dash": key_down}.
+            aim: direction (x, y, z) in space, of any length; None: no aim.
 
         Raises:
-            ValueError: the direction is not finite.
+            ValueError: the direction or the aim is not finite, or the scene has no such button or no aim.
         """
-        self.core.set_input(make_input(x, y, jump=jump))
+        self.core.set_input(make_input(x, y, jump=jump, aim=aim), buttons)
 
     def set_input_delay(self, ticks: int) -> None:
         """Sets the input delay: the effect of an input is shown `ticks` ticks later. May be called at any time.

@@ -106,8 +106,14 @@ class Client(BaseClient):
         return self.core.events()
 
     def update(self, now: float | None = None) -> None:
-        """Predicts every tick that is due, and sends its input. Starts the play once the world has arrived."""
+        """Predicts every tick that is due, and sends its input. Starts the play once the world has arrived.
+
+        Raises:
+            ValueError: before the scene was known, `set_input` was called with a button or an aim that it does not
+                have. This is raised once.
+        """
         now = _time(now)
+        self.core.controls.resolve(self.core.scene)
         self.core.port.update(now)
         self._transport.send(now)
 

@@ -30,6 +30,7 @@ from client_sdk.timing.timeline import Timeline
 from client_sdk.view import NOTHING, View
 from client_sdk.worlds import Worlds
 from shared import edits, fields, messages
+from shared.buttons import Names
 from shared.checks import SceneError, duration, shown, text, whole
 from shared.inputs import Input, checked_input, clamp
 from shared.messages import ProtocolError, decode_from_server, encode
@@ -198,13 +199,18 @@ class Core:
         """The input that was set most recently."""
         return self.controls.held
 
-    def set_input(self, input_: Input) -> None:
+    def set_input(self, input_: Input, buttons: Names = ()) -> None:
         """Sets the player's input from the next tick on. A short press between two ticks counts in the next tick.
 
+        Args:
+            input_: the input.
+            buttons: buttons that are held besides, by name. `Controls.resolve` finds their bits if the scene is not
+                known yet; the clients call it ahead of each update.
+
         Raises:
-            ValueError: `input_` is not an `Input`.
+            ValueError: `input_` is not an `Input`, or the scene has no such button or no aim.
         """
-        self.controls.set(clamp(checked_input(input_, "input")))
+        self.controls.set(clamp(checked_input(input_, "input")), buttons, self.scene)
 
     def set_input_delay(self, ticks: int) -> None:
         """Sets the input delay: inputs take effect `ticks` ticks (0 to 3) later. More delay means fewer replays.

@@ -22,7 +22,6 @@ from client_sdk.timing.lead import PricedLead, jump_ticks
 from client_sdk.timing.timeline import Timeline
 from client_sdk.view import View
 from shared.bounds import AHEAD_S, bounds
-from shared.fields import INPUT_ROW_BYTES
 from shared.inputs import row
 from shared.messages import (
     IDLE,
@@ -283,18 +282,19 @@ class InputLoop:
         if to >= first:
             clock, phase = self.world.clock, timeline.phase
             timeline.made(timeline.tick(now) - first, now)
-            rows = b""
+            rows, scene = b"", self.world.scene
             for tick in range(first, to + 1):
                 input_ = controls.take()
                 prediction.file(tick, input_)
-                rows += row(input_)
+                rows += row(input_, aim=scene.aim)
                 # Delays of a slow program are left out of the phase, because the path did not cause them.
                 self._phases.put(tick, phase - (timeline.tick(now) - tick) if timeline.own else phase)
             stats.inputs_sent += to + 1 - first
             stats.lead_ticks = phase - clock.phase
             stats.lead_s = stats.lead_ticks / clock.rate
+            size = scene.input_row_bytes
             inputs += [
-                Inputs(first + at, confirmed, rows[INPUT_ROW_BYTES * at : INPUT_ROW_BYTES * (at + ROWS_MAX)])
+                Inputs(first + at, confirmed, rows[size * at : size * (at + ROWS_MAX)])
                 for at in range(0, to + 1 - first, ROWS_MAX)
             ]
         elif self._silent:

@@ -11,6 +11,8 @@ Policies of bots work in it unchanged: `policy(env.world, env.entity(agent))` is
 episode.
 """
 
+import functools
+import operator
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -25,9 +27,10 @@ from server.game_api.api import GameApi
 from server.journal.recorded_world import RecordedWorld
 from server.players.input_queue import InputQueue
 from server.rules import Rules, prepared
+from shared.aim import AIM_MAX, NO_AIM
 from shared.checks import finite, text, whole
 from shared.fields import NAME_MAX
-from shared.inputs import MOVE_MAX, NEUTRAL, Input, clamp
+from shared.inputs import MOVE_MAX, NEUTRAL, Input, checked_input, clamp
 from shared.layout import FALLING, FLAGS, ID, TEMPLATE, VX, Int64s, X
 from shared.messages import Command
 from shared.payloads import pack_value
@@ -64,7 +67,8 @@ class Arena(ParallelEnv):  # type: ignore[misc]  # it has no type information
 
     Observations are a `Dict` of "own" [8] and "others" [8, 8] (float32; blocks and blocks/s), and "blocks" [5, 7, 7]
     (uint8; kinds by z, y, x around the feet). An action is three whole numbers: move_x (east) and move_y (north) in
-    -127..127, and 1 to jump; any `Input` is one.
+    -127..127, and the bits of the buttons (`Scene.button`): 1 to jump. In a scene with aim, its three parts in
+    -32767..32767 follow. Any `Input` is an action, too.
 
     Args:
         scene: the name or path of a scene, or a scene; None: the rules' own, otherwise "flat".
@@ -114,10 +118,7 @@ class Arena(ParallelEnv):  # type: ignore[misc]  # it has no type information
         self._blank.load_terrain()
         self._seed = 0
         self._spaces = _observations(len(self.scene.templates))
-        self._actions = {
-            agent: spaces.Box(np.array([-MOVE_MAX, -MOVE_MAX, 0]), np.array([MOVE_MAX, MOVE_MAX, 1]), dtype=np.int64)
-            for agent in self.possible_agents
-        }
+        self._actions = {agent: _actions(self.scene) for agent in self.possible_agents}
         self._table, self._corner, self._loaded = np.zeros((1, 1, 1), np.int64), np.zeros(3, np.int64), -1
 
     def observation_space(self, agent: str) -> spaces.Dict:
@@ -202,7 +203,7 @@ class Arena(ParallelEnv):  # type: ignore[misc]  # it has no type information
         return self._number
 
     def step(
-        self, actions: Mapping[str, Sequence[int] | Array]
+        self, actions: Mapping[str, Input | Sequence[int] | Array]
     ) -> tuple[
         dict[str, Observation],
         dict[str, float],
@@ -217,7 +218,7 @@ class Arena(ParallelEnv):  # type: ignore[misc]  # it has no type information
         """
         for agent in self.agents:
             given = actions.get(agent)
-            self._queues[agent].override = NEUTRAL if given is None else clamp(Input(*map(int, given)))
+            self._queues[agent].override = NEUTRAL if given is None else _input(given, self.scene)
         for _ in range(self._repeat):
             self._game.tick(0.0, 0.0)
         truncated, api = self.world.tick >= self._end, self._game.api
@@ -296,6 +297,28 @@ def _attribute(name: str) -> Reward:
         return float(found) if isinstance(found, int | float) else 0.0
 
     return value
+
+
+def _actions(scene: Scene) -> spaces.Box:
+    """Returns the space of an agent's actions in a scene."""
+    buttons = functools.reduce(operator.or_, scene.button_bits.values(), 0)
+    aim = [AIM_MAX] * 3 if scene.aim else []
+    low = [-MOVE_MAX, -MOVE_MAX, 0, *(-part for part in aim)]
+    return spaces.Box(np.array(low), np.array([MOVE_MAX, MOVE_MAX, buttons, *aim]), dtype=np.int64)
+
+
+def _input(action: Input | Sequence[int] | Array, scene: Scene) -> Input:
+    """Returns the input that an action is: an `Input`, or the numbers of the action space.
+
+    Raises:
+        SceneError: it is neither.
+    """
+    if not isinstance(action, Input):
+        x, y, buttons, *aim = map(int, action)
+        action = Input(x, y, buttons, tuple(aim) or NO_AIM)  # type: ignore[arg-type]
+    input_ = clamp(checked_input(action, "action"))
+    scene.check_aim(input_.aim, "action.aim")
+    return input_
 
 
 def _observations(templates: int) -> spaces.Dict:

@@ -19,6 +19,8 @@ INPUT_ROWS_MAX = 64
 """Limit of the inputs in one message."""
 INPUT_ROW_BYTES = 3
 """Length of one input in `Inputs.rows`, in bytes."""
+AIM_ROW_BYTES = 9
+"""Length of one input in `Inputs.rows` in a scene with aim, in bytes."""
 NAME_MAX = 32
 """Longest name of a player, a command or a game event, in characters."""
 SCENE_FIELDS_MAX = 32
@@ -79,8 +81,8 @@ segment, offset, total = _whole(-(1 << 23), (1 << 23) - 1), _whole(0, PACKED_MAX
 """Checks: index of a segment along an axis, place within a packed segment, length of a packed segment."""
 name, token, reason = _text(NAME_MAX), _text(TOKEN_MAX), _text(REASON_MAX)
 """Checks: name, identity token, reason in a `Bye`."""
-rows = _bytes(INPUT_ROWS_MAX * INPUT_ROW_BYTES, INPUT_ROW_BYTES)
-"""Check of packed inputs."""
+rows = _bytes(INPUT_ROWS_MAX * AIM_ROW_BYTES, INPUT_ROW_BYTES)
+"""Check of packed inputs, of a scene with or without aim; `decode_from_client` knows which."""
 payload, chunk = _bytes(PAYLOAD_MAX), _bytes(PACKED_MAX)
 """Checks: payload, piece of a packed segment."""
 margins, statuses = _bytes(STATUSES_MAX * 2, 2), _bytes(STATUSES_MAX)

@@ -15,9 +15,13 @@ import msgpack
 import numpy as np
 
 from shared import layout
+from shared.aim import NO_AIM, Aim
 from shared.bounds import TICK_RATE_MAX
+from shared.buttons import DEFAULT_BUTTONS, Names, bits_of, checked_buttons, held_names
 from shared.checks import Cell, SceneError, Vec, boolean, cell, choice, finite, items, shown, text, vector, whole
+from shared.fields import AIM_ROW_BYTES, INPUT_ROW_BYTES
 from shared.inputs import MOVE_MAX
+from shared.tables import in_order, plain, table_of
 from shared.template import Template, own_numbers
 from shared.units import RANGE_BLOCKS, SEGMENT, SPEED, rounded, to_position, to_velocity
 
@@ -32,7 +36,7 @@ REACH_MAX = 1024.0
 INTEGRATORS = ("mean", "semi")
 """Choices of `Scene.integrator`."""
 
-OPTIONAL: frozenset[str] = frozenset()
+OPTIONAL = frozenset({"buttons", "aim"})
 """Fields of scenes and templates that a table leaves out if they have their default, so that scenes without them keep
 their bytes and their fingerprint. A field that is None is left out, too."""
 
@@ -62,6 +66,9 @@ class Scene:
         player: name of the players' template.
         reach: greatest distance from a player's position to the centre of a block that it may place or remove, in
             blocks; 0: players cannot edit.
+        buttons: names of the players' buttons, at most 8; "jump" is bit 0, which the physics reads, and the others
+            have the bits after it in this order.
+        aim: whether players send an aim, a direction in space, with each input. It costs 6 bytes per input.
 
     Raises:
         SceneError: a value is not valid; the message names it.
@@ -80,6 +87,8 @@ class Scene:
     spawns: tuple[Vec, ...] = ((64.0, 64.0, 8.0),)
     player: str = "player"
     reach: float = 6.0
+    buttons: tuple[str, ...] = DEFAULT_BUTTONS
+    aim: bool = False
 
     def __repr__(self) -> str:
         """Returns a short text, because events are printed with it; `to_table` has all values."""
@@ -101,6 +110,8 @@ class Scene:
             raise SceneError(f"terminal_speed = {self.terminal_speed!r}: nothing could fall; set gravity = 0 instead")
         choice(self.integrator, "integrator", INTEGRATORS)
         boolean(self.entity_collision, "entity_collision")
+        boolean(self.aim, "aim")
+        object.__setattr__(self, "buttons", checked_buttons(self.buttons))
         if not 0 <= finite(self.reach, "reach") <= REACH_MAX:
             raise SceneError(f"reach = {self.reach!r}: must be 0 to {REACH_MAX:g}")
         object.__setattr__(self, "size", cell(self.size, "size", 1, SEGMENTS_MAX))
@@ -116,7 +127,7 @@ class Scene:
         for key, value in terrain.items():
             text(key, "terrain: the name of a parameter")
             try:
-                msgpack.packb(_plain(value))
+                msgpack.packb(plain(value))
             except (TypeError, ValueError, OverflowError, RecursionError) as error:
                 raise SceneError(f"terrain.{key} = {shown(value)}: cannot be sent ({type(error).__name__})") from error
         spawns = tuple(vector(spawn, f"spawns[{i}]") for i, spawn in enumerate(items(self.spawns, "spawns")))
@@ -167,12 +178,54 @@ class Scene:
 
     def to_table(self) -> dict[str, Any]:
         """Returns a table for `from_table`, of plain lists, tables, texts and numbers."""
-        return _table(self) | {"templates": [_table(entry) for entry in self.templates]}
+        return table_of(self, OPTIONAL) | {"templates": [table_of(entry, OPTIONAL) for entry in self.templates]}
 
     @functools.cached_property
     def fingerprint(self) -> bytes:
         """A hash of all fields, 16 bytes; two sides with equal fingerprints compute the same world."""
-        return hashlib.blake2b(msgpack.packb(_sorted(self.to_table())), digest_size=16).digest()
+        return hashlib.blake2b(msgpack.packb(in_order(self.to_table())), digest_size=16).digest()
+
+    @functools.cached_property
+    def button_bits(self) -> dict[str, int]:
+        """The bits of the buttons in `Input.buttons`, by name."""
+        return bits_of(self.buttons)
+
+    def button(self, name: object) -> int:
+        """Returns the bit of a button in `Input.buttons`.
+
+        Raises:
+            SceneError: the scene has no such button.
+        """
+        bit = self.button_bits.get(name) if isinstance(name, str) else None
+        if bit is None:
+            known = ", ".join(self.buttons)
+            raise SceneError(f"button = {shown(name)}: no such button (there are {known or 'none'})")
+        return bit
+
+    def buttons_bits(self, names: Names) -> int:
+        """Returns the bits of several buttons, for `make_input(buttons=...)`.
+
+        Args:
+            names: one name, several, or a table of names with whether each is held.
+
+        Raises:
+            SceneError: the scene has no such button.
+        """
+        return functools.reduce(lambda bits, name: bits | self.button(name), held_names(names), 0)
+
+    def check_aim(self, aim: Aim, at: str = "aim") -> None:
+        """Checks that an input for this scene may have an aim.
+
+        Raises:
+            SceneError: it has one, and the scene has no aim.
+        """
+        if aim != NO_AIM and not self.aim:
+            raise SceneError(f"{at} = {shown(aim)}: the scene {self.name!r} has no aim (`Scene.aim`)")
+
+    @property
+    def input_row_bytes(self) -> int:
+        """Length of one input in a message, in bytes."""
+        return AIM_ROW_BYTES if self.aim else INPUT_ROW_BYTES
 
     @functools.cached_property
     def index_of(self) -> dict[str, int]:
@@ -218,7 +271,7 @@ class Scene:
     def digests(self) -> dict[str, bytes]:
         """A hash of each field, 8 bytes, by name; two sides find the fields that differ by these."""
         return {
-            name: hashlib.blake2b(msgpack.packb(_sorted(value)), digest_size=8).digest()
+            name: hashlib.blake2b(msgpack.packb(in_order(value)), digest_size=8).digest()
             for name, value in self.to_table().items()
         }
 
@@ -280,33 +333,3 @@ def _template(entry: object) -> Template:
     if "name" not in entry:
         raise SceneError("templates.name: missing")
     return Template(**entry)
-
-
-def _table(owner: Any) -> dict[str, Any]:
-    """Returns the fields of a dataclass by name, without the optional ones that have their default."""
-    values = [(f, _plain(getattr(owner, f.name))) for f in fields(owner)]
-    return {
-        f.name: value
-        for f, value in values
-        if value is not None and (f.name not in OPTIONAL or value != _plain(f.default))
-    }
-
-
-def _plain(value: Any) -> Any:
-    """Returns a value with lists in place of tuples and tables in place of mappings, at every depth."""
-    if isinstance(value, Mapping):
-        return {key: _plain(value[key]) for key in value}
-    if isinstance(value, list | tuple):
-        return [_plain(part) for part in value]
-    return value
-
-
-def _sorted(value: Any) -> Any:
-    """Returns a value with the keys of tables in order, and whole numbers as floats: 18 and 18.0 are one number."""
-    if isinstance(value, Mapping):
-        return {key: _sorted(value[key]) for key in sorted(value)}
-    if isinstance(value, list):
-        return [_sorted(part) for part in value]
-    if isinstance(value, int) and not isinstance(value, bool):
-        return float(value)
-    return value

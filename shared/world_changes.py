@@ -11,6 +11,7 @@ from typing import Protocol
 import numpy as np
 
 from shared import blocks, layout
+from shared.aim import NO_AIM
 from shared.checks import Cell, SceneError, shown
 from shared.free_places import OverlapError, box_at, free_place, overlapping
 from shared.inputs import BUTTONS_MAX, MOVE_PART_MAX, Input, checked_input
@@ -251,18 +252,21 @@ class UncheckedWorld(WorldState):
         told: list[int] = []
         rows, most = self._row_of, MOVE_PART_MAX
         try:
-            for entity, (x, y, buttons) in inputs.items():
+            for entity, (x, y, buttons, aim) in inputs.items():
                 if not (
                     type(x) is type(y) is type(buttons) is int
                     and -most <= x <= most >= y >= -most
                     and 0 <= buttons <= BUTTONS_MAX
+                    and aim is NO_AIM
                 ):
                     raise ValueError
                 told += (rows[entity], x, y, buttons)
-        except (KeyError, TypeError, ValueError):  # one of them is wrong, or has numbers of numpy
+        except (KeyError, TypeError, ValueError):  # one of them has an aim, is wrong, or has numbers of numpy
             told = []
-            for entity, input_ in inputs.items():
-                told += (self._row_at(entity), *checked_input(input_, f"inputs[{entity}]"))
+            for entity, given in inputs.items():
+                input_ = checked_input(given, f"inputs[{entity}]")
+                self.scene.check_aim(input_.aim, f"inputs[{entity}].aim")
+                told += (self._row_at(entity), *input_[:3])
         return told
 
     def _rebase(self, tick: int) -> None:

@@ -13,6 +13,7 @@ Only `fractions.Fraction` decides. The integer test `near` merely skips what is 
 """
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from fractions import Fraction
 
@@ -117,9 +118,9 @@ class Oracle:
             p + b for p, b in zip(body.position, high, strict=True)
         ]
 
-    def step(self, inputs: dict[int, tuple[int, int, int]]) -> None:
+    def step(self, inputs: Mapping[int, tuple[int, ...]]) -> None:
         """Computes one tick. An entity without an input goes on with its latest one."""
-        for entity, (x, y, buttons) in inputs.items():
+        for entity, (x, y, buttons, *_) in inputs.items():
             self.bodies[entity].move = x, y
             self.bodies[entity].buttons = buttons
         self.fell = []

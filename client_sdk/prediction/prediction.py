@@ -110,7 +110,8 @@ class Prediction:
 
         For a tick without an input, the row is the substitute that the server would use.
         """
-        return b"".join(row(self._input(at)) for at in range(tick + 1, to + 1))
+        aim = self.confirmed.scene.aim
+        return b"".join(row(self._input(at), aim=aim) for at in range(tick + 1, to + 1))
 
     def file(self, tick: int, input_: Input) -> None:
         """Files the own input for a future tick."""

@@ -29,7 +29,6 @@ from server.rewind import Rewind
 from server.rules import Rules, checked_function
 from shared import messages
 from shared.checks import SceneError, shown, whole
-from shared.fields import INPUT_ROW_BYTES
 from shared.inputs import Input
 from shared.messages import (
     Bye,
@@ -90,6 +89,7 @@ class Game:
         whole(seed, "seed", -SEED_MAX, SEED_MAX)
         self.scene = scene
         self.limits = limits or Limits()
+        self._row_bytes = scene.input_row_bytes
         if world is None:
             world = RecordedWorld(scene, compiled=compiled)
             world.load_terrain()
@@ -147,13 +147,13 @@ class Game:
             self.connections.kick(session, messages.TOO_BIG, reason)
             return
         try:
-            message = decode_from_client(data)
+            message = decode_from_client(data, self._row_bytes)
         except ProtocolError as error:
             self.counters.malformed += 1
             self.connections.kick(session, messages.MALFORMED, str(error))
             return
         if isinstance(message, Inputs) and session.entity:
-            if len(message.rows) > self.limits.input_rows_max * INPUT_ROW_BYTES:
+            if len(message.rows) > self.limits.input_rows_max * self._row_bytes:
                 reason = f"more than {self.limits.input_rows_max} inputs in a message"
                 self.connections.kick(session, messages.MALFORMED, reason)
                 return

@@ -41,7 +41,11 @@ class Roster:
         self._spawns = Spawns(world)
         self._fallen: list[int] = []
         for player in self._api.players.values():  # players of a restored game
-            player.inputs = InputQueue(self._bounds)
+            player.inputs = self._queue()
+
+    def _queue(self) -> InputQueue:
+        """Returns a new input queue for the scene."""
+        return InputQueue(self._bounds, self._world.scene.input_row_bytes)
 
     @property
     def connected(self) -> int:
@@ -62,7 +66,7 @@ class Roster:
         entity = self._spawns.spawn()
         if entity is None:
             return None
-        player = self._api.players[entity] = Player(entity, name, session.subject, self._bounds)
+        player = self._api.players[entity] = Player(entity, name, session.subject, self._queue())
         player.edits_left = 0.0  # otherwise each leave and new join would give another burst
         player.announced = False
         self._counters.joined += 1

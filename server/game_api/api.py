@@ -11,6 +11,7 @@ from typing import Any
 from server.game_api import attributes as attribute_tables
 from server.game_api.attributes import Attributes
 from server.game_api.hooks import Hooks
+from server.game_api.input_api import InputApi
 from server.game_api.outgoing import Outgoing
 from server.game_api.shared_values import SharedValues
 from server.game_api.turn import Turn
@@ -22,14 +23,12 @@ from server.replication.change_log import ChangeLog
 from server.rewind import Rewind
 from server.rewind.history import Past
 from server.rules import Rules, check_rules
-from shared.checks import SceneError, Vec, finite, shown, whole
-from shared.fields import ENTITY_MAX
-from shared.inputs import Input, make_input
+from shared.checks import SceneError, Vec, finite, shown
 from shared.layout import TEMPLATE
 from shared.scene import Scene
 
 
-class GameApi:
+class GameApi(InputApi):
     """The game API of one running game. Positions are in blocks, velocities in blocks/s.
 
     A method raises `MissingError` (a `KeyError`) if there is no entity with the given number, and `SceneError`, which
@@ -58,15 +57,14 @@ class GameApi:
         seed: int = 0,
     ) -> None:
         check_rules(rules)
-        self.turn = Turn()
         self.kept = kept or PersistedState({}, {}, {})
-        self.steered: dict[int, Input] = {}
+        super().__init__(world, self.kept.players, Turn())
         self.log = ChangeLog(world, self.kept.attributes)
         self.shared_values = SharedValues(world, self.kept.shared)
         self.outgoing = Outgoing(counters)
         self.hooks = Hooks(self, world, rules, counters, goes_on=kept is not None)
         self._attributes = Attributes(world, self.log, self.kept.attributes)
-        self._world, self._rewind, self._seed = world, rewind, seed
+        self._rewind, self._seed = rewind, seed
         self._random = (-1, Random())
         rules.game = self
 
@@ -208,24 +206,6 @@ class GameApi:
         self._world.set_template(entity, template)
         self.log.note_act(entity)
 
-    def steer(self, entity: int, x: float, y: float, *, jump: bool = False) -> None:
-        """Sets the input of an entity that is not a player's. It holds until the next call.
-
-        Args:
-            entity: number of the entity.
-            x: direction to the east, from -1 to 1.
-            y: direction to the north, from -1 to 1.
-            jump: whether to jump.
-
-        Raises:
-            SceneError: the entity is a player's.
-        """
-        self.turn.check("steer")
-        entity = self._known(entity)
-        if entity in self.players:
-            raise SceneError(f"entity = {entity}: is a player's, whose client chooses its inputs")
-        self.steered[entity] = make_input(x, y, jump=jump)
-
     def block(self, x: int, y: int, z: int) -> int:
         """Returns the kind of a block: 1 to 255, or 0 for air and for places that are not loaded."""
         return self._world.block(x, y, z) or 0
@@ -336,28 +316,5 @@ class GameApi:
         self._world.remove(entity)
         self._world.note([LEFT, entity])
         self._attributes.forget(entity)
-        self.steered.pop(entity, None)
+        self._forget_input(entity)
         self.log.note_removal(entity)
-
-    # -- inside ------------------------------------------------------------------------------------------------
-
-    def _number(self, entity: object) -> int:
-        """Checks the number of an entity, which need not exist, and returns it as an int of Python.
-
-        Raises:
-            SceneError: it is not a whole number, or out of range.
-        """
-        if isinstance(entity, Player):
-            raise SceneError(f"entity = {shown(entity)}: is a player; its entity is `player.entity`")
-        return whole(entity, "entity", 1, ENTITY_MAX)
-
-    def _known(self, entity: object) -> int:
-        """Checks the number of an existing entity and returns it as an int of Python.
-
-        Raises:
-            MissingError: there is no such entity.
-            SceneError: it is not a whole number, or out of range.
-        """
-        number = self._number(entity)
-        self._world.awake(number)  # raises MissingError if there is no such entity
-        return number

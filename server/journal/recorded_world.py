@@ -25,6 +25,7 @@ from server.journal.records import (
     WRITE,
     Call,
     JournalError,
+    input_record,
     mark,
 )
 from shared import terrain
@@ -101,12 +102,12 @@ class Observer:
     def taken(self, world: WorldState, inputs: Mapping[int, Input]) -> list[Any]:
         """Makes the record of a tick: `[inputs, calls, mark]`, and the hash if one is due. Clears the calls."""
         calls, self.calls = self.calls, []
-        held = self._held
+        held, aim = self._held, world.scene.aim
         news: list[int] = []
         for entity, input_ in inputs.items():
             if held.get(entity) != input_:
                 held[entity] = input_
-                news += map(int, (entity, *input_))
+                news += input_record(entity, input_, aim=aim)
         first, self._first = self._first, False
         parts: list[Any] = [news, calls, None if first else mark(world)]
         due = world.tick % HASH_TICKS == 0 and len(world) <= self._hashed_max

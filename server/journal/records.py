@@ -10,7 +10,8 @@ start     [scene, tick, next_id, states, segments]         the first record
           scene: its table   states: n * 12 int64   segments: [x, y, z, packed kinds or nil if as generated]
 tick      [inputs, calls, mark] or, every 32 ticks, [inputs, calls, mark, hash]
           calls: in order, before the step   inputs: [id, move_x, move_y, buttons, id, ...] that differ from the
-          previous ones   mark: CRC-32 of the states that the tick changed (nil in the first tick, which has a hash)
+          previous ones; in a scene with aim, aim_x, aim_y and aim_z follow each buttons
+          mark: CRC-32 of the states that the tick changed (nil in the first tick, which has a hash)
           hash: 20 bytes, the world's after the step (16 in formats 1 and 2: `server.journal.former`)
 end       [nil, calls, nil, hash]                           the last record, if the recording was ended
 
@@ -37,9 +38,10 @@ import numpy as np
 
 from server.journal import former
 from shared import states, terrain
+from shared.aim import NO_AIM
 from shared.blocks import unpack
 from shared.checks import SceneError
-from shared.inputs import Input
+from shared.inputs import NEUTRAL, Input, checked_input
 from shared.layout import FALLING, FLAGS, ID, Int64s
 from shared.scene import Scene
 from shared.states import STATES
@@ -218,13 +220,29 @@ def redo(world: World, record: list[Any]) -> Moment:
         apply(world, call)
     news: dict[int, Input] = {}
     if inputs is not None:
-        news = {inputs[i]: Input(*inputs[i + 1 : i + 4]) for i in range(0, len(inputs), 4)}
+        news = recorded_inputs(inputs, aim=world.scene.aim)
         world.step(news)
         if marked is not None and mark(world) != marked:
             raise DivergedError(world.tick, "the entities that changed are not the recorded ones")
     if hashes and not has_hash(world, hashes[0]):
         raise DivergedError(world.tick, "the world is not the recorded one")
     return Moment(world, news, calls, bool(hashes), inputs is None)
+
+
+def input_record(entity: int, input_: Input, *, aim: bool) -> list[int]:
+    """Returns the numbers of one input in a record. A scene without aim has none of it in its records."""
+    x, y, buttons, aimed = (*input_, NO_AIM)[:4]
+    return [int(part) for part in (entity, x, y, buttons, *(aimed if aim else ()))]
+
+
+def recorded_inputs(numbers: list[int], *, aim: bool) -> dict[int, Input]:
+    """Returns the inputs of a record by entity: what `input_record` returned for each of them, in a row."""
+    width = len(input_record(0, NEUTRAL, aim=aim))
+    rows = [numbers[i : i + width] for i in range(0, len(numbers), width)]
+    return {
+        entity: checked_input((x, y, buttons, tuple(aimed) or NO_AIM), "input")
+        for entity, x, y, buttons, *aimed in rows
+    }
 
 
 def has_hash(world: World, recorded: bytes) -> bool:

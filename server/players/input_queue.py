@@ -8,18 +8,15 @@ one, the neutral one, or none expected yet). From these it controls how far ahea
 """
 
 import math
-import struct
 import sys
 from array import array
 from functools import lru_cache
 
 from shared.bounds import Bounds, bounds
 from shared.fields import INPUT_ROW_BYTES
-from shared.inputs import NEUTRAL, Input, clamp
+from shared.inputs import NEUTRAL, Input, clamp, unpacked
 from shared.messages import IDLE, MARGIN_REFUSED, NEUTRALISED, REPEATED, USED, Inputs
 
-INPUT_ROW = struct.Struct("<bbB")
-"""Format of one input in a message: move_x, move_y, buttons."""
 DEFAULT = bounds(32)
 """Bounds of the default tick rate, 32 Hz."""
 assert sys.byteorder == "little", "margins lie in memory as they go over the wire"
@@ -28,7 +25,7 @@ assert sys.byteorder == "little", "margins lie in memory as they go over the wir
 @lru_cache(4096)
 def _input(row: bytes) -> Input:
     """Decodes and clamps an input. The cache helps because a key is held for many ticks, so most rows repeat."""
-    return clamp(Input(*INPUT_ROW.unpack(row)))
+    return clamp(unpacked(row))
 
 
 class InputQueue:
@@ -36,10 +33,11 @@ class InputQueue:
 
     Args:
         bounds: bounds for the scene's tick rate.
+        row_bytes: length of one input in a message, `Scene.input_row_bytes`.
     """
 
-    def __init__(self, bounds: Bounds = DEFAULT) -> None:
-        self._bounds = bounds
+    def __init__(self, bounds: Bounds = DEFAULT, row_bytes: int = INPUT_ROW_BYTES) -> None:
+        self._bounds, self._row_bytes = bounds, row_bytes
         self._margin_one = bounds.margin_one
         self._waiting: dict[int, Input] = {}  # inputs for later ticks, by tick, at most `bounds.ahead` ticks ahead
         self._held = NEUTRAL  # the input that is repeated: the newest one used or late
@@ -64,7 +62,8 @@ class InputQueue:
             ahead: ticks until the next tick's deadline, with a fraction.
         """
         at, _, rows = message
-        for start in range(0, len(rows), INPUT_ROW_BYTES):
+        row_bytes = self._row_bytes
+        for start in range(0, len(rows), row_bytes):
             if at <= self._accepted:  # a duplicate, or an order that TCP cannot produce
                 self.refused += 1
             else:
@@ -73,7 +72,7 @@ class InputQueue:
                 elif self.first < 0 or at > self.newest + 1:
                     self._skipped(at)
                 self.newest = at
-                self.margins.append(self._filed(at, rows[start : start + INPUT_ROW_BYTES], tick, ahead))
+                self.margins.append(self._filed(at, rows[start : start + row_bytes], tick, ahead))
             at += 1
         if len(self.margins) > self._bounds.statuses:
             del self.margins[: -self._bounds.statuses]
@@ -116,6 +115,16 @@ class InputQueue:
             self.first = at
         else:
             self.margins.extend([MARGIN_REFUSED] * min(at - self.newest - 1, self._bounds.statuses))
+
+    def coming(self, tick: int) -> Input:
+        """Returns the input that `take` would take for a tick now. Changes nothing."""
+        if self.override is not None:
+            return self.override
+        input_ = self._waiting.get(tick)
+        if input_ is not None:
+            return input_
+        idle = self.first < 0 or tick < self.first
+        return self._held if idle or self._bounds.stands_in(self._missing + 1) else NEUTRAL
 
     def take(self, tick: int) -> Input:
         """Takes the input for the tick that is about to be computed, or a substitute, and notes the input status."""

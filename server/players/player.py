@@ -4,9 +4,8 @@ import math
 from collections import deque
 from typing import TYPE_CHECKING
 
-from server.players.input_queue import DEFAULT, InputQueue
+from server.players.input_queue import InputQueue
 from server.players.outbox import Outbox
-from shared.bounds import Bounds
 from shared.messages import Command
 
 if TYPE_CHECKING:
@@ -23,16 +22,16 @@ class Player:
         entity: number of the player's entity.
         name: the name that the client gave.
         subject: the subject of the client's token; empty if the server does not authenticate.
-        bounds: bounds for the scene's tick rate.
+        inputs: input queue of the player; None: one for the default tick rate, in a scene without aim.
     """
 
-    def __init__(self, entity: int, name: str = "", subject: str = "", bounds: Bounds = DEFAULT) -> None:
+    def __init__(self, entity: int, name: str = "", subject: str = "", inputs: InputQueue | None = None) -> None:
         self.entity = entity
         self.name = name
         self.subject = subject
         self.announced = True
         """Whether `on_join` has been called for the player."""
-        self.inputs = InputQueue(bounds)
+        self.inputs = inputs or InputQueue()
         self.commands: deque[Command] = deque()
         """Commands that wait for their tick."""
         self.command = -1

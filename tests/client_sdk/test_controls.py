@@ -2,8 +2,10 @@
 
 import random
 
+import pytest
+
 from client_sdk.controls import Controls
-from shared.inputs import NEUTRAL, Input
+from shared.inputs import NEUTRAL, Input, make_input
 
 JUMP, OTHER = Input(5, 7, 1), Input(0, 0, 2)
 
@@ -45,6 +47,24 @@ def test_each_button_is_one_of_its_own() -> None:
     assert [controls.take().buttons for _ in range(2)] == [3, 0]
 
 
+@pytest.mark.parametrize("bit", [1 << place for place in range(8)])
+@pytest.mark.parametrize("others", [0, 0b10100101])
+def test_a_press_of_any_button_counts_once(bit: int, others: int) -> None:
+    held = others & ~bit
+    controls = filled(Input(0, 0, held))
+    controls.take()
+    controls.set(Input(0, 0, held | bit))
+    controls.set(Input(0, 0, held))
+    assert [controls.take().buttons for _ in range(2)] == [held | bit, held]
+
+
+def test_the_aim_is_the_newest_one() -> None:
+    first, second = make_input(buttons=2, aim=(1, 0, 0)), make_input(aim=(0, 1, 0))
+    controls = filled(first, second)
+    assert controls.take() == second._replace(buttons=2)
+    assert controls.take() == second
+
+
 def test_a_press_is_forgotten_with_its_tick_and_what_is_held_is_not() -> None:
     controls = filled(JUMP, OTHER)
     controls.forget()
@@ -59,7 +79,7 @@ def test_any_sequence_is_that_of_the_definition() -> None:
             assert controls.take().buttons == before | pressed
             pressed = 0
         else:
-            buttons = rng.randrange(4)
+            buttons = rng.randrange(256)
             controls.set(Input(0, 0, buttons))
             pressed |= buttons & ~before
             before = buttons

@@ -93,7 +93,7 @@ def test_numbers_of_numpy_do_what_pythons_do(playing: Playing) -> None:
     parts: list[Any] = [np.int16(5), np.int64(6), np.uint8(1)]
     client.core.set_input(Input(*parts))
     assert client.core.input == Input(5, 6, 1)
-    assert [type(part) for part in client.core.input] == [int] * 3
+    assert [type(part) for part in client.core.input[:3]] == [int] * 3
     client.set_input_delay(np.int64(0))
     client.core.set_input(Input())
     playing.play(10)

@@ -5,6 +5,7 @@ import random
 import subprocess
 import sys
 import warnings
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,8 @@ from client_sdk.core import Core
 from server.agents import NO_BLOCK, OTHERS, Arena, Observation
 from server.players.player import Player
 from server.rules import Rules
+from shared.checks import SceneError
+from shared.inputs import make_input
 from shared.messages import DONE, OUT_OF_REACH
 from sovereign_netcode.examples.tag import Tag
 from tests.client_sdk.servers import real_server
@@ -157,6 +160,53 @@ def test_commands_are_answered() -> None:
     assert env.world.blocks.get(2, 0, 0) == 0
 
 
+class Keeps(Rules):
+    """Keeps what the rules learn of the first player's buttons and aim."""
+
+    told: list[Any]
+
+    def on_start(self) -> None:
+        self.told = []
+
+    def on_tick(self) -> None:
+        for player in [*self.game.players.values()][:1]:
+            held = [name for name in self.game.scene.buttons if self.game.held(player, name)]
+            self.told.append((held, self.game.aim(player)))
+
+
+def test_the_space_of_actions_has_the_buttons_and_the_aim_of_the_scene() -> None:
+    plain = arena().action_space("player_0")
+    assert plain.low.tolist() == [-127, -127, 0]
+    assert plain.high.tolist() == [127, 127, 1]
+    for buttons, most in ((("jump", "dash", "fire"), 7), (("dash",), 2), ((), 0)):
+        space = arena(scene=replace(YARD, buttons=buttons)).action_space("player_0")
+        assert space.high.tolist() == [127, 127, most]
+    rules = Keeps()
+    env = arena(scene=replace(YARD, buttons=("jump", "dash", "fire"), aim=True), rules=lambda: rules, agents=1)
+    space = env.action_space("player_0")
+    assert space.low.tolist() == [-127, -127, 0, -32767, -32767, -32767]
+    assert space.high.tolist() == [127, 127, 7, 32767, 32767, 32767]
+    env.reset()
+    rules.told.clear()
+    actions: list[Any] = [
+        (0, 0, 4),
+        (0, 0, 2, 0, 0, -5),
+        np.array([1, 0, 0, 7, 0, 0]),
+        make_input(1, 0, buttons=6, aim=(0, 1, 0)),
+    ]
+    for action in actions:
+        env.step({"player_0": action})
+    up, east, north = (0.0, 0.0, -1.0), (1.0, 0.0, 0.0), (0.0, 1.0, 0.0)
+    assert rules.told == [(["fire"], None), (["dash"], up), ([], east), (["dash", "fire"], north)]
+    for wrong in ((0, 0), (0, 0, 256), (0, 0, 0, 1), (0, 0, 0, 1, 2), (0, 0, 0, 1, 2, 3, 4)):
+        with pytest.raises(ValueError, match=r"."):
+            env.step({"player_0": wrong})
+    without = arena(agents=1)
+    without.reset()
+    with pytest.raises(SceneError, match=r"^action.aim = \(0, 32767, 0\): the scene 'test' has no aim"):
+        without.step({"player_0": make_input(aim=(0, 1, 0))})
+
+
 def played(env: Arena, policies: dict[str, Policy], seed: int | None = None) -> tuple[bytes, dict[str, Observation]]:
     """Plays a whole episode. Returns the hash of its world and the last observations."""
     seen, _ = env.reset(seed=seed)
@@ -164,7 +214,7 @@ def played(env: Arena, policies: dict[str, Policy], seed: int | None = None) -> 
         actions = {agent: policies[agent](env.world, env.entity(agent)) for agent in env.agents}
         for agent in env.agents:
             assert env.observation_space(agent).contains(seen[agent])
-            assert env.action_space(agent).contains(np.array(actions[agent]))
+            assert env.action_space(agent).contains(np.array(actions[agent][:3]))
             policy = policies[agent]
             edit = policy.edit(env.world, env.entity(agent)) if isinstance(policy, Builder) else None
             if edit is not None:

@@ -19,7 +19,7 @@ from server.rules import Rules
 from shared import edits, messages
 from shared.bounds import bounds
 from shared.fields import INPUT_ROW_BYTES, INPUT_ROWS_MAX, TICK_MAX
-from shared.inputs import Input, clamp
+from shared.inputs import checked_input, clamp, row
 from shared.layout import BUTTONS, CELL, MOVE_X, VZ, X, Y, Z
 from shared.messages import Bye, Command, Hello, Inputs, Message, Ping, Restart, Resync, Welcome, encode
 from shared.units import BLOCK
@@ -98,9 +98,9 @@ class Cheat:
             assert abs(after[X] - before[X]) <= WALK
             assert abs(after[Y] - before[Y]) <= WALK
             assert after[Z] <= ground + APEX
-            consumed = Input(*after[MOVE_X : BUTTONS + 1])
+            consumed = checked_input(tuple(after[MOVE_X : BUTTONS + 1]), "input")
             assert clamp(consumed) == consumed
-            honest.say(ahead(table, bytes(part & 0xFF for part in consumed)))
+            honest.say(ahead(table, row(consumed)))
             table.tick()
             assert state(table, entity) == after
         assert table.game.counters.kicked == 0
@@ -145,8 +145,8 @@ def test_late_inputs_are_not_made_up_for(cheat: Cheat) -> None:
 
 def test_duplicates_and_several_inputs_for_one_tick_count_once(cheat: Cheat) -> None:
     for _ in range(32):
-        for row in (EAST, EAST, JUMP, bytes((0, 127, 0))):
-            cheat.link.say(ahead(cheat.table, row))
+        for packed in (EAST, EAST, JUMP, bytes((0, 127, 0))):
+            cheat.link.say(ahead(cheat.table, packed))
         cheat.tick()
     assert cheat.walked() == 32 * WALK
     assert {seen[Y] for seen in cheat.path} == {0}
@@ -182,8 +182,8 @@ def test_a_lag_switch_loses_what_it_withholds(cheat: Cheat, withheld: int) -> No
 
 
 def test_directions_that_are_too_long_are_shortened(cheat: Cheat) -> None:
-    for row in (bytes((127, 127, 0)), bytes((128, 128, 0)), bytes((128, 0, 255)), bytes((129, 127, 254))):
-        cheat.link.say(ahead(cheat.table, row, 16))
+    for packed in (bytes((127, 127, 0)), bytes((128, 128, 0)), bytes((128, 0, 255)), bytes((129, 127, 254))):
+        cheat.link.say(ahead(cheat.table, packed, 16))
         cheat.tick(16)
     for before, after in itertools.pairwise(cheat.path):
         step = (after[X] - before[X], after[Y] - before[Y])

@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from server.config.limits import Limits
 from shared import messages
 from shared.bounds import bounds
+from shared.inputs import row
 from shared.messages import Bye, Command, Inputs, Ping, Resync, Snapshot, Terrain, encode
 from tests.lengths import examples
 from tests.tables import HELLO, FakeLink, Table, gone, ids, order
@@ -116,7 +117,7 @@ def test_a_link_that_is_full_is_skipped_and_catches_up_in_one_snapshot(table: Ta
     link, other = table.join(), table.join()
     table.tick(5)
     link.waiting = 1 << 20
-    other.say(Inputs(table.tick_number + 1, -1, bytes(EAST)))
+    other.say(Inputs(table.tick_number + 1, -1, row(EAST)))
     seen = len(link.sent)
     table.tick(5)
     assert (len(link.sent), table.game.counters.snapshots_skipped, len(other.got(Snapshot))) == (seen, 5, 11)

@@ -26,9 +26,12 @@ from server.journal.records import (
     JournalError,
     Moment,
     Recording,
+    input_record,
+    recorded_inputs,
     redo,
     replay,
 )
+from shared.aim import NO_AIM, make_aim
 from shared.inputs import Input
 from shared.world import OverlapError, World
 from shared.world_state import WorldState
@@ -139,6 +142,42 @@ def test_held_inputs_are_written_once_and_again_after_a_teleport() -> None:
     moments, _ = read(file.getvalue())
     assert [moment.inputs for moment in moments] == [{1: worlds.EAST, 2: worlds.JUMP}, {}, {1: worlds.EAST}]
     assert [[call[0] for call in moment.calls] for moment in moments] == [[], [], [PUT]]
+
+
+@pytest.mark.parametrize("aim", [False, True])
+def test_inputs_are_recorded_with_an_aim_where_the_scene_has_one(aim: bool) -> None:
+    file = io.BytesIO()
+    world = RecordedWorld(worlds.scene(FLOOR, aim=aim), compiled=False)
+    world.load_terrain()
+    for place in ((0, 0, 0), (4, 0, 0)):
+        world.spawn("box", place)
+    world.record(file)
+    aims = [make_aim((1, tick // 4, -3)) if aim else NO_AIM for tick in range(16)]
+    for tick in range(16):
+        plain: Any = (tick // 8, -5, 3)  # a tuple without an aim is an input, too
+        world.step({1: Input(127, 0, 1, aims[tick]), 2: plain})
+    world.end_recording()
+    moments, recording = read(file.getvalue())
+    assert recording.world.state_hash() == world.state_hash()
+    for tick, moment in enumerate(moments[:-1]):
+        new = {2: Input(tick // 8, -5, 3)} if tick % 8 == 0 else {}
+        if tick == 0 or aims[tick] != aims[tick - 1]:
+            new[1] = Input(127, 0, 1, aims[tick])
+        assert moment.inputs == new
+
+
+def test_an_input_record_of_a_scene_without_aim_is_what_it_was() -> None:
+    """Numbers of records from before there was an aim."""
+    input_ = Input(-5, 127, 3)
+    assert input_record(7, input_, aim=False) == [7, -5, 127, 3]
+    assert recorded_inputs([7, -5, 127, 3, 9, 0, 0, 0], aim=False) == {7: input_, 9: Input()}
+    assert input_record(7, input_, aim=True) == [7, -5, 127, 3, 0, 0, 0]
+    for numbers in ([7], [7, 0, 0, 0, 9], [7, 0, 0, 256], [7, 0, 0, "1"]):
+        with pytest.raises((ValueError, TypeError)):
+            recorded_inputs(numbers, aim=False)  # type: ignore[arg-type]
+    for short in ([7, 0, 0, 0, 1, 2], [7, 0, 0, 0, 1, 1 << 40, 0]):
+        with pytest.raises(ValueError, match=r"."):
+            recorded_inputs(short, aim=True)
 
 
 def test_notes_come_back_in_order_among_the_calls() -> None:

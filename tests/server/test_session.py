@@ -8,7 +8,7 @@ from server.game.session import Session
 from server.players.input_queue import InputQueue
 from shared.bounds import bounds
 from shared.fields import INPUT_ROWS_MAX, TICK_MAX
-from shared.inputs import NEUTRAL, Input, clamp
+from shared.inputs import NEUTRAL, Input, clamp, row
 from shared.messages import IDLE, MARGIN_REFUSED, NEUTRALISED, REPEATED, USED, Inputs
 
 LIMITS = bounds(32)
@@ -17,7 +17,7 @@ EAST, NORTH, WEST = Input(127, 0, 0), Input(0, 127, 1), Input(-127, 0, 255)
 
 
 def inputs(first: int, *wishes: Input) -> Inputs:
-    return Inputs(first, -1, bytes(part & 0xFF for input_ in wishes for part in input_))
+    return Inputs(first, -1, b"".join(map(row, wishes)))
 
 
 def filed(first: int, *wishes: Input, tick: int = 0, ahead: float = 1.0) -> InputQueue:
@@ -247,7 +247,10 @@ def test_every_input_of_any_client_has_one_status_and_memory_is_bounded(
             queue.file(inputs(first, *[EAST] * rows), tick - 1, 0.5)
             sent += rows
             assert sent >= queue.refused + queue.late + queue.used
-        assert queue.take(tick) in (EAST, NEUTRAL)
+        coming = queue.coming(tick)
+        assert queue.coming(tick) is coming, "it changes nothing"
+        assert queue.take(tick) is coming
+        assert coming in (EAST, NEUTRAL)
         assert len(queue.margins) <= STATUSES_MAX
         assert len(queue.statuses) == tick - told
         if snapshot:

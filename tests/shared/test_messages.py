@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 
 from shared import fields, messages
 from shared.fields import CLIENT_LIST_MAX, CLIENT_MESSAGE_MAX, LIST_MAX, MESSAGE_MAX, STATUSES_MAX, TICK_MAX
+from shared.inputs import Input, row
 from shared.messages import (
     CLIENT_KINDS,
     KINDS,
@@ -123,7 +124,7 @@ OUT_OF_BOUNDS: list[tuple[Message, str, list[Any]]] = [
     (Hello(1, {}, ""), "resume", [bytes(15), bytes(17), "resume", None]),
     (Inputs(0, 0, b""), "first", [-1, TICK_MAX - 63, False, 0.0]),
     (Inputs(0, 0, b""), "acked", [-2, TICK_MAX + 1, None]),
-    (Inputs(0, 0, b""), "rows", [bytes(195), bytes(4), bytes(1), "abc", None, [0, 0, 0]]),
+    (Inputs(0, 0, b""), "rows", [bytes(579), bytes(4), bytes(1), "abc", None, [0, 0, 0]]),
     (Ping(0.0), "sent", [math.nan, math.inf, -math.inf, "1", True, None, [1.0]]),
     (Ping(0.0), "corrections", [-1, 1 << 32, 1.0, None]),
     (Command(0, 0, 0.0, "", b""), "number", [-1, 1 << 32, 0.0]),
@@ -346,3 +347,23 @@ def test_a_joined_snapshot_beyond_its_bounds_is_refused_by_name(field: str) -> N
 def assert_refused(data: bytes, *, server: bool = False) -> None:
     with pytest.raises(ProtocolError):
         (decode_from_server if server else decode_from_client)(data)
+
+
+@pytest.mark.parametrize("row_bytes", [3, 9])
+def test_rows_of_inputs_have_the_length_of_the_scene(row_bytes: int) -> None:
+    for size in (*range(80), *range(180, 200), *range(570, 600)):
+        message = Inputs(5, 4, bytes(size))
+        if size % row_bytes == 0 and size <= 64 * row_bytes:
+            assert messages.decode_from_client(encode(message), row_bytes) == message
+        else:
+            with pytest.raises(ProtocolError, match=r"Inputs\.rows"):
+                messages.decode_from_client(encode(message), row_bytes)
+
+
+def test_what_clients_sent_before_there_was_an_aim_is_what_it_was() -> None:
+    """Bytes of clients of protocol version 3 from before scenes could have buttons and an aim."""
+    hello = bytes.fromhex("96010380a3416e6ea0c400")
+    assert messages.decode_from_client(hello) == Hello(3, {}, "Ann") == Hello(messages.VERSION, {}, "Ann")
+    inputs = bytes.fromhex("9402cd03fdcd03fac4067f00007f0001")
+    assert messages.decode_from_client(inputs) == Inputs(1021, 1018, bytes((127, 0, 0, 127, 0, 1)))
+    assert encode(Inputs(1021, 1018, b"".join((row(Input(127)), row(Input(127, 0, 1)))))) == inputs

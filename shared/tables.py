@@ -1,0 +1,35 @@
+"""Tables of plain values, as MessagePack holds them, of dataclasses."""
+
+from collections.abc import Collection, Mapping
+from dataclasses import fields
+from typing import Any
+
+
+def table_of(owner: Any, optional: Collection[str]) -> dict[str, Any]:
+    """Returns the fields of a dataclass by name, but not None, nor a default of `optional`."""
+    values = [(f, plain(getattr(owner, f.name))) for f in fields(owner)]
+    return {
+        f.name: value
+        for f, value in values
+        if value is not None and (f.name not in optional or value != plain(f.default))
+    }
+
+
+def plain(value: Any) -> Any:
+    """Returns a value with lists in place of tuples and tables in place of mappings, at every depth."""
+    if isinstance(value, Mapping):
+        return {key: plain(value[key]) for key in value}
+    if isinstance(value, list | tuple):
+        return [plain(part) for part in value]
+    return value
+
+
+def in_order(value: Any) -> Any:
+    """Returns a value with the keys of tables in order, and whole numbers as floats: 18 and 18.0 are one number."""
+    if isinstance(value, Mapping):
+        return {key: in_order(value[key]) for key in sorted(value)}
+    if isinstance(value, list):
+        return [in_order(part) for part in value]
+    if isinstance(value, int) and not isinstance(value, bool):
+        return float(value)
+    return value
