@@ -30,7 +30,7 @@ from server.journal.records import (
     JournalError,
     Recording,
 )
-from shared.inputs import JUMP, Input
+from shared.inputs import Input
 from shared.layout import BUTTONS, FALLING, FLAGS, ID, MOVE_X, MOVE_Y, TEMPLATE, VX, Int64s, X
 from shared.units import BLOCK, BLOCK_SHIFT, SPEED
 from shared.world import World
@@ -155,7 +155,8 @@ def show(kept: list[Scene], options: argparse.Namespace, out: Console) -> None:
             table.add_section()
         out.print(table)
     out.print(
-        "Input: east, north, jump; * if new in this tick. Entities within 4 blocks, nearest first. Blocks and blocks/s."
+        "Input: east, north, buttons; * if new in this tick. Entities within 4 blocks, nearest first. Blocks and "
+        "blocks/s."
     )
 
 
@@ -178,8 +179,8 @@ def rows(scene: Scene, entity: int) -> Iterator[tuple[str, ...]]:
         falls = "falls" if state[FLAGS] & FALLING else ""
         name = world.scene.templates[state[TEMPLATE]].name
         star = "*" if state[ID] in scene.inputs else " "
-        jump = " jump" if state[BUTTONS] & JUMP else ""
-        input_ = f"{star}{state[MOVE_X]} {state[MOVE_Y]}{jump}"
+        held = [name for name, bit in world.scene.button_bits.items() if state[BUTTONS] & bit]
+        input_ = " ".join((f"{star}{state[MOVE_X]} {state[MOVE_Y]}", *held))
         touches = ", ".join(contacts(world, state[ID]))
         yield tick, f"{state[ID]} {name}", place, speed, falls, input_, touches
         tick = ""

@@ -18,6 +18,7 @@ from client_sdk import Loopback
 from client_sdk.bots import Follow, Wander
 from client_sdk.core import Core
 from server.game import Game
+from shared.inputs import make_input
 from shared.scene import Scene, Template, load_scene
 from sovereign_netcode.playtest import Match, bot, wander
 from tests.client_sdk.servers import ROOT, real_server
@@ -28,7 +29,7 @@ from tests.readme.run_snippet import LOOPS
 ENGINES = ["pygame-ce", "pyglet", "arcade", "Panda3D", "ursina"]
 ON_A_SERVER = ["asyncio", "A bot"]
 WAITS = "Threads, timers and asyncio"
-ALONE = ["A game", "Without a socket", "Testing it", "Agents that learn", WAITS]
+ALONE = ["A game", "Without a socket", "Testing it", "Agents that learn", WAITS, "Buttons and aim"]
 A_FILE = "Your own game"
 
 
@@ -72,6 +73,20 @@ def alone(name: str) -> dict[str, Any]:
     space: dict[str, Any] = {}
     exec(compile(programs()[name], name, "exec"), space)
     return space
+
+
+def test_buttons_and_aim() -> None:
+    rules = alone("Buttons and aim")["Balls"]()
+    match = Match(load_scene(rules.scene), seed=1, rules=rules)
+    player = match.join(lambda core, _: core.input)
+    match.run(4)
+    player.core.set_input(make_input(aim=(1, 0, 0.5)), {"fire": True})
+    match.run(0.5)
+    (ball,) = match.game.api.entities("ball")
+    east, north, _ = match.game.api.velocity(ball)
+    assert east == pytest.approx(20 / 1.25**0.5, abs=0.01)
+    assert north == 0
+    assert match.game.counters.rules_failed == player.core.stats.divergences == 0
 
 
 def test_single_player() -> None:

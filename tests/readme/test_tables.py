@@ -44,7 +44,7 @@ def test_the_game_api() -> None:
     text = section(README, "Your own game").partition("### The game API")[2].partition("###")[0]
     rows = "".join(re.findall(r"^\|.*\n", text, re.MULTILINE))
     named = re.findall(r"`(\w+)(?:\([^`]*\))?`", rows)
-    public = {name for name in vars(GameApi) if not name.startswith("_")} - CALLED_BY_THE_GAME
+    public = {name for name in dir(GameApi) if not name.startswith("_")} - CALLED_BY_THE_GAME
     assert sorted(named) == sorted({*public, "players"})
 
 
