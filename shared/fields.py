@@ -82,13 +82,18 @@ segment, offset, total = _whole(-(1 << 23), (1 << 23) - 1), _whole(0, PACKED_MAX
 name, token, reason = _text(NAME_MAX), _text(TOKEN_MAX), _text(REASON_MAX)
 """Checks: name, identity token, reason in a `Bye`."""
 rows = _bytes(INPUT_ROWS_MAX * AIM_ROW_BYTES, INPUT_ROW_BYTES)
-"""Check of packed inputs, of a scene with or without aim; `decode_from_client` knows which."""
+"""Check of packed inputs, for scenes with and without aim; `whole_rows` checks the rest."""
 payload, chunk = _bytes(PAYLOAD_MAX), _bytes(PACKED_MAX)
 """Checks: payload, piece of a packed segment."""
 margins, statuses = _bytes(STATUSES_MAX * 2, 2), _bytes(STATUSES_MAX)
 """Checks: packed arrival margins and input statuses."""
 verdicts, drops = _bytes(VERDICTS_MAX * 5, 5), _bytes(DROPS_MAX * 12, 12)
 """Checks: packed verdicts and dropped segments."""
+
+
+def whole_rows(rows: bytes, row_bytes: int) -> bool:
+    """Returns whether packed inputs are at most `INPUT_ROWS_MAX` inputs of `row_bytes` bytes each."""
+    return len(rows) <= INPUT_ROWS_MAX * row_bytes and len(rows) % row_bytes == 0
 
 
 def number(value: Any) -> bool:

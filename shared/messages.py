@@ -57,6 +57,7 @@ from shared.fields import (
     TABLE_MAX,
     TICK_MAX,
     shown,
+    whole_rows,
 )
 
 VERSION = 3
@@ -291,7 +292,9 @@ def join_snapshot(header: tuple[int, int, bytes, int, bytes, bytes, bytes], segm
     return b"".join((_SNAPSHOT_HEAD, n.to_bytes(2, "big"), _SNAPSHOT_KIND, head, parts))
 
 
-def decode(data: bytes, kinds: frozenset[int], longest: int, lists: int = LIST_MAX) -> Message:
+def decode(
+    data: bytes, kinds: frozenset[int], longest: int, lists: int = LIST_MAX, row_bytes: int = INPUT_ROW_BYTES
+) -> Message:
     """Returns the message in `data`.
 
     Args:
@@ -299,6 +302,7 @@ def decode(data: bytes, kinds: frozenset[int], longest: int, lists: int = LIST_M
         kinds: kinds of messages that are allowed.
         longest: longest message, in bytes.
         lists: limit of the items of a list.
+        row_bytes: length of one input, `Scene.input_row_bytes`.
 
     Raises:
         ProtocolError: `data` is not such a message. No other exception is raised, for any bytes.
@@ -320,6 +324,9 @@ def decode(data: bytes, kinds: frozenset[int], longest: int, lists: int = LIST_M
     for name, value, check in zip(kind._fields, values, checks, strict=False):
         if not check(value):
             raise ProtocolError(f"{kind.__name__}.{name} = {shown(value)}: not allowed")
+    if kind is Inputs and not whole_rows(values[2], row_bytes):
+        size = f"{len(values[2])} bytes"
+        raise ProtocolError(f"Inputs.rows: {size}; must be at most {INPUT_ROWS_MAX} inputs of {row_bytes} bytes")
     return kind(*values)  # type: ignore[no-any-return]
 
 
@@ -340,21 +347,16 @@ def decode_from_client(data: bytes, row_bytes: int = INPUT_ROW_BYTES) -> Message
         try:
             _, first, acked, rows = msgpack.unpackb(data)
         except Exception:
-            return decode(data, CLIENT_KINDS, CLIENT_MESSAGE_MAX, CLIENT_LIST_MAX)
+            return decode(data, CLIENT_KINDS, CLIENT_MESSAGE_MAX, CLIENT_LIST_MAX, row_bytes)
         if (
             type(first) is type(acked) is int
             and 0 <= first <= FIRST_MAX
             and -1 <= acked <= TICK_MAX
             and type(rows) is bytes
-            and len(rows) % row_bytes == 0
-            and len(rows) <= INPUT_ROWS_MAX * row_bytes
+            and whole_rows(rows, row_bytes)
         ):
             return Inputs(first, acked, rows)
-    message = decode(data, CLIENT_KINDS, CLIENT_MESSAGE_MAX, CLIENT_LIST_MAX)
-    if type(message) is Inputs and (len(message.rows) % row_bytes or len(message.rows) > INPUT_ROWS_MAX * row_bytes):
-        size = f"{len(message.rows)} bytes"
-        raise ProtocolError(f"Inputs.rows: {size}; must be at most {INPUT_ROWS_MAX} inputs of {row_bytes} bytes")
-    return message
+    return decode(data, CLIENT_KINDS, CLIENT_MESSAGE_MAX, CLIENT_LIST_MAX, row_bytes)
 
 
 def decode_from_server(data: bytes) -> Message:

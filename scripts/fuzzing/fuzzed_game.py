@@ -11,6 +11,7 @@ from server.rules import Rules
 from shared import edits, fields, messages
 from shared.bounds import bounds
 from shared.fields import COMMAND_MAX
+from shared.inputs import clamp
 from shared.messages import (
     Command,
     Hello,
@@ -83,6 +84,7 @@ class FuzzedGame:
             size=(2, 2, 2),
             spawns=((0.5, 0.5, 1.0),),
             terrain={"generator": "boxes", "fill": [[-32, -32, 0, 32, 32, 1, 1]]},
+            aim=self.made // self.LIFE % 2 == 1,
         )
         limits = Limits(resume_s=1.0, silence_s=4.0, stalled_s=2.0, hello_s=1.0, edits_per_s=200.0)
         self.rng = random.Random(self.made)
@@ -115,7 +117,7 @@ class FuzzedGame:
                 game.receive(self.sessions[number], encode(hello), self.now)
         session = self.sessions[number]
         before = game.counters.kicked
-        if not _is_message(data) and rng.random() < 0.98:
+        if not _is_message(data, self.game.scene) and rng.random() < 0.98:
             data = self._plausible()  # malformed messages end the session, so most are replaced
         if not session.entity and rng.random() < 0.9:
             data = encode(Ping(0.0))
@@ -133,13 +135,13 @@ class FuzzedGame:
 
     def _plausible(self) -> bytes:
         """Returns a message that a client might send now, approximately."""
-        rng, tick = self.rng, self.game.world.tick
+        rng, tick, size = self.rng, self.game.world.tick, self.game.scene.input_row_bytes
         x, y, z = (rng.randint(-8, 8) for _ in range(3))
         return encode(
             rng.choice(
                 (
-                    Inputs(max(0, tick + rng.randint(-70, 70)), tick, rng.randbytes(3 * rng.randrange(20))),
-                    Inputs(tick + 1, tick - rng.randrange(3), rng.randbytes(6)),
+                    Inputs(max(0, tick + rng.randint(-70, 70)), tick, rng.randbytes(size * rng.randrange(20))),
+                    Inputs(tick + 1, tick - rng.randrange(3), rng.randbytes(2 * size)),
                     Command(
                         rng.randrange(COMMAND_MAX) if rng.random() < 0.01 else self.made,
                         tick + rng.randint(-3, 70),
@@ -162,15 +164,16 @@ class FuzzedGame:
         for player in game.players.values():
             assert len(player.commands) <= limits.commands_waiting_max
             assert len(player.inputs._waiting) <= bound.ahead
+            assert all(clamp(input_) == input_ for input_ in player.inputs._waiting.values())
             assert max(len(player.inputs.margins), len(player.inputs.statuses)) <= bound.statuses
             assert len(player.verdicts) <= 32 * limits.messages_per_tick * (1 + limits.stalled_s)
             assert len(player.tokens) <= 2
             assert len(player.outbox) <= limits.outbox_max
 
 
-def _is_message(data: bytes) -> bool:
+def _is_message(data: bytes, scene: Scene) -> bool:
     try:
-        decode_from_client(data)
+        decode_from_client(data, scene.input_row_bytes)
     except ProtocolError:
         return False
     return True

@@ -16,7 +16,14 @@ from scripts.fuzzing.fuzzed_game import FuzzedGame
 from server.config.options import SettingsError
 from server.config.settings import KINDS, Settings, parse
 from shared import edits
-from shared.fields import CLIENT_LIST_MAX, CLIENT_MESSAGE_MAX, COMMAND_MAX, TICK_MAX
+from shared.fields import (
+    AIM_ROW_BYTES,
+    CLIENT_LIST_MAX,
+    CLIENT_MESSAGE_MAX,
+    COMMAND_MAX,
+    INPUT_ROW_BYTES,
+    TICK_MAX,
+)
 from shared.layout import STOP_X, TOLD, WHOLE
 from shared.messages import (
     CLIENT_KINDS,
@@ -78,19 +85,24 @@ def said(error: Exception) -> str:
 
 
 def client(data: bytes) -> str:
+    """Decodes as a server does, for scenes without and with aim."""
+    return f"{_client(data, INPUT_ROW_BYTES)} {_client(data, AIM_ROW_BYTES)}"
+
+
+def _client(data: bytes, row_bytes: int) -> str:
     """Decodes as a server does. The fast decoder must agree with the general one."""
     try:
-        message: Message | None = decode_from_client(data)
+        message: Message | None = decode_from_client(data, row_bytes)
         told = type(message).__name__
     except ProtocolError as error:
         message, told = None, said(error)
     try:
-        judged: Message | None = decode(data, CLIENT_KINDS, CLIENT_MESSAGE_MAX, CLIENT_LIST_MAX)
+        judged: Message | None = decode(data, CLIENT_KINDS, CLIENT_MESSAGE_MAX, CLIENT_LIST_MAX, row_bytes)
     except ProtocolError:
         judged = None
     assert message == judged
     if message is not None:
-        assert decode_from_client(encode(message)) == message
+        assert decode_from_client(encode(message), row_bytes) == message
     return told
 
 

@@ -124,7 +124,7 @@ OUT_OF_BOUNDS: list[tuple[Message, str, list[Any]]] = [
     (Hello(1, {}, ""), "resume", [bytes(15), bytes(17), "resume", None]),
     (Inputs(0, 0, b""), "first", [-1, TICK_MAX - 63, False, 0.0]),
     (Inputs(0, 0, b""), "acked", [-2, TICK_MAX + 1, None]),
-    (Inputs(0, 0, b""), "rows", [bytes(579), bytes(4), bytes(1), "abc", None, [0, 0, 0]]),
+    (Inputs(0, 0, b""), "rows", [bytes(195), bytes(579), bytes(4), bytes(1), "abc", None, [0, 0, 0]]),
     (Ping(0.0), "sent", [math.nan, math.inf, -math.inf, "1", True, None, [1.0]]),
     (Ping(0.0), "corrections", [-1, 1 << 32, 1.0, None]),
     (Command(0, 0, 0.0, "", b""), "number", [-1, 1 << 32, 0.0]),
