@@ -17,7 +17,7 @@ import hashlib
 import itertools
 import math
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from typing import TypeVar
 
 import numpy as np
@@ -30,7 +30,7 @@ from shared.units import RANGE_BLOCKS, SEGMENT, SEGMENT_SHIFT
 BLOCKS = SEGMENT**3
 """Number of blocks in a segment."""
 AIR = 0
-"""Kind of a block that is not solid; all other kinds are."""
+"""Kind of a block that is empty. The scene says which other kinds are not solid (`Scene.kinds`)."""
 KIND_MAX = 255
 """Greatest kind of a block."""
 SEGMENT_MAX = RANGE_BLOCKS // SEGMENT
@@ -148,9 +148,18 @@ def grown(array: npt.NDArray[T], fill: int, length: int) -> npt.NDArray[T]:
 
 
 class Blocks:
-    """The loaded segments of a world, each in a row of the arrays."""
+    """The loaded segments of a world, each in a row of the arrays.
 
-    def __init__(self) -> None:
+    Args:
+        passable: kinds of blocks that are not solid, besides air.
+    """
+
+    def __init__(self, passable: Iterable[int] = ()) -> None:
+        self.stops = [kind != AIR for kind in range(KIND_MAX + 1)]
+        """Whether blocks of a kind are solid, by kind."""
+        for kind in passable:
+            self.stops[kind] = False
+        self._solid_kinds = None if sum(self.stops) == KIND_MAX else np.array(self.stops)
         self.count = 1  # row 0 is layout.NOWHERE
         self.rows: dict[Cell, int] = {}
         self.kinds: Kinds = np.zeros((1, BLOCKS), np.uint8)
@@ -185,10 +194,14 @@ class Blocks:
             self.segments[row] = index
             moved = self._enter(row) or moved
         self.kinds[row] = kinds
-        self.solid[row] = np.packbits(kinds != AIR, bitorder="little").view("<u4")
+        self.solid[row] = np.packbits(self._solid_of(kinds), bitorder="little").view("<u4")
         self._touch(row)
         self._freshen(row)
         return moved
+
+    def _solid_of(self, kinds: Kinds) -> npt.NDArray[np.bool_]:
+        """Returns whether each block is solid. Where all kinds are, a comparison is faster than a table."""
+        return kinds != AIR if self._solid_kinds is None else self._solid_kinds[kinds]
 
     def unload(self, index: Cell) -> None:
         """Removes a segment, which counts as solid from then on. No entity may be in it.
@@ -254,7 +267,7 @@ class Blocks:
         row, at = self.row(segment_of(x, y, z)), offset_of(x, y, z)
         self.kinds[row, at] = kind
         word, bit = at >> SEGMENT_SHIFT, 1 << (at & (SEGMENT - 1))
-        self.solid[row, word] = int(self.solid[row, word]) & ~bit | (bit if kind != AIR else 0)
+        self.solid[row, word] = int(self.solid[row, word]) & ~bit | (bit if self.stops[kind] else 0)
         self._touch(row)
 
     def segment(self, index: Cell) -> Kinds:

@@ -16,16 +16,17 @@ import numpy as np
 
 from shared import layout
 from shared.aim import NO_AIM, Aim
+from shared.block_kind import BlockKind, numbered, numbered_fill
 from shared.bounds import TICK_RATE_MAX
 from shared.buttons import DEFAULT_BUTTONS, Names, bits_of, checked_buttons, held_names
 from shared.checks import Cell, SceneError, Vec, boolean, cell, choice, finite, items, shown, text, vector, whole
 from shared.fields import AIM_ROW_BYTES, INPUT_ROW_BYTES
 from shared.inputs import MOVE_MAX
-from shared.tables import in_order, plain, table_of
+from shared.tables import in_order, made, plain, table_of
 from shared.template import Template, own_numbers
 from shared.units import RANGE_BLOCKS, SEGMENT, SPEED, rounded, to_position, to_velocity
 
-__all__ = ["INTEGRATORS", "SCENES", "Scene", "Template", "load_scene"]
+__all__ = ["INTEGRATORS", "SCENES", "BlockKind", "Scene", "Template", "load_scene"]
 
 TEMPLATES_MAX = 255
 """Limit of the templates of a scene."""
@@ -36,7 +37,7 @@ REACH_MAX = 1024.0
 INTEGRATORS = ("mean", "semi")
 """Choices of `Scene.integrator`."""
 
-OPTIONAL = frozenset({"buttons", "aim"})
+OPTIONAL = frozenset({"aim", "buttons", "kinds"})
 """Fields of scenes and templates that a table leaves out if they have their default, so that scenes without them keep
 their bytes and their fingerprint. A field that is None is left out, too."""
 
@@ -69,6 +70,8 @@ class Scene:
         buttons: names of the players' buttons, at most 8; "jump" is bit 0, which the physics reads, and the others
             have the bits after it in this order.
         aim: whether players send an aim, a direction in space, with each input. It costs 6 bytes per input.
+        kinds: the kinds of blocks that have a name, for rules and pictures, and which of them are not solid. Kinds
+            without an entry are solid. The last item of an entry of the terrain's `fill` may be such a name.
 
     Raises:
         SceneError: a value is not valid; the message names it.
@@ -89,6 +92,7 @@ class Scene:
     reach: float = 6.0
     buttons: tuple[str, ...] = DEFAULT_BUTTONS
     aim: bool = False
+    kinds: tuple[BlockKind, ...] = ()
 
     def __repr__(self) -> str:
         """Returns a short text, because events are printed with it; `to_table` has all values."""
@@ -121,6 +125,7 @@ class Scene:
             raise SceneError(f"origin = {self.origin}, size = {self.size}: reaches further than {RANGE_BLOCKS} blocks")
         if self.size[0] * self.size[1] * self.size[2] > SEGMENTS_MAX:
             raise SceneError(f"size = {self.size}: more than {SEGMENTS_MAX} segments")
+        object.__setattr__(self, "kinds", numbered(items(self.kinds, "kinds")))
         terrain: object = self.terrain
         if not isinstance(terrain, Mapping) or not isinstance(terrain.get("generator"), str):
             raise SceneError(f"terrain = {shown(terrain)}: must be a table with a generator")
@@ -130,6 +135,9 @@ class Scene:
                 msgpack.packb(plain(value))
             except (TypeError, ValueError, OverflowError, RecursionError) as error:
                 raise SceneError(f"terrain.{key} = {shown(value)}: cannot be sent ({type(error).__name__})") from error
+        fill = terrain.get("fill")
+        if self.kinds and isinstance(fill, list | tuple):
+            object.__setattr__(self, "terrain", {**terrain, "fill": numbered_fill(fill, self.kind)})
         spawns = tuple(vector(spawn, f"spawns[{i}]") for i, spawn in enumerate(items(self.spawns, "spawns")))
         if not spawns:
             raise SceneError(f"spawns = {shown(self.spawns)}: must list at least one position")
@@ -171,14 +179,18 @@ class Scene:
             raise SceneError("name: missing")
         values = dict(table)
         if "templates" in values:
-            values["templates"] = tuple(_template(entry) for entry in items(values["templates"], "templates"))
+            entries = items(values["templates"], "templates")
+            values["templates"] = tuple(made(Template, entry, "templates") for entry in entries)
+        if "kinds" in values:
+            values["kinds"] = tuple(made(BlockKind, entry, "kinds") for entry in items(values["kinds"], "kinds"))
         if "spawns" in values:
             values["spawns"] = tuple(items(values["spawns"], "spawns"))
         return cls(**values)
 
     def to_table(self) -> dict[str, Any]:
         """Returns a table for `from_table`, of plain lists, tables, texts and numbers."""
-        return table_of(self, OPTIONAL) | {"templates": [table_of(entry, OPTIONAL) for entry in self.templates]}
+        table = table_of(self, OPTIONAL) | {"templates": [table_of(entry, OPTIONAL) for entry in self.templates]}
+        return table | ({"kinds": [table_of(entry, OPTIONAL) for entry in self.kinds]} if self.kinds else {})
 
     @functools.cached_property
     def fingerprint(self) -> bytes:
@@ -260,7 +272,34 @@ class Scene:
         """
         base = self.templates[self.template(self.player if like is None else like, "like")]
         entry = {f.name: getattr(base, f.name) for f in fields(Template)}
-        return replace(self, templates=(*self.templates, _template({**entry, **changes, "name": name})))
+        new = made(Template, {**entry, **changes, "name": name}, "templates")
+        return replace(self, templates=(*self.templates, new))
+
+    def kind(self, name: object, at: str = "kind") -> int:
+        """Returns the number of a named kind of blocks.
+
+        Args:
+            name: name of the kind.
+            at: name of the field or argument that has `name`, for the error.
+
+        Raises:
+            SceneError: there is no such kind.
+        """
+        for kind in self.kinds:
+            if kind.name == name and kind.number is not None:
+                return kind.number
+        raise SceneError(
+            f"{at} = {shown(name)}: no such kind (there are {', '.join(each.name for each in self.kinds)})"
+        )
+
+    def with_kind(self, name: str, number: int | None = None, *, solid: bool = True) -> "Scene":
+        """Returns a copy of the scene with one more kind of blocks; `BlockKind` describes the arguments."""
+        return replace(self, kinds=(*self.kinds, BlockKind(name, number, solid)))
+
+    @functools.cached_property
+    def passable(self) -> tuple[int, ...]:
+        """The numbers of the kinds of blocks that are not solid, besides air."""
+        return tuple(kind.number for kind in self.kinds if not kind.solid and kind.number is not None)
 
     def segments(self) -> list[Cell]:
         """Returns the index of every segment of the scene, in ascending order of z, y, x."""
@@ -321,15 +360,3 @@ def load_scene(name_or_path: str | Path) -> Scene:
 def _walk_velocities(walk_speed: float) -> tuple[int, ...]:
     """Returns the velocity for each value of a part of an input, for `layout.Arrays.walk`."""
     return tuple(rounded(walk_speed * SPEED * move / MOVE_MAX) for move in range(-MOVE_MAX, MOVE_MAX + 1))
-
-
-def _template(entry: object) -> Template:
-    if not isinstance(entry, Mapping):
-        raise SceneError(f"templates: {entry!r} must be a table")
-    known = {f.name for f in fields(Template)}
-    for key in entry:
-        if key not in known:
-            raise SceneError(f"templates.{key}: no such field (there are {', '.join(sorted(known))})")
-    if "name" not in entry:
-        raise SceneError("templates.name: missing")
-    return Template(**entry)

@@ -2,7 +2,11 @@
 
 from collections.abc import Collection, Mapping
 from dataclasses import fields
-from typing import Any
+from typing import Any, TypeVar
+
+from shared.checks import SceneError
+
+Made = TypeVar("Made")
 
 
 def table_of(owner: Any, optional: Collection[str]) -> dict[str, Any]:
@@ -33,3 +37,25 @@ def in_order(value: Any) -> Any:
     if isinstance(value, int) and not isinstance(value, bool):
         return float(value)
     return value
+
+
+def made(of: type[Made], entry: object, at: str) -> Made:
+    """Returns the part of a scene, a dataclass with a name, that an entry of its table describes.
+
+    Args:
+        of: the dataclass.
+        entry: a table with the fields by name.
+        at: name of the field that has `entry`, for the error.
+
+    Raises:
+        SceneError: `entry` is no table, a field is unknown or not valid, or the name is missing.
+    """
+    if not isinstance(entry, Mapping):
+        raise SceneError(f"{at}: {entry!r} must be a table")
+    known = {f.name for f in fields(of)}  # type: ignore[arg-type]
+    for key in entry:
+        if key not in known:
+            raise SceneError(f"{at}.{key}: no such field (there are {', '.join(sorted(known))})")
+    if "name" not in entry:
+        raise SceneError(f"{at}.name: missing")
+    return of(**entry)

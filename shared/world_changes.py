@@ -119,14 +119,15 @@ class UncheckedWorld(WorldState):
     def _set_box(self, low: Cell, high: Cell, kind: int, push: bool) -> int:
         changed = self.blocks.different(low, high, kind)
         in_the_way: list[int] = []
-        if kind != blocks.AIR:
+        stops = self.blocks.stops
+        if stops[kind]:
             in_the_way = overlapping(self, -1, [part * BLOCK for part in (*low, *high)])
             if in_the_way and not push:
                 raise OverlapError(f"blocks {low} to {high}: entity {in_the_way[0]} is there")
         for (x, y, z), before in changed:
             self.blocks.set(x, y, z, kind)
             self.editing.setdefault((x, y, z), before)
-            if kind == blocks.AIR:
+            if stops[before] and not stops[kind]:
                 face = (x * BLOCK, y * BLOCK, (x + 1) * BLOCK, (y + 1) * BLOCK, (z + 1) * BLOCK)
                 self.kernel.wake_on(self.bound, -1, *face)
         if not in_the_way:

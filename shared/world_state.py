@@ -41,7 +41,7 @@ class WorldState:
         self.tick = 0
         """Number of the latest step: the world is the state at the end of this tick. `rebase` sets it without a
         step."""
-        self.blocks = blocks.Blocks()
+        self.blocks = blocks.Blocks(scene.passable)
         self.kernel = kernels.get(compiled)
         """Kernel that steps this world; all other code that works on the world's arrays uses it, too."""
         self.templates, self._walk, self.parameters = scene.kernel_tables()

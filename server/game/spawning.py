@@ -4,7 +4,6 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from shared.blocks import AIR
 from shared.checks import Vec
 from shared.layout import ID, TEMPLATE, X, Y
 from shared.units import BLOCK, BLOCK_SHIFT, to_position
@@ -87,7 +86,9 @@ class Spawns:
         spans = [
             range(a >> BLOCK_SHIFT, (a + side - 1 >> BLOCK_SHIFT) + 1) for a, side in zip(low, box[3:], strict=True)
         ]
-        return any(self._world.blocks.get(x, y, z) != AIR for z in spans[2] for y in spans[1] for x in spans[0])
+        blocks = self._world.blocks
+        kinds = (blocks.get(x, y, z) for z in spans[2] for y in spans[1] for x in spans[0])
+        return any(kind is None or blocks.stops[kind] for kind in kinds)
 
     def _taken(self, x: float, y: float) -> set[tuple[int, int]]:
         """Returns the offsets from a spawn point (in steps of `APART`) with an entity nearby, at any height."""

@@ -210,6 +210,14 @@ class GameApi(InputApi):
         """Returns the kind of a block: 1 to 255, or 0 for air and for places that are not loaded."""
         return self._world.block(x, y, z) or 0
 
+    def kind(self, name: str) -> int:
+        """Returns the number of a named kind of blocks of the scene, for `set_block` and `block`.
+
+        Raises:
+            SceneError: there is no such kind.
+        """
+        return self.scene.kind(name)
+
     def set_block(self, x: int, y: int, z: int, kind: int) -> None:
         """Places (kind 1 to 255) or removes (0) a block.
 

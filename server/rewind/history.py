@@ -205,7 +205,7 @@ class Past:
     def ray(
         self, origin: Sequence[float], direction: Sequence[float], length: float, but: Collection[int] = ()
     ) -> list[Hit]:
-        """Returns the hits of a ray, nearest first. It ends at the first block; a place that is not loaded is a block.
+        """Returns the hits of a ray, nearest first. It ends at the first solid block, or at a place that is not loaded.
 
         Args:
             origin: start of the ray in blocks.
@@ -243,7 +243,7 @@ class Past:
 
     def _solid(self, cell: Cell) -> bool:
         kind = self.block(*cell)
-        return cell[2] >= self._floor if kind is None else kind != 0
+        return cell[2] >= self._floor if kind is None else self._world.blocks.stops[kind]
 
     def _near(self, ray: Ray) -> Int64s:
         """Returns the indices of the entities that the ray may hit, by the slab test in floats with a margin."""

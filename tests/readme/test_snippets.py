@@ -136,10 +136,12 @@ def test_a_game() -> None:
 
 
 def test_a_scene(tmp_path: Path) -> None:
-    ((heading, text),) = programs("toml").items()
-    (file := tmp_path / "island.toml").write_text(text, "utf-8")
+    found = programs("toml")
+    assert found.keys() == {"Scenes", "Kinds of blocks"}
+    (file := tmp_path / "island.toml").write_text(found["Scenes"] + found["Kinds of blocks"], "utf-8")
     scene = load_scene(str(file))
-    assert (heading, repr(scene)) == ("Scenes", "<Scene 'island', 96 x 64 x 32 blocks, 32 ticks/s>")
+    assert repr(scene) == "<Scene 'island', 96 x 64 x 32 blocks, 32 ticks/s>"
+    assert (scene.kind("water"), scene.passable) == (7, (7,))
     assert scene == dataclasses.replace(scene, tick_rate=Scene.tick_rate, gravity=Scene.gravity), "the defaults"
     client = Loopback(Game(scene)).join("Ann")
     for frame in range(120):

@@ -17,6 +17,7 @@ from server.game import Game
 from server.rewind import Rewind
 from server.rewind.history import WINDOW_S, Hit, Past
 from server.rewind.rays import Ray
+from shared.block_kind import BlockKind
 from shared.checks import Cell, SceneError, Vec
 from shared.inputs import Input
 from shared.layout import Int64s
@@ -332,6 +333,35 @@ def test_unloaded_segments_stop_a_ray_and_the_void_does_not() -> None:
     past = rewinding()[1].at(0)
     assert past.ray((0.5, 0.5, 3.5), (0, 1, 0), 99)[-1].block == (0, 32, 3)
     assert past.ray((31.5, 0.5, -3.5), (0, 0, -1), 99) == []
+
+
+def test_a_ray_passes_through_water_and_stops_at_what_was_stone_then(compiled: bool) -> None:
+    kinds = (BlockKind("stone"), BlockKind("water", solid=False))
+    world, rewind = rewinding(compiled=compiled, kinds=kinds)
+    stone, water = (world.scene.kind(name) for name in ("stone", "water"))
+    world.fill((2, -3, 0), (5, 3, 4), water)
+    world.set_block(9, 0, 1, stone)
+    target = world.spawn("stone", (6, 0, 0))
+
+    def shot(seen: float) -> list[int | Cell | None]:
+        return [hit.entity or hit.block for hit in rewind.at(seen).ray((0, 0.25, 1.5), (1, 0, 0), 20)]
+
+    def tick() -> int:
+        world.step()
+        rewind.record()
+        return world.tick
+
+    before = tick()
+    assert shot(before) == [target, (9, 0, 1)]
+    world.set_block(3, 0, 1, stone)
+    walled = tick()
+    world.set_block(3, 0, 1, water)
+    after = tick()
+    assert [shot(seen) for seen in (before, walled, after)] == [
+        [target, (9, 0, 1)],
+        [(3, 0, 1)],
+        [target, (9, 0, 1)],
+    ]
 
 
 @settings(max_examples=examples(100))

@@ -93,6 +93,7 @@ CASES: list[tuple[str, str, Act, list[Any]]] = [
     ("set_block z", "z = ", lambda g, bad: g.set_block(8, 8, bad, 1), WHOLE),
     ("set_block kind", "kind = ", lambda g, bad: g.set_block(8, 8, 5, bad), [*WHOLE, -1, 256]),
     ("set_block nowhere", r"block \(99, 8, 5\)", lambda g, bad: g.set_block(99, 8, 5, bad), [1]),
+    ("kind", "kind = ", lambda g, bad: g.kind(bad), ["lava", "", None, 3, ["water"]]),
     ("rewound player", "player = ", lambda g, bad: g.rewound(bad), [None, PLAYER, "Ann"]),
     ("rewound seen", "seen = ", lambda g, bad: g.rewound(g.players[PLAYER], bad), [
         bad for bad in NUMBER if bad is not None

@@ -8,6 +8,7 @@ import pytest
 from client_sdk.core import Core
 from client_sdk.events import Answered, Corrected
 from client_sdk.netsim.links import PRESETS
+from shared.block_kind import BlockKind
 from shared.inputs import JUMP, Input
 from shared.scene import Scene, load_scene
 from shared.units import BLOCK
@@ -105,6 +106,31 @@ def test_a_player_with_acceleration_is_corrected_for_late_inputs_only(preset: st
     assert player.core.stats.divergences == 0
     assert tour.pressed > 0
     assert tour.jumped > 0
+
+
+@pytest.mark.parametrize("preset", ["typical", *long(*sorted(PRESETS.keys() - {"typical"}))])
+def test_a_player_in_water_that_comes_and_goes_is_not_corrected(preset: str) -> None:
+    """The spawn points are in water; blocks turn from stone to water and back in the way of the player."""
+    fill = [[0, 0, 0, 64, 64, 1, 1], [0, 0, 1, 64, 64, 7, "water"], [20, 20, 1, 24, 44, 3, 1]]
+    scene = Scene(
+        "pool", size=(2, 2, 1), spawns=((32.0, 32.0, 2.0),), terrain={"generator": "boxes", "fill": fill},
+        kinds=(BlockKind("water", 77, solid=False),),
+    )  # fmt: skip
+    match, tour = Match(scene, 5), Hike()
+    player = match.join(tour, PRESETS[preset])
+    match.run_until(lambda: player.core.state == "playing", 20)
+    rng = random.Random(1)
+    for _ in range(40):
+        x, y, z = (int(part // 1) for part in match.game.world.position(player.core.entity))
+        at = x + rng.randint(-6, 6), y + rng.randint(-6, 6), z + rng.randint(-1, 2)
+        if (abs(at[0] - x) > 3 or abs(at[1] - y) > 3) and at[2] > 0:
+            match.game.world.set_block(*at, rng.choice((1, 77, 77)))
+        match.run(0.25)
+    causes = {event.cause for event in player.events if isinstance(event, Corrected)}
+    assert causes <= {"late input", "unknown edit"}
+    assert player.core.stats.divergences == 0
+    assert player.core.prediction is not None
+    assert player.core.prediction.confirmed.scene.kind("water") == 77
 
 
 def test_a_push_by_the_rules_is_one_server_act_and_its_decay_is_predicted() -> None:
