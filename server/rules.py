@@ -73,7 +73,10 @@ class Rules:
         """Called when a player leaves for good, before the entity is removed."""
 
     def on_tick(self) -> None:
-        """Called once per tick, after the other hooks and before the step."""
+        """Called once per tick, after the other hooks and before the step.
+
+        `game.held`, `pressed`, `released`, `move` and `aim` give the inputs that the step of this tick uses.
+        """
 
     def on_command(self, player: Player, name: str, payload: Any) -> bool | None:
         """Called for each command that a client sends with `Client.command`, except for edits of blocks.

@@ -17,7 +17,7 @@ from server.persistence import store as stores
 from server.persistence.database import StoreError
 from server.persistence.store import Store
 from shared.blocks import pack
-from shared.inputs import Input
+from shared.inputs import Input, make_input
 from shared.world import World
 from tests import worlds
 
@@ -126,6 +126,21 @@ def test_a_world_comes_back_with_its_hash_after_a_crash_and_after_a_stop(
         assert store.close()
         store = opened()
         assert (store.restored[0], store.kept, store.notes) == (last[0] + 1, KEPT, [])
+
+
+def test_inputs_with_an_aim_come_back_after_a_crash(tmp_path: Path) -> None:
+    scene = worlds.scene([worlds.floor(0)], aim=True)
+    with closing(Store(tmp_path / "data", scene, checkpoint_s=60)) as store:
+        store.start(keep)
+        rng, entity = random.Random(3), store.world.spawn("box", (0, 0, 0))
+        for _ in range(50):
+            aim = [rng.uniform(-1, 1) for _ in range(3)]
+            store.world.step({entity: make_input(rng.uniform(-1, 1), 1, buttons=rng.randrange(8), aim=aim)})
+        after, state = store.world.state_hash(), store.world.state(entity)
+        copy = crashed(store, tmp_path)
+    with closing(Store(copy, scene, checkpoint_s=60)) as store:
+        assert store.world.state(entity) == state
+        assert store.world.state_hash() == after
 
 
 def test_notes_come_back_since_the_checkpoint_each_with_its_tick(opened: Callable[..., Store], tmp_path: Path) -> None:
