@@ -11,7 +11,9 @@ from typing import TYPE_CHECKING, Any
 from client_sdk.async_client import AsyncClient
 from client_sdk.client import Client
 from client_sdk.events import (
+    Announced,
     Answered,
+    BehaviourFailed,
     Corrected,
     Disconnected,
     Diverged,
@@ -23,6 +25,7 @@ from client_sdk.events import (
     Resumed,
     Resynchronised,
     SegmentLoaded,
+    Withdrawn,
 )
 from client_sdk.loopback import Loopback
 from client_sdk.stats import Stats
@@ -34,8 +37,10 @@ if TYPE_CHECKING:
     from client_sdk.netsim.links import Link
 
 __all__ = [
+    "Announced",
     "Answered",
     "AsyncClient",
+    "BehaviourFailed",
     "Client",
     "ConnectError",
     "Corrected",
@@ -55,6 +60,7 @@ __all__ = [
     "SegmentLoaded",
     "Stats",
     "View",
+    "Withdrawn",
     "make_input",
 ]
 

@@ -11,7 +11,7 @@ import asyncio
 import socket
 import ssl
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from types import TracebackType
 from typing import TYPE_CHECKING, cast
 
@@ -31,6 +31,7 @@ from client_sdk.transports.connection import (
     unreachable,
 )
 from client_sdk.view import View
+from shared.behaviours import Behaviour
 from shared.checks import duration
 from shared.scene import Scene
 
@@ -94,6 +95,7 @@ class AsyncClient(BaseClient):
         tls: ssl.SSLContext | None = None,
         link: "str | Link | None" = None,
         before_update: Callable[[Core], None] | None = None,
+        behaviours: Iterable[type[Behaviour]] = (),
     ) -> "AsyncClient":
         """Connects to a server. Returns as soon as the server has answered; the client then joins by itself.
 
@@ -109,13 +111,14 @@ class AsyncClient(BaseClient):
             tls: certificates to trust for wss://; None: those that the system trusts.
             link: a simulated link: the name of a preset, or a `Link`; None: none.
             before_update: called with the core before each update while the client plays, so that it can set the input.
+            behaviours: the classes of the game's behaviours, as for `Client.connect`.
 
         Raises:
             ValueError: an argument is not valid.
             ConnectError: there is no connection; the text says why, and what to do.
         """
         COMPILER.begin()
-        core = Core(name, scene, token=token, patience_s=patience_s)
+        core = Core(name, scene, token=token, patience_s=patience_s, behaviours=behaviours)
         set_link(core, link)
         client = cls(core, url, before_update, checked_tls(tls))
         connection = client._connection

@@ -11,6 +11,7 @@ with Client.connect("ws://localhost:8765", name="Ann") as client:
 
 import ssl
 import time
+from collections.abc import Iterable
 from types import TracebackType
 from typing import TYPE_CHECKING, Protocol
 
@@ -21,6 +22,7 @@ from client_sdk.events import Event
 from client_sdk.transports.connection import Connection, checked_tls
 from client_sdk.transports.polling import PollingTransport
 from client_sdk.view import View
+from shared.behaviours import Behaviour
 from shared.checks import duration, finite
 from shared.scene import Scene
 
@@ -75,6 +77,7 @@ class Client(BaseClient):
         timeout: float = 5.0,
         tls: ssl.SSLContext | None = None,
         link: "str | Link | None" = None,
+        behaviours: Iterable[type[Behaviour]] = (),
     ) -> "Client":
         """Connects to a server. Returns as soon as the server has answered; `poll` and `update` then join the game.
 
@@ -89,6 +92,8 @@ class Client(BaseClient):
             timeout: the longest time that this call may block, in seconds.
             tls: certificates to trust for wss://; None: those that the system trusts.
             link: a simulated link: the name of a preset, or a `Link`; None: none. `Client.link` changes it later.
+            behaviours: the classes of the game's behaviours, which the client predicts (`shared.behaviours`). If one is
+                missing or differs from the server's, the client gets `Left` with its name.
 
         Raises:
             ValueError: an argument is not valid: no preset has the name in `link`, or UTF-8 cannot hold the name or the
@@ -96,7 +101,7 @@ class Client(BaseClient):
             ConnectError: there is no connection; the text says why, and what to do.
         """
         COMPILER.begin()
-        core = Core(name, scene, token=token, patience_s=patience_s)
+        core = Core(name, scene, token=token, patience_s=patience_s, behaviours=behaviours)
         set_link(core, link)
         return cls(core, PollingTransport(Connection(url, core), duration(timeout, "timeout"), checked_tls(tls)))
 

@@ -12,6 +12,7 @@
 """
 
 import math
+from collections.abc import Iterable
 from typing import Any, SupportsIndex
 
 from client_sdk.advice import advised
@@ -30,6 +31,7 @@ from client_sdk.timing.timeline import Timeline
 from client_sdk.view import NOTHING, View
 from client_sdk.worlds import Worlds
 from shared import edits, fields, messages
+from shared.behaviours import Behaviour, BehaviourError, checked_classes
 from shared.buttons import Names
 from shared.checks import SceneError, duration, shown, text, whole
 from shared.inputs import Input, checked_input, clamp
@@ -57,6 +59,7 @@ class Core:
         compiled: True: use a compiled kernel; False: use the plain one; None: use the one that `shared.kernels`
             chooses, and the plain one as long as Numba compiles it, because no call of a core waits for a compiler.
         neighbours: whether the predicted world has other entities, so that blocking each other is predicted.
+        behaviours: this program's classes of the game's behaviours. A server whose scene needs others is refused.
 
     Raises:
         ValueError: the name or the token is not a text, is too long, or UTF-8 cannot hold it.
@@ -71,6 +74,7 @@ class Core:
         patience_s: float = 0.0,
         compiled: bool | None = None,
         neighbours: bool = True,
+        behaviours: Iterable[type[Behaviour]] = (),
     ) -> None:
         self.name = text(name, "name", NAME_MAX, shortest=0)
         if scene is not None and not isinstance(scene, Scene):
@@ -93,7 +97,15 @@ class Core:
         self._out: list[bytes] = []
         self._events = PendingEvents()
         self._game_events = GameEvents(self._events)
-        self._worlds = Worlds(self.stats, self._events, self.controls, compiled=compiled, neighbours=neighbours)
+        self.behaviours = checked_classes(behaviours)
+        self._worlds = Worlds(
+            self.stats,
+            self._events,
+            self.controls,
+            self.behaviours,
+            compiled=compiled,
+            neighbours=neighbours,
+        )
 
     @property
     def prediction(self) -> Prediction | None:
@@ -281,7 +293,7 @@ class Core:
                     self._events.append(SegmentLoaded(segment))
             case messages.Welcome():
                 self._welcome(message, now)
-            case messages.Happened():
+            case messages.Happened() | messages.Announce():
                 self._game_events.happened(message, hold=self._joins)
             case messages.NextHappened():
                 self._game_events.next(message.number, hold=self._joins)
@@ -305,7 +317,11 @@ class Core:
         worlds = self._worlds
         if worlds.filled:
             raise ProtocolError("unexpected second Welcome message")
-        world = worlds.replica(welcome, now)
+        try:
+            world = worlds.replica(welcome, now)
+        except BehaviourError as error:
+            self._fail(messages.WRONG_SCENE, str(error))
+            return
         if self.scene is not None and world.scene.digests != self.scene.digests:
             raise ProtocolError("Welcome.scene: not the scene that the client requested")
         self.scene, self._resume = world.scene, welcome.resume

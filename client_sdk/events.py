@@ -94,6 +94,43 @@ class Happened:
 
 
 @dataclass(frozen=True)
+class Announced:
+    """An event that the behaviour of an entity has announced at `tick` (`Body.announce`).
+
+    For the own entity, and for what it has spawned, it comes with the prediction, in the frame of the own input, and
+    `number` is positive: a later `Withdrawn` of that number takes it back. Without one, it is true. For other entities
+    it comes from the server, and `number` is 0.
+    """
+
+    tick: int
+    entity: int
+    name: str
+    data: Any
+    number: int = 0
+
+
+@dataclass(frozen=True)
+class Withdrawn:
+    """The announcement of that `number` did not take place on the server."""
+
+    number: int
+    name: str
+
+
+@dataclass(frozen=True)
+class BehaviourFailed:
+    """The predicted turn of a behaviour has raised an exception; nothing of that turn was done.
+
+    `error` is its text, with the line of the code. The server's turn, which decides, has probably failed, too.
+    """
+
+    tick: int
+    entity: int
+    behaviour: str
+    error: str
+
+
+@dataclass(frozen=True)
 class EventsDropped:
     """At this place, `count` events are missing, because too many waited.
 
@@ -151,6 +188,9 @@ Event = (
     | Corrected
     | Answered
     | Happened
+    | Announced
+    | Withdrawn
+    | BehaviourFailed
     | EventsDropped
     | Diverged
     | Resynchronised

@@ -10,10 +10,11 @@ begins.
 """
 
 import math
+import traceback
 from struct import iter_unpack
 
 from client_sdk.controls import Controls
-from client_sdk.events import Diverged, Resynchronised
+from client_sdk.events import BehaviourFailed, Diverged, Resynchronised
 from client_sdk.pending_events import PendingEvents
 from client_sdk.prediction.prediction import NONDETERMINISM, NOTHING
 from client_sdk.replica import Replica
@@ -153,6 +154,7 @@ class InputLoop:
             if not self._draws:
                 self.seen = shown
         messages = self._predict(now, controls)
+        self._tell()
         stats.snapshot_age_s = max(server_tick - world.prediction.confirmed.tick, 0.0) / clock.rate
         if not online:
             return []
@@ -162,6 +164,17 @@ class InputLoop:
         if alarm:
             messages.insert(0, Resync())
         return messages
+
+    def _tell(self) -> None:
+        """Files the events of predicted behaviours."""
+        prediction = self.world.prediction
+        if prediction.announcements.events:
+            for event in prediction.announcements.take():
+                self._events.append(event)
+        for tick, entity, behaviour, error in prediction.failures:
+            text = "".join(traceback.format_exception(error)[-2:]).strip()
+            self._events.append(BehaviourFailed(tick, entity, behaviour, text))
+        prediction.failures.clear()
 
     def next_tick(self, now: float) -> float:
         """Returns the local time at which the next tick is due; `inf`: not before a snapshot arrives."""

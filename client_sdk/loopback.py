@@ -71,7 +71,8 @@ class Loopback:
         Raises:
             ValueError: no preset has the name in `link`; or UTF-8 cannot hold the name or the token.
         """
-        core = Core(name, token=token, patience_s=PATIENCE_S)
+        behaviours = [entry.code for entry in self.game.scene.behaviours if entry.code is not None]
+        core = Core(name, token=token, patience_s=PATIENCE_S, behaviours=behaviours)
         set_link(core, link)
         seat = _Seat(self, core)
         self._seats.append(seat)

@@ -1,6 +1,6 @@
 """The events that wait until the program takes them: in order and bounded; dropped ones are counted."""
 
-from client_sdk.events import Disconnected, Event, EventsDropped, Happened, Joined, Left, Resumed
+from client_sdk.events import Announced, Disconnected, Event, EventsDropped, Happened, Joined, Left, Resumed
 from shared import messages, payloads
 
 EVENTS_MAX = 10_000
@@ -8,7 +8,8 @@ EVENTS_MAX = 10_000
 NEVER, GAME, OTHER = range(3)
 """Kinds of events: never dropped, game events, and other events of the SDK."""
 KINDS = {
-    Happened: GAME, EventsDropped: GAME, Joined: NEVER, Disconnected: NEVER, Resumed: NEVER, Left: NEVER,
+    Happened: GAME, Announced: GAME, EventsDropped: GAME,
+    Joined: NEVER, Disconnected: NEVER, Resumed: NEVER, Left: NEVER,
 }  # fmt: skip
 """Kind of an event by its class; all others are OTHER."""
 
@@ -79,7 +80,7 @@ class GameEvents:
         self._count = 0
         """Number of events that have arrived, or are known to be lost."""
 
-    def happened(self, message: messages.Happened, *, hold: bool) -> None:
+    def happened(self, message: messages.Happened | messages.Announce, *, hold: bool) -> None:
         """Takes one event.
 
         Args:
@@ -90,7 +91,11 @@ class GameEvents:
             ProtocolError: its payload is malformed.
         """
         self._count += 1
-        self._file(Happened(message.tick, message.name, payloads.unpack_value(message.payload)), hold=hold)
+        data = payloads.unpack_value(message.payload)
+        if isinstance(message, messages.Announce):
+            self._file(Announced(message.tick, message.entity, message.name, data), hold=hold)
+        else:
+            self._file(Happened(message.tick, message.name, data), hold=hold)
 
     def next(self, number: int, *, hold: bool) -> None:
         """Takes the number of the server's next event. If events before it are missing, files an `EventsDropped`."""

@@ -7,11 +7,14 @@ is complete (`complete`), it takes over the inputs and edits of the first (`take
 welcome agrees with it within `CLOCK_S` seconds: then the client's timeline goes on.
 """
 
+from collections.abc import Sequence
+
 from client_sdk.controls import Controls
 from client_sdk.prediction.confirmed import Confirmed
 from client_sdk.prediction.prediction import Prediction
 from client_sdk.timing.server_clock import ServerClock
 from client_sdk.view import ViewBuilder
+from shared.behaviours import Behaviour
 from shared.blocks import unpack
 from shared.checks import Cell
 from shared.kernels import Kernel
@@ -31,11 +34,13 @@ class Replica:
         clock: the clock of the connection before; it stays in use if the welcome agrees with it.
         now: local time in seconds.
         controls: where the input delay is set.
+        behaviours: this program's classes of the game's behaviours.
         neighbours: whether the predicted world has other entities, so that blocking each other is predicted.
         compiled: True for a compiled kernel, False for the plain one, None for the chosen one.
 
     Raises:
         ProtocolError: the welcome is malformed.
+        BehaviourError: the scene needs behaviours that this program does not have.
     """
 
     def __init__(
@@ -45,10 +50,11 @@ class Replica:
         now: float,
         *,
         controls: Controls,
+        behaviours: Sequence[type[Behaviour]] = (),
         neighbours: bool,
         compiled: bool | None,
     ) -> None:
-        self.scene = check_scene(welcome.scene)
+        self.scene = check_scene(welcome.scene).bound(behaviours)
         self.confirmed = Confirmed(self.scene, welcome.entity, compiled=compiled)
         self.prediction = Prediction(self.confirmed, controls, neighbours=neighbours)
         self.picture = ViewBuilder(self.scene, self.prediction)

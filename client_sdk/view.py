@@ -17,7 +17,7 @@ from client_sdk.prediction.prediction import Prediction, Reconciled
 from client_sdk.timing.server_clock import ServerClock
 from client_sdk.timing.timeline import Timeline
 from shared.checks import Vec
-from shared.layout import ID, TEMPLATE, VX, X
+from shared.layout import CELL, ID, TEMPLATE, VX, X
 from shared.scene import Scene
 from shared.units import BLOCK, SPEED
 
@@ -26,7 +26,8 @@ from shared.units import BLOCK, SPEED
 class EntityView:
     """One entity to draw: its number, position in blocks, velocity in blocks/s, and the name of its template.
 
-    `attributes` are the named values that the rules of the game gave to the entity, for example "name".
+    `attributes` are the named values that the rules of the game gave to the entity, for example "name". `fields` are
+    the fields of its behaviour.
     """
 
     entity: int
@@ -34,6 +35,7 @@ class EntityView:
     position: Vec
     velocity: Vec
     attributes: Mapping[str, Any] = field(default_factory=dict)
+    fields: Mapping[str, int] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -71,6 +73,7 @@ class ViewBuilder:
         self._templates = [template.name for template in scene.templates]
         self._predicted = {i for i, template in enumerate(scene.templates) if template.shown == "predicted"}
         self._smoothing: dict[int, Smoothing] = {}
+        self._extras = scene.extras
         self._delay = 0.0  # the input delay of the latest view, in ticks
         self._viewed = -math.inf  # the timeline's tick of the latest view
 
@@ -104,10 +107,13 @@ class ViewBuilder:
         others = []
         for state, place in zip(states.tolist(), places.tolist(), strict=True):
             entity = state[ID]
-            if entity == prediction.entity:
+            if prediction.entity <= entity <= prediction.last_own:
                 continue
             ahead = self._ahead(entity, tick, now) if state[TEMPLATE] in self._predicted else None
             others.append(ahead or self._figure(state, place))
+        if prediction.last_own > prediction.entity:  # what the own entity has spawned: predicted, like itself
+            own = (self._ahead(entity, tick, now) for entity in prediction.spawned())
+            others = sorted([*others, *(each for each in own if each is not None)], key=lambda each: each.entity)
         return View(tick, self._ahead(prediction.entity, tick, now), others, self.interpolation.shown(server_tick))
 
     def _ahead(self, entity: int, tick: float, now: float) -> EntityView | None:
@@ -129,4 +135,8 @@ class ViewBuilder:
         x, y, z = place
         vx, vy, vz = (part / SPEED for part in state[VX : VX + 3])
         attributes = self._prediction.attributes.get(state[ID], NO_ATTRIBUTES)
-        return EntityView(state[ID], self._templates[state[TEMPLATE]], (x, y, z), (vx, vy, vz), attributes)
+        template = self._templates[state[TEMPLATE]]
+        if not self._extras.count:
+            return EntityView(state[ID], template, (x, y, z), (vx, vy, vz), attributes)
+        fields = self._prediction.predicted.fields_of(state[TEMPLATE], list(state[CELL:]))
+        return EntityView(state[ID], template, (x, y, z), (vx, vy, vz), attributes, fields)

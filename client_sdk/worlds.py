@@ -6,6 +6,7 @@ after a reconnect  the messages fill a second replica; the input loop uses the o
 """
 
 from collections import deque
+from collections.abc import Sequence
 
 from client_sdk.commands import SentCommands
 from client_sdk.controls import Controls
@@ -15,6 +16,7 @@ from client_sdk.replica import Replica
 from client_sdk.stats import Stats
 from client_sdk.timing.server_clock import ServerClock
 from shared import kernels
+from shared.behaviours import Behaviour
 from shared.messages import Message, Pong, ProtocolError, Snapshot, Welcome
 
 
@@ -25,12 +27,20 @@ class Worlds:
         stats: counters to update.
         events: receives the events.
         controls: where the input delay is set.
+        behaviours: this program's classes of the game's behaviours.
         compiled: whether the kernel is compiled, as for `Core`.
         neighbours: whether the predicted world has other entities, as for `Core`.
     """
 
     def __init__(
-        self, stats: Stats, events: PendingEvents, controls: Controls, *, compiled: bool | None, neighbours: bool
+        self,
+        stats: Stats,
+        events: PendingEvents,
+        controls: Controls,
+        behaviours: Sequence[type[Behaviour]],
+        *,
+        compiled: bool | None,
+        neighbours: bool,
     ) -> None:
         self.filled: Replica | None = None
         """The replica that receives the messages of the current connection; None before its welcome."""
@@ -39,7 +49,7 @@ class Worlds:
         self.plain_for_now = False
         """Whether the plain kernel is used until the chosen one is ready (`speed_up`)."""
         self._stats, self._events, self._controls = stats, events, controls
-        self._compiled, self._neighbours = compiled, neighbours
+        self._compiled, self._neighbours, self._behaviours = compiled, neighbours, behaviours
         self._pings: deque[float] = deque(maxlen=16)
         """Local times at which the unanswered pings were sent, in seconds."""
 
@@ -74,11 +84,18 @@ class Worlds:
 
         Raises:
             ProtocolError: the welcome is malformed.
+            BehaviourError: the scene needs behaviours that this program does not have.
         """
         self.plain_for_now = self._compiled is None and not kernels.ready()
         compiled = False if self.plain_for_now else self._compiled
         world = Replica(
-            welcome, self.clock, now, controls=self._controls, neighbours=self._neighbours, compiled=compiled
+            welcome,
+            self.clock,
+            now,
+            controls=self._controls,
+            behaviours=self._behaviours,
+            neighbours=self._neighbours,
+            compiled=compiled,
         )
         self._stats.kernel = "plain for now" if self.plain_for_now else world.confirmed.world.kernel.form
         return world

@@ -19,12 +19,13 @@ does not.
 import importlib
 import inspect
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from server.config.options import nearest
 from server.players.player import Player
+from shared.behaviours import Behaviour
 from shared.checks import SceneError, shown
 from shared.scene import Scene
 
@@ -44,6 +45,9 @@ class Rules:
 
     scene = ""
     """The scene to play if the operator names none: a name or the path of a file. Empty: the server's default."""
+
+    behaviours: Sequence[type[Behaviour]] = ()
+    """The behaviours of the game (`shared.behaviours`). Clients pass the same classes to `Client.connect`."""
 
     game: "GameApi"
     """The game API of the running game. Not available in `__init__` and `prepare`."""
@@ -219,7 +223,7 @@ def checked_result(result: Any, name: str) -> Any:
 
 
 def prepared(rules: Rules, scene: Scene) -> Scene:
-    """Returns the scene to play: the result of `Rules.prepare` for `scene`.
+    """Returns the scene to play: the result of `Rules.prepare` for `scene`, with the rules' behaviours.
 
     Raises:
         RulesError: `rules` cannot be used (see `check_rules`), `prepare` fails, or its result is not a scene.
@@ -235,7 +239,7 @@ def prepared(rules: Rules, scene: Scene) -> Scene:
         raise RulesError(f"{name} failed ({type(error).__name__}: {error})") from error
     if not isinstance(made, Scene):
         raise RulesError(f"{name} returned {shown(made)}: it must return the scene to play in")
-    return made
+    return made.with_behaviours(rules.behaviours)
 
 
 ASYNC = (inspect.iscoroutinefunction, inspect.isasyncgenfunction)

@@ -1,15 +1,19 @@
 """Edits: blocks that players place and remove, by one rule on both sides, so that a client can predict them."""
 
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import msgpack
 
 from shared.blocks import AIR, KIND_MAX
 from shared.checks import WHOLE, SceneError, shown, whole
+from shared.free_places import OverlapError, overlapping
 from shared.layout import X
 from shared.messages import DONE, INVALID, OUT_OF_REACH, OVERLAPS
 from shared.units import BLOCK
-from shared.world import OverlapError, World
+from shared.world_state import WorldState
+
+if TYPE_CHECKING:
+    from shared.world import World
 
 NAME = "edit"
 """Name of the command that carries an edit."""
@@ -66,19 +70,36 @@ def unpack(payload: bytes) -> Edit | None:
     return edit if all(abs(part) <= FAR for part in edit[:3]) and AIR <= edit.kind <= KIND_MAX else None
 
 
-def apply(world: World, entity: int, edit: Edit) -> int:
+def verdict(world: WorldState, entity: int, edit: Edit) -> int:
+    """Returns the verdict on an edit by an entity, without carrying it out: as `apply`."""
+    if not _in_reach(world, entity, edit):
+        return OUT_OF_REACH if entity in world else INVALID
+    x, y, z, kind = edit
+    if world.blocks.get(x, y, z) is None:
+        return INVALID
+    low = [part * BLOCK for part in edit[:3]]
+    in_the_way = kind != AIR and overlapping(world, -1, low + [part + BLOCK for part in low])
+    return OVERLAPS if in_the_way else DONE
+
+
+def _in_reach(world: WorldState, entity: int, edit: Edit) -> bool:
+    """Returns whether an entity exists and its position is within `Scene.reach` of the centre of an edit's block."""
+    if entity not in world:
+        return False
+    centre = [part * BLOCK + BLOCK // 2 for part in edit[:3]]
+    way = [a - b for a, b in zip(centre, world.state(entity)[X : X + 3], strict=True)]
+    return sum(part * part for part in way) <= (world.scene.reach * BLOCK) ** 2
+
+
+def apply(world: "World", entity: int, edit: Edit) -> int:
     """Carries out an edit by the player with the entity `entity`, if the rules allow it.
 
     Returns:
         The verdict, as in `shared.messages`: DONE, OUT_OF_REACH (beyond `Scene.reach`), OVERLAPS (an entity is in the
         way) or INVALID (there is no such entity, or the segment is not loaded).
     """
-    if entity not in world:
-        return INVALID
-    centre = [part * BLOCK + BLOCK // 2 for part in edit[:3]]
-    way = [a - b for a, b in zip(centre, world.state(entity)[X : X + 3], strict=True)]
-    if sum(part * part for part in way) > (world.scene.reach * BLOCK) ** 2:
-        return OUT_OF_REACH
+    if not _in_reach(world, entity, edit):
+        return OUT_OF_REACH if entity in world else INVALID
     try:
         world.set_block(*edit)
     except OverlapError:

@@ -12,6 +12,7 @@ packed little-endian records in a MessagePack `bin`. docs/protocol.md explains e
       6 Resync                                             21 Happened  tick name payload
       7 Restart  tick                                      22 Shared    values
                                                            23 NextHappened  number
+                                                           24 Announce  tick entity name payload
                                                             4 Bye       code reason wait
 
     Inputs.rows    n * [i8 move_x, i8 move_y, u8 buttons], for the ticks first, first + 1, ...; in a scene with aim
@@ -31,7 +32,8 @@ packed little-endian records in a MessagePack `bin`. docs/protocol.md explains e
     Happened       a game event, sent once. The payload is MessagePack, as in a command.
     NextHappened   the number of the next `Happened`, sent if the client may expect another number, because events were
                    dropped or lost with a connection. The first event that a player gets has the number 0.
-    Shared         all shared values of the game by name, each time: a score or the time left, for example.
+    Announce       an event of an entity's behaviour; its own player does not get it. It counts as a `Happened`.
+    Shared         all shared values of the game by name, each time: a score, for example.
     Ping           `corrections`: number of corrections of the client's prediction so far, for the operator.
     Pong.tick      the server time in ticks when it answered: 17.25 is a quarter of a tick after tick 17.
 
@@ -89,8 +91,7 @@ GOING_AWAY, PROTOCOL, TEXT, TOO_BIG, INTERNAL = 1001, 1002, 1003, 1009, 1011
 """Close codes of WebSocket (RFC 6455) that the server and the client use."""
 WRONG_VERSION, WRONG_SCENE, MALFORMED, FULL, TOO_SLOW, NO_HELLO, TAKEN_OVER, UNAUTHORISED = range(4001, 4009)
 """Close codes of this protocol. FULL: the server has no room for another player. TOO_SLOW: the connection cannot keep
-up, or nothing was received for too long. NO_HELLO: no `Hello` came in time. TAKEN_OVER: another connection goes on as
-this player."""
+up, or nothing was received for too long. NO_HELLO: no `Hello` came in time. TAKEN_OVER: another one goes on."""
 
 
 class ProtocolError(ValueError):
@@ -211,6 +212,15 @@ class Happened(NamedTuple):
     payload: bytes
 
 
+class Announce(NamedTuple):
+    """A game event that the behaviour of `entity` has announced in `tick` (`shared.body.Body.announce`)."""
+
+    tick: int
+    entity: int
+    name: str
+    payload: bytes
+
+
 class Shared(NamedTuple):
     """All shared values of the game, by name."""
 
@@ -238,6 +248,7 @@ Message = (
     | Happened
     | Shared
     | NextHappened
+    | Announce
 )
 KINDS: dict[int, tuple[type[Any], tuple[fields.Check, ...]]] = {
     1: (Hello, (fields.version, fields.digests, fields.name, fields.token, fields.resume)),
@@ -257,12 +268,13 @@ KINDS: dict[int, tuple[type[Any], tuple[fields.Check, ...]]] = {
     21: (Happened, (fields.tick, fields.name, fields.payload)),
     22: (Shared, (fields.names,)),
     23: (NextHappened, (fields.index,)),
+    24: (Announce, (fields.tick, fields.entity, fields.name, fields.payload)),
 }
 """Message class and checks of the fields, by the number of the kind. A snapshot's last field has no check here:
 `shared.snapshot` checks the segments."""
 CLIENT_KINDS = frozenset({1, 2, 3, 4, 5, 6, 7})
 """Kinds of messages that a client may send."""
-SERVER_KINDS = frozenset({4, 17, 18, 19, 20, 21, 22, 23})
+SERVER_KINDS = frozenset({4, 17, 18, 19, 20, 21, 22, 23, 24})
 """Kinds of messages that a server may send."""
 _KIND_OF = {kind: number for number, (kind, _) in KINDS.items()}
 _INPUTS_HEAD = bytes((0x94, _KIND_OF[Inputs]))

@@ -6,7 +6,7 @@ Every value is checked when a scene is made. A fingerprint shows whether client 
 import functools
 import hashlib
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
@@ -14,12 +14,15 @@ from typing import Any
 import msgpack
 import numpy as np
 
+from shared import behaviours as behaviour_classes
 from shared import layout
 from shared.aim import NO_AIM, Aim
+from shared.behaviours import BehaviourEntry, checked_entries, entry_of
 from shared.block_kind import BlockKind, numbered, numbered_fill
 from shared.bounds import TICK_RATE_MAX
 from shared.buttons import DEFAULT_BUTTONS, Names, bits_of, checked_buttons, held_names
 from shared.checks import Cell, SceneError, Vec, boolean, cell, choice, finite, items, shown, text, vector, whole
+from shared.extras import Extras
 from shared.fields import AIM_ROW_BYTES, INPUT_ROW_BYTES
 from shared.inputs import MOVE_MAX
 from shared.tables import in_order, made, plain, table_of
@@ -36,8 +39,10 @@ REACH_MAX = 1024.0
 """Greatest reach of a player, in blocks."""
 INTEGRATORS = ("mean", "semi")
 """Choices of `Scene.integrator`."""
+CHANCE_MAX = (1 << 63) - 1
+"""Greatest seed of `Scene.chance`."""
 
-OPTIONAL = frozenset({"aim", "buttons", "kinds"})
+OPTIONAL = frozenset({"aim", "behaviours", "buttons", "chance", "kinds"})
 """Fields of scenes and templates that a table leaves out if they have their default, so that scenes without them keep
 their bytes and their fingerprint. A field that is None is left out, too."""
 
@@ -72,6 +77,8 @@ class Scene:
         aim: whether players send an aim, a direction in space, with each input. It costs 6 bytes per input.
         kinds: the kinds of blocks that have a name, for rules and pictures, and which of them are not solid. Kinds
             without an entry are solid. The last item of an entry of the terrain's `fill` may be such a name.
+        behaviours: the behaviours of templates (`shared.behaviours`); `with_behaviours` adds them.
+        chance: seed of `Body.chance`, 0 to 2^63 - 1.
 
     Raises:
         SceneError: a value is not valid; the message names it.
@@ -93,6 +100,8 @@ class Scene:
     buttons: tuple[str, ...] = DEFAULT_BUTTONS
     aim: bool = False
     kinds: tuple[BlockKind, ...] = ()
+    behaviours: tuple[BehaviourEntry, ...] = ()
+    chance: int = 0
 
     def __repr__(self) -> str:
         """Returns a short text, because events are printed with it; `to_table` has all values."""
@@ -160,6 +169,9 @@ class Scene:
             if weight > 0 and to_velocity(self.terminal_speed, "terminal_speed") == 0:
                 at = f"templates.{template.name}.gravity = {template.gravity!r}"
                 raise SceneError(f"{at}: terminal_speed = {self.terminal_speed!r} lets nothing fall")
+        whole(self.chance, "chance", 0, CHANCE_MAX)
+        object.__setattr__(self, "behaviours", checked_entries(self.behaviours))
+        self.extras  # noqa: B018 - checks the behaviours' templates
 
     @classmethod
     def from_table(cls, table: Mapping[str, Any]) -> "Scene":
@@ -300,6 +312,28 @@ class Scene:
     def passable(self) -> tuple[int, ...]:
         """The numbers of the kinds of blocks that are not solid, besides air."""
         return tuple(kind.number for kind in self.kinds if not kind.solid and kind.number is not None)
+
+    def with_behaviours(self, classes: Iterable[object]) -> "Scene":
+        """Returns a copy of the scene with further behaviours.
+
+        Raises:
+            SceneError: a class or one of its values is not valid, or two behaviours have one template or name.
+        """
+        added = tuple(entry_of(each) for each in classes)
+        return replace(self, behaviours=(*self.behaviours, *added)) if added else self
+
+    def bound(self, classes: Iterable[object]) -> "Scene":
+        """Returns a copy of the scene that has this program's classes of its behaviours.
+
+        Raises:
+            SceneError: a class is missing, or differs from the one that the scene names.
+        """
+        return replace(self, behaviours=behaviour_classes.bound(self.behaviours, classes)) if self.behaviours else self
+
+    @functools.cached_property
+    def extras(self) -> Extras:
+        """The extra columns of the states of entities."""
+        return Extras(self)
 
     def segments(self) -> list[Cell]:
         """Returns the index of every segment of the scene, in ascending order of z, y, x."""

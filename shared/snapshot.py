@@ -1,7 +1,7 @@
 """The parts of a snapshot, one per segment: encoded once per tick, and sent to every client that sees the segment.
 
-    segment   [x, y, z, ago, heads, tails, rows, gone, check, edits, attributes]   an array inside the snapshot's array,
-              without the fields at its end that are empty
+    segment   [x, y, z, ago, heads, tails, rows, gone, check, edits, attributes, fields]   an array inside the
+              snapshot's array, without the fields at its end that are empty
     ago       the number of ticks that this part covers; -1 (`KEYFRAME`): rows are all entities of the segment
     heads     n * [u32 id, u8 events]: entities that did not go on as before; only if `ago` is 1
     tails     for each of them: i8 move_x, i8 move_y, u8 buttons if it has the event `TOLD` (a new input); then an i32
@@ -14,6 +14,7 @@
     check     sometimes a checksum of the segment, its entities and its blocks; otherwise 0
     attributes  [u32 id, {name: value}, u32 id, ...]: all attributes of an entity (its name, for example), if they
               changed in these ticks, or the entity came into the segment
+    fields    the extra columns of entities that changed (`shared.extras`), in scenes that have any
 
 On the wire the flags have two more bits. `ACTED`: the server's rules acted on the entity (placed it, threw it, changed
 its template). `PLACED`: the rules placed the entity, so it did not move from its old position to the new one.
@@ -44,6 +45,7 @@ from shared.layout import (
     MOVE_X,
     TEMPLATE,
     TURN,
+    WIDTH_SHIFT,
     Int64s,
     X,
 )
@@ -77,7 +79,7 @@ EDIT = np.dtype([("block", "<u2"), ("kind", "u1")])
 NO_EDITS = np.zeros(0, EDIT)
 NO_STATES = np.zeros((0, CELL), np.int64)
 NO_TURNS = np.zeros((0, TURN), np.int64)
-NO_FIELDS: list[Any] = [b"", b"", b"", b"", 0, b"", []]
+NO_FIELDS: list[Any] = [b"", b"", b"", b"", 0, b"", [], b""]
 """Values of the fields from `heads` on that a part leaves out."""
 SIDE = SEGMENT * BLOCK
 """Length of a segment's side, in grid steps."""
@@ -89,6 +91,8 @@ assert (HEAD.itemsize, ROW_BYTES) == (bulk.HEAD_BYTES, bulk.ROW_BYTES)
 FAR = 1 << 23
 """Bound of a segment's index along each axis, in segments: from `-FAR` to `FAR - 1`."""
 
+KEY_ROW = (1 << bulk.ID_BITS) - 1
+"""Mask of a row's place in the array of entities within a key of `bulk.muster`."""
 KEYFRAME = -1
 """Value of `ago` in a part that has all entities of the segment."""
 ACTED = 4
@@ -111,7 +115,7 @@ class DecodedDelta(NamedTuple):
     """A decoded part of a snapshot.
 
     `entities` is the number of the part's states, `gone` has ids, and `edits` has `EDIT` records. The other fields are
-    those of the wire format.
+    those of the wire format; `Extras.decode` reads `fields`.
     """
 
     segment: Cell
@@ -121,6 +125,7 @@ class DecodedDelta(NamedTuple):
     edits: np.ndarray[Any, np.dtype[Any]]
     check: int
     attributes: list[tuple[int, dict[str, Any]]]
+    fields: bytes
 
 
 def encode_rows(rows: Int64s, acted: Collection[int] = (), placed: Collection[int] = ()) -> bytes:
@@ -220,6 +225,7 @@ def encode_part(
     placed: Collection[int] = (),
     check: int = 0,
     attributes: Sequence[Any] = (),
+    fields: bytes = b"",
 ) -> bytes:
     """Returns a segment's part, encoded for `messages.join_snapshot`.
 
@@ -233,8 +239,10 @@ def encode_part(
         placed: ids that get the flags `ACTED` and `PLACED`.
         check: checksum of the segment, or 0.
         attributes: id, attributes, id, attributes, ...
+        fields: records of extra columns (`shared.extras`).
     """
-    return join_part(segment, ago, (b"", b"", encode_rows(rows, acted, placed)), gone, edits, check, attributes)
+    news = b"", b"", encode_rows(rows, acted, placed)
+    return join_part(segment, ago, news, gone, edits, check, attributes, fields)
 
 
 def join_part(
@@ -245,11 +253,12 @@ def join_part(
     edits: Sequence[tuple[int, int]] = (),
     check: int = 0,
     attributes: Sequence[Any] = (),
+    extra: bytes = b"",
 ) -> bytes:
     """Returns a segment's part like `encode_part`, from `news`: heads, tails and rows that are packed already."""
     packed_gone = np.array(gone, "<u4").tobytes() if gone else b""
     packed_edits = np.array(edits, EDIT).tobytes() if edits else b""
-    fields = [*news, packed_gone, check, packed_edits, attributes]
+    fields = [*news, packed_gone, check, packed_edits, attributes, extra]
     while fields and not fields[-1]:
         del fields[-1]
     return pack((*segment, ago, *fields))
@@ -258,8 +267,8 @@ def join_part(
 def checksum(world: World, segment: Cell) -> int:
     """Returns the checksum of a loaded segment, over its entities and blocks: 1 to 2^32 - 1.
 
-    It is the first 4 bytes, little-endian, of a SHA-256 over the segment's digest and the rows of its entities; 1
-    stands for 0.
+    It is the first 4 bytes, little-endian, of a SHA-256 over the segment's digest, the rows of its entities, and their
+    extra columns as i64; 1 stands for 0.
     """
     kernel = world.kernel
     keys, packed = np.empty(len(world), np.int64), np.empty(len(world) * ROW_BYTES, np.uint8)
@@ -267,6 +276,9 @@ def checksum(world: World, segment: Cell) -> int:
     end = kernel.muster(world.arrays.entities, world.arrays.heads, *mine, world.blocks.rows[segment])
     whole = hashlib.sha256(world.blocks.digest(segment))
     whole.update(packed[:end].data)
+    if world.extras.count:
+        rows = (keys[: end // ROW_BYTES] & KEY_ROW) >> WIDTH_SHIFT
+        whole.update(world.extra_rows[rows].astype("<i8").tobytes())
     return int.from_bytes(whole.digest()[:4], "little") or 1
 
 
@@ -318,9 +330,9 @@ def _decode_part(part: Any, corners: list[int], news: tuple[list[bytes], ...]) -
 
     Appends its low corner (grid steps) and its number of rows to `corners`, and its heads, tails and rows to `news`.
     """
-    if type(part) is not list or not 4 <= len(part) <= 11:
-        raise ProtocolError("segment: must be a list of 4 to 11 fields")
-    x, y, z, ago, heads, tails, rows, gone, check, edits, attributes = part + NO_FIELDS[len(part) - 4 :]
+    if type(part) is not list or not 4 <= len(part) <= 12:
+        raise ProtocolError("segment: must be a list of 4 to 12 fields")
+    x, y, z, ago, heads, tails, rows, gone, check, edits, attributes, fields = part + NO_FIELDS[len(part) - 4 :]
     if not (type(x) is type(y) is type(z) is int and -FAR <= x < FAR and -FAR <= y < FAR and -FAR <= z < FAR):
         raise ProtocolError(f"segment {shown(x)} {shown(y)} {shown(z)}: not allowed")
     if type(check) is not int or not 0 <= check < 1 << 32:
@@ -328,11 +340,13 @@ def _decode_part(part: Any, corners: list[int], news: tuple[list[bytes], ...]) -
     if type(ago) is not int or not -1 <= ago < 1 << 53:
         raise ProtocolError(f"segment.ago = {shown(ago)}: not allowed")
     if not (
-        type(heads) is type(tails) is type(rows) is type(gone) is type(edits) is bytes
-        and max(len(heads), len(tails), len(rows), len(gone), len(edits)) <= PART_MAX
+        type(heads) is type(tails) is type(rows) is type(gone) is type(edits) is type(fields) is bytes
+        and max(len(heads), len(tails), len(rows), len(gone), len(edits), len(fields)) <= PART_MAX
         and len(heads) % HEAD.itemsize == len(rows) % ROW_BYTES == len(gone) % 4 == len(edits) % EDIT.itemsize == 0
     ):
-        raise ProtocolError("segment: heads, tails, rows, gone or edits are not bytes, too long, or of a wrong length")
+        raise ProtocolError(
+            "segment: heads, tails, rows, gone, edits or fields are not bytes, too long, or of a wrong length"
+        )
     if heads and ago != 1:
         raise ProtocolError(f"segment.heads: not allowed with ago = {ago}, only with 1")
     all_heads, all_tails, all_rows = news
@@ -346,7 +360,7 @@ def _decode_part(part: Any, corners: list[int], news: tuple[list[bytes], ...]) -
     said = _decode_attributes(attributes) if attributes != [] else []
     entities = len(rows) // ROW_BYTES
     corners += (x * SIDE, y * SIDE, z * SIDE, entities)
-    return DecodedDelta((x, y, z), ago, entities, left, edited, check, said)
+    return DecodedDelta((x, y, z), ago, entities, left, edited, check, said, fields)
 
 
 def _decode_attributes(attributes: Any) -> list[tuple[int, dict[str, Any]]]:

@@ -5,6 +5,7 @@ from collections.abc import Iterable
 import numpy as np
 
 from shared.checks import SceneError, shown
+from shared.extras import Extras
 from shared.inputs import BUTTONS_MAX, MOVE_MAX
 from shared.layout import BUTTONS, CELL, COLUMNS, FLAGS, ID, MOVE_X, TEMPLATE, VX, Int64s, X
 from shared.units import BLOCK, RANGE_BLOCKS
@@ -18,12 +19,13 @@ PLACE_MAX, FAST = 2 * RANGE_BLOCKS * BLOCK, 1 << 30
 steps; no world reaches them."""
 
 
-def checked_states(states: Iterable[tuple[int, ...]] | Int64s, templates: int) -> Int64s:
-    """Returns states as an int64 matrix [n, 12].
+def checked_states(states: Iterable[tuple[int, ...]] | Int64s, templates: int, extras: Extras | None = None) -> Int64s:
+    """Returns states as an int64 matrix [n, 12], or with the extra columns of a scene.
 
     Args:
-        states: rows of 12 whole numbers (`STATES`).
+        states: rows of 12 whole numbers (`STATES`), or of these and the extra columns.
         templates: number of templates of the scene.
+        extras: the extra columns of the scene; None: it has none.
 
     Raises:
         SceneError: the rows have another shape or type, a value is out of range, or two rows have one id.
@@ -34,15 +36,20 @@ def checked_states(states: Iterable[tuple[int, ...]] | Int64s, templates: int) -
         raise SceneError(f"states = {shown(states)}: must be rows of {STATES} whole numbers") from error
     if not found.size:
         return np.zeros((0, STATES), np.int64)
-    if found.dtype.kind != "i" or found.ndim != 2 or found.shape[1] != STATES:
+    columns = extras.columns if extras is not None and found.ndim == 2 and found.shape[1] > STATES else ()
+    if found.dtype.kind != "i" or found.ndim != 2 or found.shape[1] != STATES + len(columns):
         raise SceneError(f"states = {shown(states)}: must be rows of {STATES} whole numbers")
     matrix = found.astype(np.int64, copy=False)
     low, high = _LOW, _HIGH.copy()
     high[TEMPLATE] = templates - 1
+    if columns:
+        low = np.append(low, [column.low for column in columns])
+        high = np.append(high, [column.high for column in columns])
     bad = np.argwhere((matrix < low) | (matrix > high))
     if len(bad):
         row, column = bad[0].tolist()
-        field, value = f"states[{row}].{COLUMNS[column]}", matrix[row, column]
+        names = [*COLUMNS[:STATES], *(each.name for each in columns)]
+        field, value = f"states[{row}].{names[column]}", matrix[row, column]
         raise SceneError(f"{field} = {value}: must be a whole number from {low[column]} to {high[column]}")
     if len(np.unique(matrix[:, ID])) < len(matrix):
         raise SceneError("states: two rows have the same id")

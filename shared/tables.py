@@ -20,12 +20,12 @@ def table_of(owner: Any, optional: Collection[str]) -> dict[str, Any]:
 
 
 def plain(value: Any) -> Any:
-    """Returns a value with lists in place of tuples and tables in place of mappings, at every depth."""
+    """Returns a value with lists in place of tuples, and tables in place of mappings and entries, at every depth."""
     if isinstance(value, Mapping):
         return {key: plain(value[key]) for key in value}
     if isinstance(value, list | tuple):
         return [plain(part) for part in value]
-    return value
+    return plain(value.to_table()) if hasattr(value, "to_table") else value
 
 
 def in_order(value: Any) -> Any:

@@ -9,9 +9,9 @@ Theory of operation. A world changes only by the methods below: between two tick
 scene that get the same calls in the same order have the same `state_hash()` at every tick, on every machine, with every
 form of the kernel. For this, all state is whole numbers, and entities take their turns in ascending order of id.
 
-A `World` is made of three layers. `shared.world_state` holds the state in memory and reads it. `shared.world_changes`
-changes it, wakes the entities that a change could concern, and reports each change to an observer. This module checks
-the arguments.
+A `World` is made of layers. `shared.world_state` holds the state in memory and reads it. `shared.world_changes`
+changes it, wakes the entities that a change could concern, and reports each change to an observer. `shared.world_turns`
+changes it for the behaviours of a scene. This module checks the arguments.
 """
 
 from collections.abc import Iterable, Mapping
@@ -21,12 +21,13 @@ import numpy.typing as npt
 
 from shared import blocks, layout, terrain
 from shared.checks import Cell, SceneError, boolean, shown, vector, whole
+from shared.extras import Record
 from shared.free_places import OverlapError, box_at, free_place, taken
 from shared.inputs import Input
 from shared.layout import FLAGS, ID, MOVE_X, TEMPLATE, VX, X
-from shared.states import ID_MAX, checked_states
+from shared.states import ID_MAX, STATES, checked_states
 from shared.units import BLOCK, SPEED, SPEED_MAX, to_positions, to_velocity
-from shared.world_changes import UncheckedWorld
+from shared.world_turns import TurnWorld
 
 __all__ = ["OverlapError", "World"]
 
@@ -34,7 +35,7 @@ TICK_MAX = (1 << 53) - 1
 """Greatest tick of a world, which a float holds exactly."""
 
 
-class World(UncheckedWorld):
+class World(TurnWorld):
     """The whole state of a scene at one tick.
 
     A method that takes an entity raises `MissingError` (a `KeyError`) if there is no entity of that number. A wrong
@@ -132,7 +133,7 @@ class World(UncheckedWorld):
         kind = self.scene.template(template)
         at = free_place(self, -1, kind, position, boolean(push, "push"))
         speed = _velocity(velocity)
-        if self._next_id > ID_MAX:
+        if self._next_id + self.extras.blocks[kind] > ID_MAX:
             raise SceneError("ids: used up")
         entity = self._next_id
         self._put([(entity, kind, self._thrown(kind, speed[2]), *at, *speed, 0, 0, 0)])
@@ -154,14 +155,15 @@ class World(UncheckedWorld):
         """
         kind = self.scene.template(template)
         at = to_positions(positions, "positions")
-        n, first = len(at), self._next_id
-        if first + n - 1 > ID_MAX:
+        n = len(at)
+        ids = self._new_ids(kind, n)
+        if ids.stop - 1 > ID_MAX:
             raise SceneError("ids: used up")
         settled = self._settle(kind, at)
         if settled < n:
             place = (at[settled] / BLOCK).tolist()
             raise OverlapError(f"positions[{settled}] = {place}: no room for a {template!r} there")
-        return range(first, first + n)
+        return ids
 
     def place(self, entity: int, position: tuple[float, float, float], *, push: bool = False) -> None:
         """Teleports an entity, which keeps its velocity.
@@ -225,7 +227,43 @@ class World(UncheckedWorld):
         box = box_at(self, state[TEMPLATE], state[X : X + 3])
         if taken(self, row, state[TEMPLATE], box):
             raise OverlapError(f"entity {entity}: no room for the box of {template!r}")
+        extras = self.extras
+        if extras.count and extras.behaviour_of[self._entities[row, TEMPLATE]] != extras.behaviour_of[state[TEMPLATE]]:
+            state[STATES + extras.first :] = extras.starts[state[TEMPLATE], extras.first :].tolist()
         self._put([tuple(state)])
+
+    def set_field(self, entity: int, name: str, value: int) -> None:
+        """Sets a field of an entity's behaviour.
+
+        Raises:
+            MissingError: there is no such entity.
+            SceneError: its behaviour has no such field, or the value is out of range.
+        """
+        state = list(self.state(entity))
+        column, declared = self.field_column(state[TEMPLATE], name)
+        state[STATES + column] = declared.checked(value)
+        self._put([tuple(state)])
+
+    def write_fields(self, records: Iterable[Record]) -> bool:
+        """Writes extra columns of entities, as they are on the wire. Returns whether there is an entity for each."""
+        there = True
+        for entity, values in records:
+            row = self._row_of.get(entity)
+            if row is None:
+                there = False
+                continue
+            for column, value in values:
+                self._extra[row, column] = value
+        return there
+
+    def forget(self, entity: int) -> None:
+        """Removes an entity that has left a client's view; unlike `remove`, it still exists for its owner.
+
+        Raises:
+            MissingError: there is no such entity.
+        """
+        self._row_at(entity)
+        self._take_out(entity)
 
     def remove(self, entity: int) -> None:
         """Removes an entity from the world, and wakes the entities that stood on it.
@@ -240,12 +278,12 @@ class World(UncheckedWorld):
         """Writes states as they are, without a check for free places; ids that are not known become new entities.
 
         Args:
-            states: [n, 12] whole numbers, as `state` returns them.
+            states: [n, 12] whole numbers, as `state` returns them, perhaps with the extra columns of the scene.
 
         Raises:
             SceneError: a value is out of range, or two states have one id.
         """
-        self._put(checked_states(states, len(self.scene.templates)))
+        self._put(checked_states(states, len(self.scene.templates), self.extras))
 
     def write(self, states: layout.Int64s) -> None:
         """Writes states like `put`, but without its checks, for states that `snapshot.decode_parts` has checked."""
@@ -319,9 +357,12 @@ class World(UncheckedWorld):
             MissingError: there is no entity of an id.
             SceneError: a value is not an `Input`.
         """
-        n = len(inputs) if inputs else 0
-        if inputs:
-            told = self._told_of(inputs)
+        used = inputs
+        if self.extras.count:
+            used = self._with_turns(inputs or {})
+        n = len(used) if used else 0
+        if used:
+            told = self._told_of(used)
             if len(told) > len(self._inputs):
                 self._inputs = np.zeros(2 * len(told), np.int64)
                 self._told = self.kernel.lent(self._inputs)
@@ -330,6 +371,8 @@ class World(UncheckedWorld):
         self.edited, self.editing = self.editing, {}
         if self.placing or self.placed:
             self.placed, self.placing = self.placing, set()
+        if self.extras.count:
+            self.fields_set, self._fields_setting = self._fields_setting, {}
         self.kernel.step(self.bound, self._told, n, self.tick)
         if self._limbo:
             self._free += self._limbo

@@ -176,16 +176,29 @@ class UncheckedWorld(WorldState):
 
     def _put(self, states: Iterable[tuple[int, ...]] | Int64s) -> None:
         """Writes states; ids that are not known become new entities."""
-        new = np.asarray(states if isinstance(states, np.ndarray) else list(states), np.int64).reshape(-1, STATES)
+        new = np.asarray(states if isinstance(states, np.ndarray) else list(states), np.int64)
+        extras = self.extras
+        if extras.count:
+            new = extras.widened(new.reshape(-1, new.shape[-1] if new.size else STATES))
+        else:
+            new = new.reshape(-1, STATES)
         if self.observer is not None:
             self.observer.put(new)
         self._store(new)
 
     def _store(self, new: Int64s) -> None:
-        """Writes states ([n, 12]) without a report."""
+        """Writes states ([n, 12], and the extra columns of the scene) without a report."""
         ids = new[:, ID].tolist()
         known = list(map(self._row_of.get, ids))
         rows = np.array([self._row(entity) for entity in ids] if None in known else known, np.int64)
+        extras = self.extras
+        if extras.count:
+            self._extra[rows] = new[:, STATES:]
+            for entity, kind in zip(ids, new[:, TEMPLATE].tolist(), strict=True) if extras.spawns else ():
+                self._next_id = max(self._next_id, entity + 1 + extras.blocks[kind])
+            if self.turns is not None:
+                self.turns.rows = None
+            new = np.ascontiguousarray(new[:, :STATES])
         self.kernel.store(self.bound, self.kernel.lent(rows), self.kernel.lent(new), len(rows), self.tick + 1)
 
     def _settle(self, template: int, positions: Int64s) -> int:
@@ -196,12 +209,17 @@ class UncheckedWorld(WorldState):
             positions: [n, 3] in grid steps.
         """
         n, first = len(positions), self._next_id
-        ids = range(first, first + n)
+        ids = self._new_ids(template, n)
         states = np.zeros((n, STATES), np.int64)
         states[:, ID] = ids
         states[:, TEMPLATE] = template
         states[:, X : X + 3] = positions
         rows = np.array([self._row(entity) for entity in ids], np.int64)
+        if self.extras.count:
+            self._extra[rows] = self.extras.starts[template]
+        self._next_id = ids.stop
+        if self.turns is not None:
+            self.turns.rows = None
         settled: int = self.kernel.settle(
             self.bound, self.kernel.lent(rows), self.kernel.lent(states), n, self.tick + 1
         )
@@ -215,8 +233,14 @@ class UncheckedWorld(WorldState):
             self.observer.put(self.states_of(ids))
         return settled
 
+    def _new_ids(self, template: int, n: int) -> range:
+        """Returns the ids of `n` new entities of a template; between them are the ids that belong to each of them."""
+        step = 1 + self.extras.blocks[template]
+        return range(self._next_id, self._next_id + n * step, step)
+
     def _remove(self, entity: int) -> None:
         """Removes an entity, and wakes the entities that stood on it."""
+        self._disown(entity)
         self._take_out(entity)
         if self.observer is not None:
             self.observer.removed(entity)
@@ -224,10 +248,26 @@ class UncheckedWorld(WorldState):
     def _take_out(self, entity: int) -> None:
         """Removes an entity without a report."""
         row = self._row_of.pop(entity)
+        if self.turns is not None:
+            self.turns.rows = None
         self._leave(row)
         self.kernel.unlink(self.bound, row)
         self._entities[row, ID] = 0
         (self._limbo if self._entities[row, FLAGS] & layout.AWAKE else self._free).append(row)
+
+    def _disown(self, entity: int) -> None:
+        """Notes that an entity is about to be removed, in the entity that has spawned it, if there is one."""
+        extras = self.extras
+        for owner in range(entity - extras.spawns, entity) if extras.spawns else ():
+            row = self._row_of.get(owner)
+            bit = 1 << entity - owner - 1
+            if row is not None and int(self._extra[row, extras.alive]) & bit:
+                self._extra[row, extras.alive] &= ~bit
+                self.note_fields(owner, 1 << extras.alive)
+
+    def note_fields(self, entity: int, mask: int) -> None:
+        """Notes that extra columns of an entity were set in its row in memory."""
+        self._fields_setting[entity] = self._fields_setting.get(entity, 0) | mask
 
     def _thrown(self, template: int, speed: int) -> int:
         """Returns the flags for a vertical speed: an entity that moves up falls, even if something supports it.
@@ -283,6 +323,7 @@ class UncheckedWorld(WorldState):
         self.tick = tick
         self.editing, self.edited = {}, {}
         self.placing, self.placed = set(), set()
+        self._fields_setting, self.fields_set = {}, {}
         if self._limbo:
             for name, length in (("_awake", layout.N_AWAKE), ("_woken", layout.N_WOKEN)):
                 keys = getattr(self, name)[: self._lengths[length]]
@@ -318,6 +359,11 @@ class UncheckedWorld(WorldState):
         self._row_of, self._free, self._limbo = dict(other._row_of), list(other._free), list(other._limbo)
         n = self._rows
         self._entities[:n] = other._entities[:n]
+        if self.extras.count:
+            self._extra[:n] = other._extra[:n]
+            self._fields_setting, self.fields_set = dict(other._fields_setting), dict(other.fields_set)
+            if self.turns is not None:
+                self.turns.rows = None
         self._entities[n:, ID] = 0
         self._lengths[:] = other._lengths
         for name, length in LISTS:

@@ -11,17 +11,21 @@ name it until then.
 import hashlib
 import struct
 from collections.abc import Iterable
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
 
 from shared import blocks, kernels, layout
+from shared.behaviours import Field
 from shared.checks import Cell, MissingError, SceneError, shown, whole
-from shared.layout import ENTITY, FALLING, FLAGS, ID, NEXT, VX, Arrays, X
+from shared.layout import ENTITY, FALLING, FLAGS, ID, NEXT, TEMPLATE, VX, Arrays, X
 from shared.scene import Scene
 from shared.states import ID_MAX, STATES
 from shared.units import BLOCK, SPEED
+
+if TYPE_CHECKING:
+    from shared.turns import Turns
 
 HASH_BYTES = 20
 """Length of a state hash in bytes."""
@@ -32,6 +36,9 @@ COLLECT_MAX = 1024
 
 class WorldState:
     """The whole state of a scene at one tick. `shared.world.World` describes the arguments and the errors."""
+
+    turns: "Turns | None" = None
+    """The behaviours; None: the scene has none, or the world has not made a step."""
 
     def __init__(self, scene: Scene, *, compiled: bool | None = None) -> None:
         rules: object = scene
@@ -45,6 +52,8 @@ class WorldState:
         self.kernel = kernels.get(compiled)
         """Kernel that steps this world; all other code that works on the world's arrays uses it, too."""
         self.templates, self._walk, self.parameters = scene.kernel_tables()
+        self.extras = scene.extras
+        """The extra columns of the scene's states."""
         self._row_of: dict[int, int] = {}
         self._next_id = 1
         self._rows = 0  # number of rows that were ever used
@@ -60,7 +69,11 @@ class WorldState:
         self.placed: set[int] = set()
         """Entities that were placed between the latest step and the step before it; they did not move to where they
         are."""
+        self._fields_setting: dict[int, int] = {}
+        self.fields_set: dict[int, int] = {}
+        """Entities whose extra columns alone were set in the latest step, with a mask of these columns."""
         self._inputs = np.zeros(32, np.int64)
+        self._extra = np.zeros((0, self.extras.count), np.int64)
         self._entities = np.zeros((0, len(layout.COLUMNS)), np.int64)
         self._awake = self._next_awake = self._woken = self._later = np.zeros(0, np.int64)
         self._changed = self._fell = np.zeros(0, np.int64)
@@ -89,7 +102,12 @@ class WorldState:
         return self._entities[rows]
 
     def states(self) -> layout.Int64s:
-        """Returns the states of all entities, [n, 12], ascending by id; equal worlds have equal states. A copy."""
+        """Returns the states of all entities, [n, 12], ascending by id; equal worlds have equal states. A copy.
+
+        In a scene with extra columns (`shared.extras`), these follow the 12.
+        """
+        if self.extras.count:
+            return self._wide_states()
         if self.compiled and self._rows <= COLLECT_MAX:
             out = np.empty((self._rows, STATES), np.int64)
             return out[: self.kernel.collect(self._arrays.entities, self._rows, self.kernel.lent(out))]
@@ -103,13 +121,85 @@ class WorldState:
         """Returns a copy of the states of some entities, [n, 12], in the given order."""
         states = self.rows(entities)[:, :STATES]
         states[:, FLAGS] &= FALLING
+        if self.extras.count:
+            extra = self._extra[[self._row_of[entity] for entity in states[:, ID].tolist()]]
+            return np.concatenate((states, extra), axis=1)
+        return states
+
+    def _wide_states(self) -> layout.Int64s:
+        """Returns the states of all entities with their extra columns, ascending by id."""
+        ids = self._entities[: self._rows, ID]
+        rows = np.flatnonzero(ids)
+        rows = rows[np.argsort(ids[rows])]
+        states = np.concatenate((self._entities[rows, :STATES], self._extra[rows]), axis=1)
+        states[:, FLAGS] &= FALLING
         return states
 
     def state(self, entity: int) -> tuple[int, ...]:
-        """Returns the state of one entity as 12 whole numbers (the columns of `layout.COLUMNS` before `cell`)."""
-        state = self._entities[self._row_at(entity), :STATES].copy()
+        """Returns the state of one entity as 12 whole numbers (the columns of `layout.COLUMNS` before `cell`).
+
+        In a scene with extra columns, these follow.
+        """
+        row = self._row_at(entity)
+        state: list[int] = self._entities[row, :STATES].tolist()
         state[FLAGS] &= FALLING
-        return tuple(state.tolist())
+        return tuple(state + self._extra[row].tolist()) if self.extras.count else tuple(state)
+
+    def field(self, entity: int, name: str) -> int:
+        """Returns the value of a field of an entity's behaviour.
+
+        Raises:
+            MissingError: there is no such entity.
+            SceneError: its behaviour has no such field.
+        """
+        row = self._row_at(entity)
+        column, _ = self.field_column(int(self._entities[row, TEMPLATE]), name)
+        return int(self._extra[row, column])
+
+    def fields(self, entity: int) -> dict[str, int]:
+        """Returns the fields of an entity's behaviour by name; empty if its template has no behaviour."""
+        row = self._row_at(entity)
+        return self.fields_of(int(self._entities[row, TEMPLATE]), self._extra[row].tolist())
+
+    def fields_of(self, kind: int, extra: list[int]) -> dict[str, int]:
+        """Returns the fields of a template's behaviour by name, from the extra columns of an entity."""
+        behaviour = self.extras.behaviour_of[kind]
+        if behaviour < 0:
+            return {}
+        fields = self.scene.behaviours[behaviour].fields
+        return {each.name: extra[self.extras.first + k] for k, each in enumerate(fields)}
+
+    def field_column(self, kind: int, name: str) -> tuple[int, Field]:
+        """Returns the place of a field among the extra columns, and its declaration.
+
+        Args:
+            kind: number of a template.
+            name: name of the field.
+
+        Raises:
+            SceneError: the template's behaviour has no such field.
+        """
+        behaviour = self.extras.behaviour_of[kind]
+        fields = self.scene.behaviours[behaviour].fields if behaviour >= 0 else ()
+        for k, each in enumerate(fields):
+            if each.name == name:
+                return self.extras.first + k, each
+        there = ", ".join(each.name for each in fields) or "none"
+        raise SceneError(f"{self.scene.templates[kind].name}.{name}: no such field (there are {there})")
+
+    def row_of(self, entity: int) -> int:
+        """Returns the row of an entity in memory."""
+        return self._row_of[entity]
+
+    @property
+    def entity_rows(self) -> layout.Int64s:
+        """The rows of all entities in memory, [rows, 16]; only for `shared.turns`."""
+        return self._entities
+
+    @property
+    def extra_rows(self) -> layout.Int64s:
+        """The extra columns of all rows in memory, [rows, n]; only for `shared.turns`."""
+        return self._extra
 
     def position(self, entity: int) -> tuple[float, float, float]:
         """Returns the position of an entity, in blocks."""
@@ -219,6 +309,8 @@ class WorldState:
     def _allocate(self, rows: int) -> None:
         """Makes room for `rows` entities, and keeps the present ones."""
         self._entities = blocks.grown(self._entities, 0, rows)
+        if self.extras.count:
+            self._extra = blocks.grown(self._extra, 0, rows)
         for name in ("_awake", "_next_awake", "_woken", "_later", "_changed", "_fell"):
             setattr(self, name, blocks.grown(getattr(self, name), 0, rows + 1))
         self.candidates = np.zeros((rows + 1, layout.CANDIDATE), np.int64)

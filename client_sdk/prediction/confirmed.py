@@ -86,7 +86,10 @@ class Confirmed:
             if max(states[:, FLAGS].tolist()) > FALLING:
                 self._act(states, snapshot.tick)
             world.write(states)
+        there = True
         for part in parts:
+            if part.fields:
+                there &= world.write_fields(world.extras.decode(part.fields))
             if len(part.edits):
                 self._edit(part)
             if part.attributes:
@@ -97,7 +100,7 @@ class Confirmed:
             if segment in world.blocks and not len(world.in_segment(segment)):
                 world.unload_segment(segment)
                 self.terrain_changed = True
-        there = world.follow(turns, min(ticks, self.follow_max), snapshot.tick)
+        there &= world.follow(turns, min(ticks, self.follow_max), snapshot.tick)
         self.states = world.states()
         for part in parts:
             if part.check and part.segment in world.blocks and checksum(world, part.segment) != part.check:
@@ -158,5 +161,5 @@ class Confirmed:
         for entity, (x, y, z) in zip(self.states[:, ID].tolist(), segments, strict=True):
             home = (x, y, z)
             if entity not in here and (home in whole or (home, entity) in gone):
-                self.world.remove(entity)
+                self.world.forget(entity)
                 self.attributes.pop(entity, None)

@@ -22,16 +22,19 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 
 from client_sdk.controls import Controls
 from client_sdk.events import Corrected
+from client_sdk.prediction.announcements import Announcements
 from client_sdk.prediction.confirmed import Confirmed
 from shared import edits
 from shared.bounds import bounds
 from shared.edits import Edit
 from shared.inputs import NEUTRAL, Input, row
-from shared.layout import COLUMNS, ID, Int64s, X
+from shared.layout import CELL, ID, TEMPLATE, Int64s, X
 from shared.ring import Ring
+from shared.turns import Failure, Turns
 from shared.units import BLOCK
 from shared.world import World
 
@@ -81,6 +84,9 @@ class Prediction:
         self.known = known
         self.entity = known.entity
         self.neighbours = neighbours
+        scene = known.world.scene
+        self.last_own = self.entity + scene.extras.blocks[scene.template(scene.player)]
+        """Greatest number of an entity that the own one may have spawned; they follow its own number."""
         self._controls = controls or Controls()
         self.confirmed = known.world
         self.predicted = World(known.world.scene, compiled=known.world.compiled)
@@ -92,9 +98,14 @@ class Prediction:
         self._states: Ring[Int64s] = Ring(limits.predicted)
         templates = known.world.scene.templates
         self._shown_ahead = np.array([template.shown == "predicted" for template in templates], np.int64)
+        self.announcements = Announcements(scene.tick_rate)
+        """The announcements of the own entity, for the program."""
+        self.failures: list[Failure] = []
+        """Turns of behaviours that have failed in a tick that was predicted for the first time."""
         self._edits: dict[int, tuple[int, Edit]] = {}  # edits without a verdict, with their ticks, by number
         self._refused = False  # whether an edit that the last replay applied was refused since
         self._compared = -1
+        self._failed = -1  # newest tick whose failed turns the program knows
 
     def begin(self, tick: int) -> None:
         """Starts the prediction at `tick`, or starts it again: replays the filed inputs from the confirmed world."""
@@ -103,7 +114,7 @@ class Prediction:
 
     def adopt(self, old: "Prediction") -> None:
         """Takes over the inputs and the edits without a verdict from an earlier prediction of the same entity."""
-        self._inputs, self._edits = old._inputs, old._edits
+        self._inputs, self._edits, self.announcements = old._inputs, old._edits, old.announcements
 
     def rows_since(self, tick: int, to: int) -> bytes:
         """Returns the own inputs after `tick`, up to `to`, packed as `Inputs.rows`.
@@ -127,6 +138,17 @@ class Prediction:
                 edits.apply(world, self.entity, edit)
         world.step({self.entity: self._input(tick)} if self.entity in world else None)
         self._states.put(tick, world.states())
+        if world.turns is not None:
+            self._heed(world.turns, tick)
+
+    def _heed(self, turns: Turns, tick: int) -> None:
+        """Takes the announcements and the exceptions of the turns of the latest step."""
+        for event in turns.announced:
+            if self.entity <= event.entity <= self.last_own:
+                self.announcements.add(tick, event)
+        failures = turns.take_failures() if turns.failures else ()
+        self.failures += [each for each in failures if each.tick > self._failed]
+        self._failed = max(self._failed, tick)
 
     def _input(self, tick: int) -> Input:
         """Returns the own input of a tick, or the substitute that the server uses if none was sent."""
@@ -178,6 +200,7 @@ class Prediction:
         guess, truth = self._states.get(tick), self._truth()
         changed = known.terrain_changed or self._refused
         if guess is not None and not changed and self._near_equal(guess, truth):
+            self.announcements.confirm(tick)
             return NOTHING
         correction = None
         if guess is not None and (mine := self._difference(guess, truth)):
@@ -226,6 +249,10 @@ class Prediction:
                 return before, after, min(max((at - first) / (last - first), 0.0), 1.0)
         return after, after, 0.0
 
+    def spawned(self) -> list[int]:
+        """Returns the predicted entities that the own one has spawned, in ascending order."""
+        return [entity for entity in range(self.entity + 1, self.last_own + 1) if entity in self.predicted]
+
     def _placed(self, since: int, to: int) -> frozenset[int]:
         """Returns the entities that the server's rules placed after the tick `since`, up to `to`."""
         ticks = range(max(since, to - self.known.follow_max) + 1, to + 1)
@@ -245,26 +272,54 @@ class Prediction:
 
     def _truth(self) -> Int64s:
         states = self.known.states
-        return states if self.neighbours else states[states[:, ID] == self.entity]
+        return states if self.neighbours else states[self._mine(states[:, ID])]
 
     def _replay(self, to: int) -> None:
+        tick = self.confirmed.tick
+        guess = self._states.get(tick)
+        self.announcements.begin(tick, final=guess is None or self._acts(guess) == self._acts(self._truth()))
         self.predicted.restore(self.confirmed)
         self.known.terrain_changed = self.known.edited_near = self._refused = False
         if not self.neighbours:
-            for entity in self.predicted.states()[:, ID].tolist():
-                if entity != self.entity:
-                    self.predicted.remove(entity)
+            ids = self.predicted.states()[:, ID]
+            for entity in ids[~self._mine(ids)].tolist():
+                self.predicted.forget(entity)
         self._states.put(self.confirmed.tick, self._truth())
         while self.predicted.tick < to:
             self.step()
+        self.announcements.end()
+
+    def _acts(self, states: Int64s) -> list[list[int]]:
+        """Returns the counts of the acts of the own entity and of what it has spawned, with their numbers."""
+        extras = self.confirmed.extras
+        if not extras.count:
+            return []
+        acts: list[list[int]] = states[self._mine(states[:, ID])][:, (ID, CELL + extras.acts)].tolist()
+        return acts
 
     def _near_equal(self, guess: Int64s, truth: Int64s) -> bool:
         """Returns whether all entities are as predicted that could meet the own one, or are drawn as predicted."""
         if guess.tobytes() == truth.tobytes():
             return True
+        if self.confirmed.extras.count:
+            return bool(np.array_equal(self._counting(guess), self._counting(truth)))
         kernel, reach = self.confirmed.kernel, MEET_BLOCKS * BLOCK
         a, b, always = map(kernel.lent, (guess, truth, self._shown_ahead))
         return bool(kernel.alike(a, len(guess), b, len(truth), self.entity, reach, always))
+
+    def _counting(self, states: Int64s) -> Int64s:
+        """Returns the states that count in a comparison, as `bulk.alike` chooses them, with their extra columns."""
+        own = states[states[:, ID] == self.entity]
+        if not len(own):
+            return states
+        ways = np.abs(states[:, X : X + 3] - own[0, X : X + 3])
+        near = (ways < MEET_BLOCKS * BLOCK).all(axis=1)
+        counting: Int64s = states[near | (self._shown_ahead[states[:, TEMPLATE]] != 0) | self._mine(states[:, ID])]
+        return counting
+
+    def _mine(self, ids: Int64s) -> npt.NDArray[np.bool_]:
+        """Returns for each entity whether it is the own one, or one that this has spawned."""
+        return (ids >= self.entity) & (ids <= self.last_own)
 
     def _difference(self, guess: Int64s, truth: Int64s) -> tuple[tuple[str, ...], float] | None:
         """Returns the fields and the distance (blocks) by which the own entity differs; None if it does not."""
@@ -272,7 +327,8 @@ class Prediction:
         if not len(mine) or not len(was) or np.array_equal(mine, was):
             return None
         way = (mine[0, X : X + 3] - was[0, X : X + 3]) / BLOCK
-        return tuple(COLUMNS[k] for k in np.flatnonzero(mine[0] != was[0])), float(np.sqrt((way * way).sum()))
+        names = self.confirmed.extras.names
+        return tuple(names[k] for k in np.flatnonzero(mine[0] != was[0])), float(np.sqrt((way * way).sum()))
 
     def _others_differ(self, guess: Int64s, truth: Int64s) -> bool:
         return not np.array_equal(guess[guess[:, ID] != self.entity], truth[truth[:, ID] != self.entity])

@@ -28,6 +28,7 @@ from shared.layout import STOP_X, TOLD, WHOLE
 from shared.messages import (
     CLIENT_KINDS,
     VERSION,
+    Announce,
     Bye,
     Command,
     Happened,
@@ -75,6 +76,7 @@ FROM_SERVER: tuple[Message, ...] = (
     Terrain(0, -1, 2, 0, 4, b"\1\2\3\4"),
     Pong(1.5, 17.25),
     Happened(3, "goal", b"\xc0"),
+    Announce(3, 7, "dash", b"\xc0"),
     Shared({"score": [1, None, {"x": 3.0}]}),
 )
 

@@ -15,6 +15,7 @@ from server.game_api.input_api import InputApi
 from server.game_api.outgoing import Outgoing
 from server.game_api.shared_values import SharedValues
 from server.game_api.turn import Turn
+from server.game_api.turns import TurnResults
 from server.journal.recorded_world import RecordedWorld
 from server.observability.counters import Counters
 from server.players.persisted_state import LEFT, PersistedState
@@ -23,7 +24,7 @@ from server.replication.change_log import ChangeLog
 from server.rewind import Rewind
 from server.rewind.history import Past
 from server.rules import Rules, check_rules
-from shared.checks import SceneError, Vec, finite, shown
+from shared.checks import SceneError, Vec, finite, shown, text
 from shared.layout import TEMPLATE
 from shared.scene import Scene
 
@@ -64,6 +65,7 @@ class GameApi(InputApi):
         self.outgoing = Outgoing(counters)
         self.hooks = Hooks(self, world, rules, counters, goes_on=kept is not None)
         self._attributes = Attributes(world, self.log, self.kept.attributes)
+        self.turn_results = TurnResults(world, self.log, self._attributes, counters)
         self._rewind, self._seed = rewind, seed
         self._random = (-1, Random())
         rules.game = self
@@ -132,6 +134,25 @@ class GameApi(InputApi):
     def template(self, entity: int) -> str:
         """Returns the name of an entity's template."""
         return self.scene.templates[self._world.state(self._known(entity))[TEMPLATE]].name
+
+    def field(self, entity: int, name: str) -> int:
+        """Returns the value of a field of the behaviour of an entity.
+
+        Raises:
+            SceneError: its template has no behaviour, or that has no such field.
+        """
+        return self._world.field(self._known(entity), text(name, "name"))
+
+    def set_field(self, entity: int, name: str, value: int) -> None:
+        """Sets a field of the behaviour of an entity, from this tick on.
+
+        Raises:
+            SceneError: there is no such field, or the value is out of its range.
+        """
+        self.turn.check("set_field")
+        entity = self._known(entity)
+        self._world.set_field(entity, text(name, "name"), value)
+        self.log.note_act(entity)
 
     def spawn(self, template: str, position: Vec, velocity: Vec = (0.0, 0.0, 0.0), **attributes: Any) -> int:
         """Adds an entity and returns its number.

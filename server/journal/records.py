@@ -257,7 +257,8 @@ def checked_states(scene: Scene, numbers: Int64s) -> Int64s:
         ValueError: the numbers are not states, or are not possible in the scene.
     """
     try:
-        return states.checked_states(numbers.reshape(-1, STATES), len(scene.templates))
+        rows = numbers.reshape(-1, STATES + scene.extras.count)
+        return states.checked_states(rows, len(scene.templates), scene.extras)
     except SceneError as error:
         raise ValueError(f"a state is out of range ({error})") from error
 

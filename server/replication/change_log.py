@@ -18,9 +18,10 @@ from server.observability.errors import FaultReporter
 from shared.blocks import offset_of, pack, segment_of
 from shared.bounds import bounds, in_ticks
 from shared.checks import Cell
-from shared.layout import ID, X
+from shared.layout import ID, TEMPLATE, X
 from shared.ring import Ring
-from shared.snapshot import KEYFRAME, TickEncoder, checksum, encode_part, encode_rows, join_part
+from shared.snapshot import KEYFRAME, SegmentDelta, TickEncoder, checksum, encode_part, encode_rows, join_part
+from shared.states import STATES
 from shared.units import TO_SEGMENT
 from shared.world import World
 
@@ -48,10 +49,11 @@ class _Tick:
         self.acted: set[int] = set()  # entities that the rules changed without placing them
         self.placed: set[int] = set()  # entities that the rules placed
         self.said: dict[Cell, set[int]] = defaultdict(set)  # entities whose attributes are new in the segment
+        self.fields: dict[Cell, set[int]] = defaultdict(set)  # entities whose extra columns alone changed
 
     def more(self) -> set[Cell]:
-        """Returns the segments with changes other than entity states: removals, edits, attributes."""
-        return self.gone.keys() | self.edited.keys() | self.said.keys()
+        """Returns the segments with changes other than motion: removals, edits, attributes, extra columns."""
+        return self.gone.keys() | self.edited.keys() | self.said.keys() | self.fields.keys()
 
 
 class DeltaCache(dict[Cell, bytes]):
@@ -126,6 +128,8 @@ class ChangeLog:
         self._due: set[Cell] = set()
         """Segments whose checksums are to be sent in this tick."""
         self._news = TickEncoder(world, in_ticks(CHECK_S, world.scene.tick_rate, 1))
+        self._latest_fields: dict[Cell, bytes] = {}
+        """Records of extra columns of the newest tick, by segment."""
         self._latest: dict[Cell, tuple[bytes, bytes, bytes]] | None = None
         """Entity changes of the newest tick, packed, by segment; None after a removal."""
         self._placed_at = -self.history
@@ -134,6 +138,10 @@ class ChangeLog:
     def segment(self, entity: int) -> Cell:
         """Returns the segment of an entity at the end of the latest recorded tick."""
         return self._home[entity]
+
+    def segment_at(self, entity: int) -> Cell | None:
+        """Returns the segment of an entity like `segment`; None if it does not exist."""
+        return self._home.get(entity)
 
     def note_act(self, entity: int) -> None:
         """Notes that the rules changed an entity before the coming step. The world notes placed entities and edits."""
@@ -178,10 +186,33 @@ class ChangeLog:
         for entity in self._said & homes.keys():
             now.said[homes[entity]].add(entity)
         self._said.clear()
+        if self._world.extras.count:
+            self._record_fields(now, shares)
         self._ticks.put(self._world.tick, now)
         self._now = _Tick()
         self._parts.clear()
         self._packs_left = PACKS_PER_TICK
+
+    def _record_fields(self, now: _Tick, shares: list[SegmentDelta]) -> None:
+        """Packs the extra columns of the entities that are sent whole, and of those whose extra columns changed."""
+        world, extras = self._world, self._world.extras
+        whole = {entity: segment for segment, _, ids, _ in shares for entity in ids}
+        records: dict[Cell, list[bytes]] = defaultdict(list)
+        for entity, segment in whole.items():
+            records[segment].append(self._fields_of(entity))
+        for entity, mask in world.fields_set.items():
+            segment_of = self._home.get(entity)
+            if segment_of is not None and entity not in whole:
+                now.fields[segment_of].add(entity)
+                row = world.extra_rows[world.row_of(entity)].tolist()
+                records[segment_of].append(extras.record(entity, mask, row))
+        self._latest_fields = {segment: b"".join(packed) for segment, packed in records.items()}
+
+    def _fields_of(self, entity: int) -> bytes:
+        """Returns the record of the extra columns of an entity that is sent whole."""
+        world = self._world
+        state = world.state(entity)
+        return world.extras.whole(entity, state[TEMPLATE], state[STATES:])
 
     def since(self, since: int) -> DeltaCache:
         """Returns the delta of each segment since a tick; an empty delta means no changes.
@@ -224,8 +255,9 @@ class ChangeLog:
         else:
             strays = [entity for entity, home in self._home.items() if home == segment]
             rows = self._world.rows(sorted(strays))
-        placed = self._placed_lately()
-        return encode_part(segment, KEYFRAME, rows, placed=placed, attributes=self._of(rows[:, ID].tolist()))
+        placed, ids = self._placed_lately(), rows[:, ID].tolist()
+        fields = b"".join(map(self._fields_of, ids)) if self._world.extras.count else b""
+        return encode_part(segment, KEYFRAME, rows, placed=placed, attributes=self._of(ids), fields=fields)
 
     def _placed_lately(self) -> set[int]:
         """Returns the entities placed in the last `history` ticks. A client may still know their former positions."""
@@ -240,13 +272,31 @@ class ChangeLog:
         check = checksum(self._world, segment) if due else 0
         ticks = known.ticks
         ago, news = self._world.tick - since, self._share(segment, since, ticks)
+        fields = self._fields(segment, since, ticks) if self._world.extras.count else b""
         if segment not in known.more:
-            return join_part(segment, ago, news, check=check)
+            return join_part(segment, ago, news, check=check, extra=fields)
         gone = {entity for tick in ticks for entity in tick.gone.get(segment, ()) if self._home.get(entity) != segment}
         edited = {offset for tick in ticks for offset in tick.edited.get(segment, ())}
         kinds = self._kinds(segment, sorted(edited))
         said = {entity for tick in ticks for entity in tick.said.get(segment, ()) if self._home.get(entity) == segment}
-        return join_part(segment, ago, news, sorted(gone), kinds, check, self._of(sorted(said)))
+        return join_part(segment, ago, news, sorted(gone), kinds, check, self._of(sorted(said)), fields)
+
+    def _fields(self, segment: Cell, since: int, ticks: list[_Tick]) -> bytes:
+        """Returns the records of extra columns of the entities that changed and are still in the segment."""
+        if self._latest is not None and since == self._world.tick - 1:
+            return self._latest_fields.get(segment, b"")
+        world, extras = self._world, self._world.extras
+        whole = {entity for tick in ticks for entity in tick.changed.get(segment, ())}
+        others = {entity for tick in ticks for entity in tick.fields.get(segment, ())} - whole
+        here = self._home.get
+        records = [self._fields_of(entity) for entity in sorted(whole) if here(entity) == segment]
+        every = (1 << extras.count) - 1
+        records += [
+            extras.record(entity, every, world.extra_rows[world.row_of(entity)].tolist())
+            for entity in sorted(others)
+            if here(entity) == segment
+        ]
+        return b"".join(records)
 
     def _of(self, entities: list[int]) -> list[Any]:
         """Returns the attributes of entities as on the wire. Those beyond `SAID_BYTES` wait for the next tick."""

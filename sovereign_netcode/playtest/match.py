@@ -182,7 +182,10 @@ class Match:
             core: its client; None: a new one.
         """
         seed = self.seed * 1_000_003 + len(self.players) * 7919
-        player = Player(self, core or Core(f"player {len(self.players)}"), path or Link(), policy, seed)
+        if core is None:
+            classes = [entry.code for entry in self.game.scene.behaviours if entry.code is not None]
+            core = Core(f"player {len(self.players)}", behaviours=classes)
+        player = Player(self, core, path or Link(), policy, seed)
         self.players.append(player)
         self.at(self.now, player.connect)
         return player

@@ -19,7 +19,7 @@ from shared.messages import KINDS, Message, Snapshot, decode_from_client, decode
 from shared.snapshot import FIELDS, ROW, decode_parts
 
 PAGE = (Path(__file__).resolve().parents[2] / "docs" / "protocol.md").read_text("utf-8")
-SEGMENT = ("segment", "x", "y", "z", "ago", "heads", "tails", "rows", "gone", "check", "edits", "attributes")
+SEGMENT = ("segment", "x", "y", "z", "ago", "heads", "tails", "rows", "gone", "check", "edits", "attributes", "fields")
 DECODE = {"client": decode_from_client, "server": decode_from_server}
 
 
@@ -65,8 +65,8 @@ def names(decoded: Message) -> Iterator[str]:
         yield from decoded._fields
     else:
         yield from decoded._fields[:-1]
-        for _ in decoded.segments:
-            yield from SEGMENT
+        for segment in decoded.segments:
+            yield from SEGMENT[: 1 + len(segment)]
 
 
 EXAMPLES = [pytest.param(side, text, id=type(message(text, side)).__name__) for side, text in blocks("wire")]

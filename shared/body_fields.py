@@ -1,0 +1,41 @@
+"""The fields of a behaviour as attributes of its bodies."""
+
+from typing import Any
+
+from shared.behaviours import BehaviourEntry, Field
+from shared.body import Body
+from shared.checks import SceneError
+
+
+def body_class(entry: BehaviourEntry, first: int) -> type[Body]:
+    """Returns the class of the bodies of a behaviour, with its fields as attributes.
+
+    Args:
+        entry: the behaviour.
+        first: place of its first field among the extra columns.
+
+    Raises:
+        SceneError: a field has the name of something that each body has.
+    """
+    names: dict[str, Any] = {}
+    for k, each in enumerate(entry.fields):
+        if hasattr(Body, each.name) or each.name in ("id", "tick", "behaviour", "entry") or each.name.startswith("_"):
+            raise SceneError(f"behaviours.{entry.name}.{each.name}: this name is taken; use another one")
+        names[each.name] = _attribute(each, first + k)
+    return type(f"{entry.name}Body", (Body,), names)
+
+
+def _attribute(declared: Field, column: int) -> property:
+    """Returns the property by which a turn reads and sets a field."""
+    low, high, bit = declared.low, declared.high, 1 << column
+
+    def get(self: Body) -> int:
+        return self._values[column]
+
+    def put(self: Body, value: object) -> None:
+        if type(value) is not int or not low <= value <= high:
+            value = declared.checked(value)
+        self._values[column] = value
+        self._mask |= bit
+
+    return property(get, put)

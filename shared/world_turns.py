@@ -1,0 +1,101 @@
+"""The changes and the reading of a world by the turns of behaviours (`shared.turns`).
+
+These changes are not reported to the observer, because a replay of a recording takes the turns again.
+"""
+
+from collections.abc import Mapping
+from contextlib import suppress
+
+from shared import blocks, edits, layout
+from shared.free_places import OverlapError
+from shared.inputs import Input, checked_input
+from shared.layout import ID, TEMPLATE, Int64s
+from shared.messages import DONE
+from shared.seen import Seen
+from shared.turns import Turns
+from shared.units import BLOCK, SPEED
+from shared.world_changes import UncheckedWorld
+
+AIM_MASK = 0b111
+"""Mask of the columns of an aim among the extra columns."""
+
+
+class TurnWorld(UncheckedWorld):
+    """A world whose behaviours change it within a step."""
+
+    def _with_turns(self, inputs: Mapping[int, Input]) -> Mapping[int, Input]:
+        """Takes the turns of behaviours before a step, and writes the aims of the inputs.
+
+        Returns:
+            The inputs of the step: without entities that the turns have removed.
+
+        Raises:
+            MissingError, SceneError: as for `World.step`; then no turn was taken.
+        """
+        self._told_of(inputs)  # checks them
+        used = inputs if all(type(each) is Input for each in inputs.values()) else _inputs(inputs)
+        if self.scene.behaviours:
+            if self.turns is None:
+                self.turns = Turns(self)
+            used = self.turns.take(used)
+            if self.turns.vanished:
+                used = {entity: input_ for entity, input_ in used.items() if entity in self._row_of}
+        if self.extras.aims:
+            for entity, input_ in used.items():
+                row, aim = self._row_of[entity], list(input_.aim)
+                if self._extra[row, : len(aim)].tolist() != aim:
+                    self._extra[row, : len(aim)] = aim
+                    self.note_fields(entity, AIM_MASK)
+        return used
+
+    def store_silently(self, states: Int64s) -> None:
+        """Writes states with all columns without a report. New entities count as placed."""
+        new = {entity for entity in states[:, ID].tolist() if entity not in self._row_of}
+        self._store(states)
+        self.placing |= new
+
+    def remove_silently(self, entity: int) -> None:
+        """Removes an entity without a report."""
+        self._disown(entity)
+        self._take_out(entity)
+
+    def edit_silently(self, entity: int, edit: edits.Edit) -> None:
+        """Carries out an edit without a report of it; the observer is still notified before the block changes."""
+        if edits.verdict(self, entity, edit) == DONE:
+            x, y, z, kind = edit
+            if self.observer is not None:
+                segment = blocks.segment_of(x, y, z)
+                self.observer.touching(segment, segment)
+            with suppress(OverlapError):
+                self._set_box((x, y, z), (x + 1, y + 1, z + 1), kind, False)
+
+    def rows_in(self, box: list[int], but: int, kind: int | None) -> list[int]:
+        """Returns the rows of the entities that overlap or touch a box, ascending by id.
+
+        Args:
+            box: low and high corner, in grid steps.
+            but: row that is left out.
+            kind: number of their template; None: any.
+        """
+        end = self.kernel.gather(self.bound, but, False, *box)
+        rows = self.candidates[: end // layout.CANDIDATE, 6]
+        found = self._entities[rows][:, (ID, TEMPLATE)].tolist()
+        ordered = sorted(zip(found, rows.tolist(), strict=True))
+        return [row for (_, template), row in ordered if kind is None or template == kind]
+
+    def seen(self, row: int) -> Seen:
+        """Returns what the turn of another entity sees of the entity in a row."""
+        entity, kind, _, x, y, z, vx, vy, vz, *_ = self._entities[row].tolist()
+        fields = self.fields_of(kind, self._extra[row].tolist())
+        name = self.scene.templates[kind].name
+        velocity = (vx / SPEED, vy / SPEED, vz / SPEED)
+        return Seen(entity, name, (x / BLOCK, y / BLOCK, z / BLOCK), velocity, fields)
+
+    def thrown(self, kind: int, speed: int) -> int:
+        """Returns the flags of an entity of a template for a vertical speed, as `_thrown`."""
+        return self._thrown(kind, speed)
+
+
+def _inputs(inputs: Mapping[int, Input]) -> dict[int, Input]:
+    """Returns inputs, some of which are plain tuples or have numbers of numpy, as `Input`."""
+    return {entity: checked_input(input_, f"inputs[{entity}]") for entity, input_ in inputs.items()}
