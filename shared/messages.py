@@ -47,15 +47,12 @@ import msgpack
 
 from shared import fields
 from shared.fields import (
-    CLIENT_LIST_MAX,
     CLIENT_MESSAGE_MAX,
-    FIRST_MAX,
     INPUT_ROW_BYTES,
     INPUT_ROWS_MAX,
     LIST_MAX,
     MESSAGE_MAX,
     SEGMENTS_MAX,
-    STATUSES_MAX,
     TABLE_MAX,
     TICK_MAX,
     shown,
@@ -359,16 +356,16 @@ def decode_from_client(data: bytes, row_bytes: int = INPUT_ROW_BYTES) -> Message
         try:
             _, first, acked, rows = msgpack.unpackb(data)
         except Exception:
-            return decode(data, CLIENT_KINDS, CLIENT_MESSAGE_MAX, CLIENT_LIST_MAX, row_bytes)
+            return decode(data, CLIENT_KINDS, CLIENT_MESSAGE_MAX, fields.CLIENT_LIST_MAX, row_bytes)
         if (
             type(first) is type(acked) is int
-            and 0 <= first <= FIRST_MAX
+            and 0 <= first <= fields.FIRST_MAX
             and -1 <= acked <= TICK_MAX
             and type(rows) is bytes
             and whole_rows(rows, row_bytes)
         ):
             return Inputs(first, acked, rows)
-    return decode(data, CLIENT_KINDS, CLIENT_MESSAGE_MAX, CLIENT_LIST_MAX, row_bytes)
+    return decode(data, CLIENT_KINDS, CLIENT_MESSAGE_MAX, fields.CLIENT_LIST_MAX, row_bytes)
 
 
 def decode_from_server(data: bytes) -> Message:
@@ -395,7 +392,7 @@ def decode_from_server(data: bytes) -> Message:
             and -1 <= newest <= TICK_MAX
             and -1 <= first <= TICK_MAX
             and len(margins) in (0, 2, 4)
-            and len(statuses) <= STATUSES_MAX
+            and len(statuses) <= fields.STATUSES_MAX
             and len(segments) <= SEGMENTS_MAX
         ):
             return Snapshot(tick, newest, margins, first, statuses, verdicts, drops, tuple(segments))
