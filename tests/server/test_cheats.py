@@ -39,7 +39,7 @@ HEIGHT = 7 * BLOCK // 4
 EAST, JUMP = bytes((127, 0, 0)), bytes((127, 0, 1))
 
 
-def plain(rules: Rules | None = None, limits: Limits | None = None) -> Table:
+def plain(rules: Rules | None = None, limits: Limits | None = None, *, aim: bool = False) -> Table:
     """Returns a plain of 64 x 64 blocks around its spawn. A lost player has 5 s to reconnect."""
     return Table(
         limits,
@@ -49,6 +49,7 @@ def plain(rules: Rules | None = None, limits: Limits | None = None) -> Table:
         origin=(-1, -1, -1),
         size=(2, 2, 2),
         spawns=((0.0, 0.0, 1.0),),
+        aim=aim,
     )
 
 
@@ -446,13 +447,15 @@ ACTS = st.one_of(
 
 
 @settings(max_examples=examples(60))
-@given(st.lists(ACTS, max_size=60))
-def test_any_schedule_comes_to_an_honest_path(schedule: list[tuple[str, int, bytes]]) -> None:
-    cheat = Cheat(plain())
+@given(st.lists(ACTS, max_size=60), st.sampled_from([b"", bytes(6), b"\x00\x80" * 3, b"\xff\x7f\x01\x00\x00\x80"]))
+def test_any_schedule_comes_to_an_honest_path(schedule: list[tuple[str, int, bytes]], aim: bytes) -> None:
+    """Plays in scenes with and without aim. An aim, of whatever length, does not change the path."""
+    cheat = Cheat(plain(aim=aim != b""))
     for what, number, rows in schedule:
         match what:
             case "inputs":
-                cheat.link.say(Inputs(max(0, cheat.table.tick_number + number), -1, rows))
+                packed = b"".join(rows[at : at + INPUT_ROW_BYTES] + aim for at in range(0, len(rows), INPUT_ROW_BYTES))
+                cheat.link.say(Inputs(max(0, cheat.table.tick_number + number), -1, packed))
                 if number % 2:
                     continue  # more messages in the same tick
             case "wait":
