@@ -12,6 +12,7 @@ from shared.inputs import MOVE_MAX, NEUTRAL, Input
 from shared.scene import Scene, load_scene
 from shared.world import World
 from sovereign_netcode.playtest import Match, bot
+from tests.lengths import long
 
 FLAT = load_scene("flat")
 
@@ -40,7 +41,7 @@ def test_the_seed_decides(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", POLICIES)
-@pytest.mark.parametrize("scene", ["arena", "hills", "topdown"])
+@pytest.mark.parametrize("scene", ["arena", *long("hills"), "topdown"])
 def test_every_policy_plays_every_scene(name: str, scene: str) -> None:
     for input_ in wishes(name, 7, 200, load_scene(scene)):
         assert input_.move_x**2 + input_.move_y**2 <= MOVE_MAX**2

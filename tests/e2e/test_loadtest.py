@@ -84,6 +84,7 @@ def test_no_server_is_one_clear_line() -> None:
     assert "Traceback" not in done.stdout + done.stderr
 
 
+@pytest.mark.slow
 def test_a_broken_scene_is_one_clear_line() -> None:
     done = loadtest("--scene", "nowhere")
     assert done.returncode == 2

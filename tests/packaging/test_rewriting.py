@@ -7,6 +7,7 @@ import pytest
 
 import hatch_build
 from hatch_build import FOLDERS, PACKAGE, RewriteError, rewritten
+from tests.lengths import long_but
 
 ROOT = Path(__file__).resolve().parents[2]
 MODULES = frozenset(hatch_build.module_names(ROOT))
@@ -80,7 +81,7 @@ def test_an_import_that_would_fail_in_the_wheel_is_refused(source: str, reason: 
     assert str(error.value) == reason
 
 
-@pytest.mark.parametrize("file", SOURCES, ids=lambda file: str(file.relative_to(ROOT)))
+@pytest.mark.parametrize("file", long_but(SOURCES[::8], SOURCES), ids=lambda file: str(file.relative_to(ROOT)))
 def test_a_source_of_the_product_differs_in_names_only(file: Path) -> None:
     before = file.read_text("utf-8")
     after = rewritten(before, file.name, MODULES)

@@ -211,6 +211,7 @@ def test_a_game_is_played_in_the_window(installed: Installed) -> None:
     assert (installed.folder / "picture.png").stat().st_size > 10_000
 
 
+@pytest.mark.slow
 def test_a_match(installed: Installed) -> None:
     program = "from tests.readme.pages import programs; exec(programs()['Testing it']); print('over:', match.now)"
     assert "over: 30" in installed.run("-c", program)

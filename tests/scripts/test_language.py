@@ -99,6 +99,7 @@ def test_a_finding_names_place_rule_and_text() -> None:
     assert str(finding).endswith(": Those of the " + "x" * 87 + "...")
 
 
+@pytest.mark.slow  # a step of its own in scripts/test
 def test_the_repository_complies(capsys: pytest.CaptureFixture[str]) -> None:
     assert all((language.ROOT / name).exists() for name in language.CHECKED)
     assert language.main([]) == 0, capsys.readouterr().out

@@ -106,8 +106,9 @@ def run(ticks: int, rate: int, integrator: str, gravity: float, compiled: bool, 
 @pytest.mark.parametrize(
     ("rate", "integrator", "gravity"),
     [
-        (20, "semi", 18.0), (32, "mean", 18.0), (60, "mean", 0.0), (128, "semi", 18.0),
-        *long((1, "mean", 18.0), (30, "mean", 18.0), (64, "semi", 5.0), (240, "mean", 18.0)),
+        (32, "mean", 18.0), (128, "semi", 18.0),
+        *long((20, "semi", 18.0), (60, "mean", 0.0), (1, "mean", 18.0), (30, "mean", 18.0), (64, "semi", 5.0)),
+        *long((240, "mean", 18.0)),
     ],
 )  # fmt: skip
 def test_a_follower_computes_every_bit(rate: int, integrator: str, gravity: float, compiled: bool) -> None:
