@@ -24,15 +24,22 @@ SCALE = 1 << 30
 _LONGEST, _SHORTEST = AIM_MAX**2, (AIM_MAX - 2) ** 2
 
 
+def is_normal(aim: Aim) -> bool:
+    """Returns whether `normalised` leaves an aim as it is."""
+    x, y, z = aim
+    square = x * x + y * y + z * z
+    return square == 0 or _SHORTEST <= square <= _LONGEST
+
+
 def normalised(aim: Aim) -> Aim:
     """Returns the aim with this direction and the length 32767, in whole numbers. Both sides use this rule.
 
     A direction of length 0 stays as it is, and so does one that has the length already.
     """
+    if is_normal(aim):
+        return aim
     x, y, z = aim
     square = x * x + y * y + z * z
-    if square == 0 or _SHORTEST <= square <= _LONGEST:
-        return aim
     # |part| = floor(32767 |part| / length), so the result is never too long, and less than sqrt(3) too short
     return _scaled(x, square), _scaled(y, square), _scaled(z, square)
 

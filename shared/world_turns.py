@@ -7,8 +7,9 @@ from collections.abc import Mapping
 from contextlib import suppress
 
 from shared import blocks, edits, layout
+from shared.aim import NO_AIM, is_normal
 from shared.free_places import OverlapError
-from shared.inputs import Input, checked_input
+from shared.inputs import Input, checked_input, clamp
 from shared.layout import ID, TEMPLATE, Int64s
 from shared.messages import DONE
 from shared.seen import Seen
@@ -33,7 +34,7 @@ class TurnWorld(UncheckedWorld):
             MissingError, SceneError: as for `World.step`; then no turn was taken.
         """
         self._told_of(inputs)  # checks them
-        used = inputs if all(type(each) is Input for each in inputs.values()) else _inputs(inputs)
+        used = inputs if all(map(_is_used, inputs.values())) else _inputs(inputs)
         if self.scene.behaviours:
             if self.turns is None:
                 self.turns = Turns(self)
@@ -96,6 +97,11 @@ class TurnWorld(UncheckedWorld):
         return self._thrown(kind, speed)
 
 
+def _is_used(input_: Input) -> bool:
+    """Returns whether a checked input can be used as it is."""
+    return type(input_) is Input and (input_.aim is NO_AIM or is_normal(input_.aim))
+
+
 def _inputs(inputs: Mapping[int, Input]) -> dict[int, Input]:
-    """Returns inputs, some of which are plain tuples or have numbers of numpy, as `Input`."""
-    return {entity: checked_input(input_, f"inputs[{entity}]") for entity, input_ in inputs.items()}
+    """Returns checked inputs, some of which are plain tuples or have an aim of another length, as they are used."""
+    return {entity: clamp(checked_input(input_, f"inputs[{entity}]")) for entity, input_ in inputs.items()}

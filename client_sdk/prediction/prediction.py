@@ -292,7 +292,7 @@ class Prediction:
     def _acts(self, states: Int64s) -> list[list[int]]:
         """Returns the counts of the acts of the own entity and of what it has spawned, with their numbers."""
         extras = self.confirmed.extras
-        if not extras.count:
+        if not self.confirmed.scene.behaviours:
             return []
         acts: list[list[int]] = states[self._mine(states[:, ID])][:, (ID, CELL + extras.acts)].tolist()
         return acts

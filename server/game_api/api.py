@@ -345,5 +345,5 @@ class GameApi(InputApi):
         self._world.remove(entity)
         self._world.note([LEFT, entity])
         self._attributes.forget(entity)
-        self._forget_input(entity)
+        self.steered.pop(entity, None)
         self.log.note_removal(entity)

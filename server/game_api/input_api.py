@@ -10,12 +10,13 @@ from collections.abc import Sequence
 from server.game_api.turn import Turn
 from server.journal.recorded_world import RecordedWorld
 from server.players.player import Player
-from shared.aim import NO_AIM, Aim, direction
+from shared.aim import NO_AIM, direction
 from shared.buttons import Names
 from shared.checks import SceneError, Vec, shown, whole
 from shared.fields import ENTITY_MAX
 from shared.inputs import MOVE_MAX, Input, make_input
 from shared.layout import BUTTONS, MOVE_X, MOVE_Y
+from shared.states import STATES
 
 
 class InputApi:
@@ -31,7 +32,6 @@ class InputApi:
         self.turn = turn
         self.steered: dict[int, Input] = {}
         self._world, self._players = world, players
-        self._aims: dict[int, Aim] = {}
 
     def held(self, who: Player | int, button: str) -> bool:
         """Returns whether a button is held in the tick that is about to be computed.
@@ -115,8 +115,6 @@ class InputApi:
         input_ = make_input(x, y, jump=jump, buttons=scene.buttons_bits(buttons), aim=aim)
         scene.check_aim(input_.aim)
         self.steered[entity] = input_
-        if scene.aim:
-            self._aims[entity] = input_.aim
 
     # -- inside ------------------------------------------------------------------------------------------------
 
@@ -128,12 +126,8 @@ class InputApi:
         if entity in self.steered:
             return self.steered[entity]
         state = self._world.state(entity)
-        return Input(state[MOVE_X], state[MOVE_Y], state[BUTTONS], self._aims.get(entity, NO_AIM))
-
-    def _forget_input(self, entity: int) -> None:
-        """Forgets the input of an entity that is removed."""
-        self.steered.pop(entity, None)
-        self._aims.pop(entity, None)
+        aim = (state[STATES], state[STATES + 1], state[STATES + 2]) if self._world.scene.aim else NO_AIM
+        return Input(state[MOVE_X], state[MOVE_Y], state[BUTTONS], aim)
 
     def _whose(self, who: Player | int) -> int:
         """Returns the number of an existing entity, for a player or a number."""

@@ -125,6 +125,17 @@ def test_rows_have_an_aim_where_the_scene_asks_for_it() -> None:
     assert unpacked(row(input_)) == (*input_[:3], NO_AIM)
 
 
+def test_a_world_keeps_the_aim_with_its_length() -> None:
+    world = build([[-8, -8, -1, 8, 8, 0, 1]], aim=True)
+    entity = world.spawn("box", (0.0, 0.0, 0.0))
+    for aim in ((1, 0, 0), (-AIM_PART_MAX, AIM_PART_MAX, 7), (0, 0, 0), (3, -4, 0), make_aim((1, 2, 3))):
+        world.step({entity: Input(0, 0, 0, aim)})
+        assert world.state(entity)[12:15] == normalised(aim)
+    plain: Any = (1, 2, 3)
+    world.step({entity: plain})
+    assert world.state(entity)[9:15] == (1, 2, 3, *NO_AIM)
+
+
 @pytest.mark.parametrize("compiled", [False, True])
 def test_a_world_steps_with_and_without_an_aim(compiled: bool) -> None:
     plain = build([[-8, -8, -1, 8, 8, 0, 1]], compiled=compiled)
