@@ -24,11 +24,14 @@ SCALE = 1 << 30
 _LONGEST, _SHORTEST = AIM_MAX**2, (AIM_MAX - 2) ** 2
 
 
-def is_normal(aim: Aim) -> bool:
-    """Returns whether `normalised` leaves an aim as it is."""
+def is_normal(aim: object) -> bool:
+    """Returns whether a value is an aim that `normalised` leaves as it is."""
+    if type(aim) is not tuple or len(aim) != len(NO_AIM):
+        return False
     x, y, z = aim
-    square = x * x + y * y + z * z
-    return square == 0 or _SHORTEST <= square <= _LONGEST
+    if not type(x) is type(y) is type(z) is int:
+        return False
+    return _SHORTEST <= x * x + y * y + z * z <= _LONGEST or aim == NO_AIM
 
 
 def normalised(aim: Aim) -> Aim:

@@ -363,6 +363,8 @@ class World(TurnWorld):
         n = len(used) if used else 0
         if used:
             told = self._told_of(used)
+            if self.extras.aims:
+                self._write_aims(used)
             if len(told) > len(self._inputs):
                 self._inputs = np.zeros(2 * len(told), np.int64)
                 self._told = self.kernel.lent(self._inputs)

@@ -289,16 +289,19 @@ class UncheckedWorld(WorldState):
         self.kernel.wake_on(self.bound, row, box[0], box[1], box[3], box[4], box[5])
 
     def _told_of(self, inputs: Mapping[int, Input]) -> list[int]:
-        """Returns inputs as the kernel takes them: row, move_x, move_y and buttons for each."""
+        """Returns inputs as the kernel takes them: row, move_x, move_y and buttons for each.
+
+        In a scene with aim, the aims must have been checked before.
+        """
         told: list[int] = []
-        rows, most = self._row_of, MOVE_PART_MAX
+        rows, most, aims = self._row_of, MOVE_PART_MAX, self.scene.aim
         try:
             for entity, (x, y, buttons, aim) in inputs.items():
                 if not (
                     type(x) is type(y) is type(buttons) is int
                     and -most <= x <= most >= y >= -most
                     and 0 <= buttons <= BUTTONS_MAX
-                    and aim is NO_AIM
+                    and (aims or aim is NO_AIM)
                 ):
                     raise ValueError
                 told += (rows[entity], x, y, buttons)

@@ -25,29 +25,32 @@ class TurnWorld(UncheckedWorld):
     """A world whose behaviours change it within a step."""
 
     def _with_turns(self, inputs: Mapping[int, Input]) -> Mapping[int, Input]:
-        """Takes the turns of behaviours before a step, and writes the aims of the inputs.
+        """Takes the turns of behaviours before a step.
 
         Returns:
-            The inputs of the step: without entities that the turns have removed.
+            The inputs of the step: as `Input`, and without entities that the turns have removed.
 
         Raises:
             MissingError, SceneError: as for `World.step`; then no turn was taken.
         """
-        self._told_of(inputs)  # checks them
         used = inputs if all(map(_is_used, inputs.values())) else _inputs(inputs)
         if self.scene.behaviours:
+            self._told_of(used)  # checks them
             if self.turns is None:
                 self.turns = Turns(self)
             used = self.turns.take(used)
             if self.turns.vanished:
                 used = {entity: input_ for entity, input_ in used.items() if entity in self._row_of}
-        if self.extras.aims:
-            for entity, input_ in used.items():
-                row, aim = self._row_of[entity], list(input_.aim)
-                if self._extra[row, : len(aim)].tolist() != aim:
-                    self._extra[row, : len(aim)] = aim
-                    self.note_fields(entity, AIM_MASK)
         return used
+
+    def _write_aims(self, inputs: Mapping[int, Input]) -> None:
+        """Writes the aims of the inputs of a step, which `_with_turns` has returned."""
+        rows, extra = self._row_of, self._extra
+        for entity, (_, _, _, aim) in inputs.items():
+            mine = extra[rows[entity]]
+            if (mine.item(0), mine.item(1), mine.item(2)) != aim:
+                mine[:3] = aim
+                self.note_fields(entity, AIM_MASK)
 
     def store_silently(self, states: Int64s) -> None:
         """Writes states with all columns without a report. New entities count as placed."""
@@ -98,10 +101,14 @@ class TurnWorld(UncheckedWorld):
 
 
 def _is_used(input_: Input) -> bool:
-    """Returns whether a checked input can be used as it is."""
+    """Returns whether an input is an `Input` whose aim has its length. The other values are not checked."""
     return type(input_) is Input and (input_.aim is NO_AIM or is_normal(input_.aim))
 
 
 def _inputs(inputs: Mapping[int, Input]) -> dict[int, Input]:
-    """Returns checked inputs, some of which are plain tuples or have an aim of another length, as they are used."""
+    """Returns inputs, some of which are plain tuples or have an aim of another length, as they are used.
+
+    Raises:
+        SceneError: a value is not an `Input`.
+    """
     return {entity: clamp(checked_input(input_, f"inputs[{entity}]")) for entity, input_ in inputs.items()}
