@@ -29,6 +29,7 @@ from client_sdk.events import Corrected
 from client_sdk.prediction.announcements import Announcements
 from client_sdk.prediction.confirmed import Confirmed
 from shared import edits
+from shared.aim import NO_AIM
 from shared.bounds import bounds
 from shared.edits import Edit
 from shared.inputs import NEUTRAL, Input, row
@@ -308,13 +309,18 @@ class Prediction:
         return bool(kernel.alike(a, len(guess), b, len(truth), self.entity, reach, always))
 
     def _counting(self, states: Int64s) -> Int64s:
-        """Returns the states that count in a comparison, as `bulk.alike` chooses them, with their extra columns."""
+        """Returns the states that count in a comparison, as `bulk.alike` chooses them, with their extra columns.
+
+        The aim of others does not count: it changes in every tick, and what it leads to is compared.
+        """
         own = states[states[:, ID] == self.entity]
         if not len(own):
             return states
         ways = np.abs(states[:, X : X + 3] - own[0, X : X + 3])
         near = (ways < MEET_BLOCKS * BLOCK).all(axis=1)
         counting: Int64s = states[near | (self._shown_ahead[states[:, TEMPLATE]] != 0) | self._mine(states[:, ID])]
+        if self.confirmed.extras.aims:
+            counting[~self._mine(counting[:, ID]), CELL : CELL + len(NO_AIM)] = 0
         return counting
 
     def _mine(self, ids: Int64s) -> npt.NDArray[np.bool_]:

@@ -210,6 +210,26 @@ def test_a_lone_player_with_buttons_and_aim_is_not_corrected(name: str) -> None:
     assert match.game.counters.malformed == 0
 
 
+def test_others_who_only_aim_cause_no_replays() -> None:
+    """Turns the aims of all players in every tick. Each client has the aims of all, as they were at its snapshot."""
+    match = Match(yard(aim=True, spawns=[(0.0, 0.0, 0.0), (3.0, 0.0, 0.0), (0.0, 3.0, 0.0)]), seed=15)
+
+    def turns(core: Core, rng: random.Random) -> Input:
+        return make_input(aim=[rng.uniform(-1, 1) for _ in range(3)])
+
+    players = [match.join(turns, Link(0.05, jitter_s=0.01)) for _ in range(3)]
+    match.run(3)
+    before = [player.core.stats.repredictions for player in players]
+    aims: set[Any] = set()
+    for _ in range(64):
+        match.run(1 / 32)
+        worlds = [player.core.prediction.confirmed for player in players if player.core.prediction]
+        aims |= {world.state(players[0].core.entity)[12:15] for world in worlds}
+    assert [player.core.stats.repredictions for player in players] == before
+    assert len(aims) > 60
+    assert sum(player.core.stats.divergences + player.core.stats.corrections for player in players) == 0
+
+
 def test_nothing_changes_on_the_wire_for_a_scene_with_buttons_but_without_aim() -> None:
     """Plays once with names and once without; the inputs are the same, byte by byte."""
     sent = []

@@ -8,6 +8,7 @@ from client_sdk.core import Core
 from server.players.player import Player
 from server.rules import Rules
 from shared.aim import AIM_MAX, NO_AIM, direction, make_aim
+from shared.behaviours import Behaviour, field
 from shared.checks import MissingError, SceneError
 from shared.inputs import Input, make_input, row
 from shared.layout import BUTTONS, MOVE_X, MOVE_Y
@@ -143,6 +144,42 @@ def test_substitutes_hold_a_button_and_a_long_silence_releases_it() -> None:
     assert held == [False, *[True] * 11, *[False] * 8], "its own tick, 10 repeated ones, then neutral"
     assert [bool(entry["pressed"]) for entry in told] == [n == 1 for n in range(20)]
     assert [bool(entry["released"]) for entry in told] == [n == 12 for n in range(20)]
+
+
+class Counter(Behaviour):
+    """Counts the presses of a button in a field."""
+
+    templates = ("box",)
+    presses = field(bits=16)
+
+    def turn(self, me: Any) -> None:
+        if me.pressed("fire"):
+            me.presses += 1
+
+
+class Counts(Rules):
+    """Counts the presses of a button, as the rules get them."""
+
+    behaviours = (Counter,)
+    presses = 0
+
+    def on_tick(self) -> None:
+        self.presses += sum(self.game.pressed(player, "fire") for player in self.game.players.values())
+
+
+def test_rules_and_behaviours_get_the_same_presses() -> None:
+    rules = Counts()
+    match = Match(yard(aim=True), seed=9, rules=rules)
+
+    def plays(core: Core, rng: Any) -> Input:
+        aim = [rng.uniform(-1, 1) for _ in range(3)]
+        return make_input(rng.uniform(-1, 1), 0, buttons=rng.randrange(8), aim=aim)
+
+    player = match.join(plays, Link(0.05, jitter_s=0.03, loss=0.05))
+    match.run(12)
+    assert rules.presses > 40
+    assert match.game.api.field(player.core.entity, "presses") == rules.presses
+    assert player.core.stats.divergences == match.game.counters.rules_failed == 0
 
 
 class Steers(Rules):
