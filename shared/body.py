@@ -30,6 +30,31 @@ WAKE_MAX = (1 << 32) - 1
 """Greatest tick at which an entity can ask to have a turn."""
 
 
+class Changes:
+    """The changes of one turn.
+
+    Attributes:
+        state: the new state, 12 columns; None: it stays.
+        values: the extra columns.
+        mask: bits of the extra columns that were set.
+        steered: the input that replaces the player's; None: there is none.
+        edits: changes of blocks.
+        spawned: states of new entities, with all columns.
+        removed: entities to remove.
+        announced: names and payloads of events.
+    """
+
+    def __init__(self) -> None:
+        self.state: list[int] | None = None
+        self.values: list[int] = []
+        self.mask = 0
+        self.steered: Input | None = None
+        self.edits: list[Edit] = []
+        self.spawned: list[list[int]] = []
+        self.removed: list[int] = []
+        self.announced: list[tuple[str, bytes]] = []
+
+
 class Body:
     """The entity of a turn. Positions are in blocks, velocities in blocks/s, directions in -127..127.
 
@@ -51,25 +76,17 @@ class Body:
         self._before: list[int] = []
         self._values: list[int] = []
         self._input = NEUTRAL
-        self._held = 0
-        self.clear()
+        self._held = self._drawn = 0
+        self._bits = world.scene.button_bits
+        self.changes = False
+        """Whether the turn has changed anything."""
+        self._parts = Changes()
 
     if TYPE_CHECKING:  # a type checker knows no fields; at run time an unknown name is an error
 
         def __getattr__(self, name: str) -> Any: ...
 
         def __setattr__(self, name: str, value: Any) -> None: ...
-
-    def clear(self) -> None:
-        """Forgets the changes of the turn before."""
-        self._new: list[int] | None = None
-        self._mask = 0
-        self._steered: Input | None = None
-        self._edits: list[Edit] = []
-        self._spawned: list[list[int]] = []
-        self._removed: list[int] = []
-        self._announced: list[tuple[str, bytes]] = []
-        self._drawn = 0
 
     def begin(self, tick: int, state: list[int], values: list[int], input_: Input | None) -> None:
         """Begins the turn of another entity.
@@ -80,21 +97,26 @@ class Body:
             values: its extra columns.
             input_: its input of this tick; None: it goes on with its latest one.
         """
-        if self._new is not None or self._mask or self._edits or self._spawned or self._removed or self._announced:
-            self.clear()
-        self._steered = None
-        self._drawn = 0
         self.tick, self.id = tick, state[ID]
         self._state, self._before, self._values = state, values, values[:]
         self._held = state[BUTTONS]
         self._input = input_ if input_ is not None else self._held_input()
+        self._drawn = 0
+        if self.changes:
+            self.changes = False
+            self._parts = Changes()
+
+    def taken(self) -> "Changes":
+        """Returns the changes of the turn."""
+        self._parts.values = self._values
+        return self._parts
 
     # -- reading: the own entity ---------------------------------------------------------------------------
 
     @property
     def template(self) -> str:
         """The name of the entity's template."""
-        return self._world.scene.templates[(self._new or self._state)[TEMPLATE]].name
+        return self._world.scene.templates[(self._parts.state or self._state)[TEMPLATE]].name
 
     @property
     def position(self) -> Vec:
@@ -108,7 +130,7 @@ class Body:
 
         An entity that walks without `acceleration` sets the horizontal part from its input in every step.
         """
-        x, y, z = (self._new or self._state)[VX : VX + 3]
+        x, y, z = (self._parts.state or self._state)[VX : VX + 3]
         return x / SPEED, y / SPEED, z / SPEED
 
     @velocity.setter
@@ -168,7 +190,8 @@ class Body:
         In the next tick, `pressed` and `released` compare with the replaced input.
         """
         made = make_input(x, y, jump=jump, buttons=buttons)
-        self._steered = self._input._replace(move_x=made.move_x, move_y=made.move_y, buttons=made.buttons)
+        self.changes = True
+        self._parts.steered = self._input._replace(move_x=made.move_x, move_y=made.move_y, buttons=made.buttons)
 
     # -- reading: the world --------------------------------------------------------------------------------
 
@@ -219,7 +242,7 @@ class Body:
             SceneError: there is no such template.
         """
         kind = self._world.scene.template(template)
-        state = self._new or self._state
+        state = self._parts.state or self._state
         if kind == state[TEMPLATE]:
             return True
         if taken(self._world, self._row, kind, box_at(self._world, kind, state[X : X + 3])):
@@ -235,7 +258,7 @@ class Body:
         edit = edits.checked(x, y, z, kind)
         if edits.verdict(self._world, self.id, edit) != DONE:
             return False
-        self._edits.append(edit)
+        self._parts.edits.append(edit)
         self._acted()
         return True
 
@@ -274,9 +297,9 @@ class Body:
         except OverlapError:
             return None
         entity = self.id + 1 + slot
-        self._set(extras.alive, alive | 1 << slot)
+        self.set_column(extras.alive, alive | 1 << slot)
         self._acted()
-        self._spawned.append([entity, kind, world.thrown(kind, speed[2]), *at, *speed, 0, 0, 0, *values])
+        self._parts.spawned.append([entity, kind, world.thrown(kind, speed[2]), *at, *speed, 0, 0, 0, *values])
         return entity
 
     def remove(self, entity: int | None = None) -> None:
@@ -285,10 +308,11 @@ class Body:
         Raises:
             SceneError: the other entity does not belong to this one, or does not exist.
         """
+        self.changes = True
         if entity is None or entity == self.id:
-            self._removed.append(self.id)
+            self._parts.removed.append(self.id)
         elif self.owns(entity) and entity in self._world:
-            self._removed.append(entity)
+            self._parts.removed.append(entity)
         else:
             raise SceneError(f"entity = {shown(entity)}: is not one that entity {self.id} has spawned")
 
@@ -297,7 +321,7 @@ class Body:
 
         Only the latest call counts.
         """
-        self._set(self._extras.wakes_at, whole(tick, "tick", 0, WAKE_MAX))
+        self.set_column(self._extras.wakes_at, whole(tick, "tick", 0, WAKE_MAX))
 
     def announce(self, name: str, data: Any = None) -> None:
         """Sends a game event to all players who see the entity.
@@ -313,7 +337,7 @@ class Body:
             SceneError: the name is not valid.
             ValueError: the data is not valid.
         """
-        self._announced.append((text(name, "name", 32), pack_value(data)))
+        self._parts.announced.append((text(name, "name", 32), pack_value(data)))
         self._acted()
 
     # -- inside --------------------------------------------------------------------------------------------
@@ -331,20 +355,23 @@ class Body:
 
     def _changed(self) -> list[int]:
         """Returns the state to change."""
-        if self._new is None:
-            self._new = self._state[: layout.CELL]
-        return self._new
+        self.changes = True
+        if self._parts.state is None:
+            self._parts.state = self._state[: layout.CELL]
+        return self._parts.state
 
-    def _set(self, column: int, value: int) -> None:
+    def set_column(self, column: int, value: int) -> None:
+        """Sets an extra column."""
+        self.changes = True
         self._values[column] = value
-        self._mask |= 1 << column
+        self._parts.mask |= 1 << column
 
     def _acted(self) -> None:
         acts = self._extras.acts
-        self._set(acts, (self._values[acts] + 1) & 0xFFFF)
+        self.set_column(acts, (self._values[acts] + 1) & 0xFFFF)
 
     def _bit(self, button: str) -> int:
-        return self._world.scene.button(button)
+        return self._bits.get(button) or self._world.scene.button(button)
 
     def _found(self, box: list[int], template: str | None) -> list[Seen]:
         world = self._world

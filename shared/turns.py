@@ -10,7 +10,7 @@ over; all else changes after the last turn, so every turn reads the other entiti
 changes are not reported to the world's observer, because a replay of a recording takes the turns again.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -19,8 +19,8 @@ import numpy.typing as npt
 from shared.body import Body
 from shared.body_fields import body_class
 from shared.checks import SceneError
-from shared.inputs import Input
-from shared.layout import CELL, FALLING, FLAGS, ID, TEMPLATE, VX, Int64s
+from shared.inputs import NEUTRAL, Input, checked_input
+from shared.layout import BUTTONS, CELL, FALLING, FLAGS, ID, MOVE_X, MOVE_Y, TEMPLATE, VX, VY, VZ, Int64s
 
 if TYPE_CHECKING:
     from shared.world_turns import TurnWorld
@@ -46,6 +46,34 @@ class Announcement(NamedTuple):
     entity: int
     name: str
     payload: bytes
+
+
+class _Changes:
+    """The changes of the turns of one tick.
+
+    Args:
+        inputs: the inputs of the tick.
+    """
+
+    def __init__(self, inputs: Mapping[int, Input]) -> None:
+        self.inputs = inputs
+        self.steered: dict[int, Input] = {}
+        self.states: list[list[int]] = []
+        self.fields: list[tuple[int, int, int, list[int]]] = []
+        self.removed: list[int] = []
+
+
+def rests(state: list[int]) -> bool:
+    """Returns whether an entity neither moves nor falls, and its latest input was neutral."""
+    return not (
+        state[VX]
+        or state[VY]
+        or state[VZ]
+        or state[MOVE_X]
+        or state[MOVE_Y]
+        or state[BUTTONS]
+        or state[FLAGS] & FALLING
+    )
 
 
 class Turns:
@@ -86,72 +114,78 @@ class Turns:
 
     def take(self, inputs: Mapping[int, Input]) -> Mapping[int, Input]:
         """Takes the turns of the coming tick. Returns the inputs that the step uses."""
-        if self.announced or self.vanished:
-            self.announced, self.vanished = [], []
-        if self.steered:
-            self.steered = []
-        rows = self._found()
-        if len(rows) > FEW:
-            rows = rows[self._active(rows, inputs)]
-        if not len(rows):
-            return inputs
-        world, extras = self._world, self._world.extras
-        entities, more = world.entity_rows, world.extra_rows
-        tick, wakes = world.tick + 1, extras.wakes_at
-        used: dict[int, Input] | None = None
-        stored: list[list[int]] = []
-        removed: list[int] = []
-        fields: list[tuple[int, int, int, list[int]]] = []
-        for row, state, values in zip(rows.tolist(), entities[rows].tolist(), more[rows].tolist(), strict=True):
-            entity, due = state[ID], 0 < values[wakes] <= tick
+        if self.announced or self.vanished or self.steered:
+            self.announced, self.vanished, self.steered = [], [], []
+        world, bodies = self._world, self._bodies
+        aims, wakes, tick = world.extras.aims, world.extras.wakes_at, world.tick + 1
+        made = _Changes(inputs)
+        for row, state, values in self._candidates(inputs):
+            entity = state[ID]
+            due = 0 < values[wakes] <= tick
             input_ = inputs.get(entity)
-            if not (
-                due
-                or state[FLAGS] & FALLING
-                or any(state[VX:CELL])
-                or (input_ is not None and any(input_[:3]))
-                or (extras.aims and (any(values[:3]) or (input_ is not None and any(input_[3]))))
-            ):
+            if input_ is not None:
+                if type(input_) is not Input:
+                    input_ = checked_input(input_, f"inputs[{entity}]")
+                if not due and input_ == NEUTRAL and rests(state) and not (aims and any(values[:3])):
+                    continue
+            elif not due and rests(state) and not (aims and any(values[:3])):
                 continue
-            body = self._bodies[state[TEMPLATE]]
+            body = bodies[state[TEMPLATE]]
             assert body is not None
             body.begin(tick, state, values, input_)
             if due:
-                body._set(wakes, 0)
+                body.set_column(wakes, 0)
             try:
                 body.behaviour.turn(body)
             except Exception as error:
                 self._fail(tick, entity, body, error)
-                if not due:
-                    continue
-                body.clear()
-                body._values = values[:]
-                body._set(wakes, 0)
-            if body._steered is not None:
-                used = dict(inputs) if used is None else used
-                used[entity] = body._steered
-                self.steered.append(entity)
-            for edit in body._edits:
-                world.edit_silently(entity, edit)
-            if body._new is not None:
-                stored.append(body._new + body._values)
-            elif body._mask:
-                fields.append((row, entity, body._mask, body._values))
-            if body._spawned:
-                stored += body._spawned
-            removed += body._removed
-            for name, payload in body._announced:
-                self.announced.append(Announcement(entity, name, payload))
-        for row, entity, mask, values in fields:
-            more[row] = values
+                body.begin(tick, state, values, input_)
+                if due:
+                    body.set_column(wakes, 0)
+            if body.changes:
+                self._collect(made, row, body)
+        return self._apply(made)
+
+    def _candidates(self, inputs: Mapping[int, Input]) -> Iterable[tuple[int, list[int], list[int]]]:
+        """Returns row, state and extra columns of the entities that may be active, ascending by id."""
+        world, rows = self._world, self._found()
+        entities, more = world.entity_rows, world.extra_rows
+        if len(rows) <= FEW:
+            return [(row, entities[row].tolist(), more[row].tolist()) for row in rows.tolist()]
+        rows = rows[self._active(rows, inputs)]
+        return zip(rows.tolist(), entities[rows].tolist(), more[rows].tolist(), strict=True)
+
+    def _collect(self, made: "_Changes", row: int, body: Body) -> None:
+        """Collects the changes of a turn, and makes those of blocks."""
+        entity, parts = body.id, body.taken()
+        if parts.steered is not None:
+            made.steered[entity] = parts.steered
+        for edit in parts.edits:
+            self._world.edit_silently(entity, edit)
+        if parts.state is not None:
+            made.states.append(parts.state + parts.values)
+        elif parts.mask:
+            made.fields.append((row, entity, parts.mask, parts.values))
+        made.states += parts.spawned
+        made.removed += parts.removed
+        self.announced += [Announcement(entity, name, payload) for name, payload in parts.announced]
+
+    def _apply(self, made: "_Changes") -> Mapping[int, Input]:
+        """Makes the changes of all turns. Returns the inputs that the step uses."""
+        world = self._world
+        for row, entity, mask, values in made.fields:
+            world.extra_rows[row] = values
             world.note_fields(entity, mask)
-        if stored:
-            world.store_silently(np.array(stored, np.int64))
-        for entity in removed:
+        if made.states:
+            world.store_silently(np.array(made.states, np.int64))
+        for entity in made.removed:
             if entity in world:
                 world.remove_silently(entity)
                 self.vanished.append(entity)
-        return inputs if used is None else used
+        if not made.steered and not self.vanished:
+            return made.inputs
+        self.steered = list(made.steered)
+        return {entity: input_ for entity, input_ in {**made.inputs, **made.steered}.items() if entity in world}
 
     def take_failures(self) -> list[Failure]:
         """Returns the failed turns since the last call."""
@@ -161,10 +195,8 @@ class Turns:
     def _found(self) -> Int64s:
         """Returns the rows of the entities with behaviours, ascending by id."""
         if self.rows is None:
-            matrix = self._world.matrix
-            ids = matrix[:, ID]
-            rows = np.flatnonzero((ids != 0) & self._behaves[matrix[:, TEMPLATE]])
-            self.rows = rows[np.argsort(ids[rows])]
+            rows = self._world.ordered_rows()
+            self.rows = rows[self._behaves[self._world.entity_rows[rows, TEMPLATE]]]
         return self.rows
 
     def _active(self, rows: Int64s, inputs: Mapping[int, Input]) -> npt.NDArray[np.bool_]:
@@ -179,8 +211,7 @@ class Turns:
         if world.extras.aims:
             active |= (world.extra_rows[rows, :3] != 0).any(axis=1)
         if inputs:
-            given = [entity for entity, input_ in inputs.items() if any(input_[:3]) or any(input_[3:])]
-            active |= np.isin(states[:, ID], given)
+            active |= np.isin(states[:, ID], list(inputs))
         return active
 
     def _fail(self, tick: int, entity: int, body: Body, error: Exception) -> None:

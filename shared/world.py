@@ -357,12 +357,14 @@ class World(TurnWorld):
             MissingError: there is no entity of an id.
             SceneError: a value is not an `Input`.
         """
+        told = self._told_of(inputs) if inputs else []
         used = inputs
         if self.extras.count:
             used = self._with_turns(inputs or {})
+            if used is not inputs:
+                told = self._told_of(used)
         n = len(used) if used else 0
         if used:
-            told = self._told_of(used)
             if self.extras.aims:
                 self._write_aims(used)
             if len(told) > len(self._inputs):

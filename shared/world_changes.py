@@ -226,6 +226,7 @@ class UncheckedWorld(WorldState):
         if settled < n:
             for entity in ids[settled:]:
                 self._free.append(self._row_of.pop(entity))
+                self._ordered = None
             for entity in ids[:settled]:
                 self._take_out(entity)
             self._next_id = first
@@ -248,6 +249,7 @@ class UncheckedWorld(WorldState):
     def _take_out(self, entity: int) -> None:
         """Removes an entity without a report."""
         row = self._row_of.pop(entity)
+        self._ordered = None
         if self.turns is not None:
             self.turns.rows = None
         self._leave(row)
@@ -360,6 +362,7 @@ class UncheckedWorld(WorldState):
         self.placing, self.placed = set(other.placing), set(other.placed)
         self.tick, self._next_id, self._rows = other.tick, other._next_id, other._rows
         self._row_of, self._free, self._limbo = dict(other._row_of), list(other._free), list(other._limbo)
+        self._ordered, self._dense = other._ordered, other._dense
         n = self._rows
         self._entities[:n] = other._entities[:n]
         if self.extras.count:

@@ -55,6 +55,8 @@ class WorldState:
         self.extras = scene.extras
         """The extra columns of the scene's states."""
         self._row_of: dict[int, int] = {}
+        self._ordered: layout.Int64s | None = None  # rows, ascending by id; None: to be sorted
+        self._dense = False  # whether these rows are 0, 1, 2, ...
         self._next_id = 1
         self._rows = 0  # number of rows that were ever used
         self._free: list[int] = []
@@ -128,12 +130,23 @@ class WorldState:
 
     def _wide_states(self) -> layout.Int64s:
         """Returns the states of all entities with their extra columns, ascending by id."""
-        ids = self._entities[: self._rows, ID]
-        rows = np.flatnonzero(ids)
-        rows = rows[np.argsort(ids[rows])]
-        states = np.concatenate((self._entities[rows, :STATES], self._extra[rows]), axis=1)
+        rows = self.ordered_rows()
+        n = len(rows)
+        entities, extra = self._entities, self._extra
+        if not self._dense:
+            entities, extra = entities.take(rows, 0), extra.take(rows, 0)
+        states = np.empty((n, STATES + self.extras.count), np.int64)
+        states[:, :STATES] = entities[:n, :STATES]
+        states[:, STATES:] = extra[:n]
         states[:, FLAGS] &= FALLING
         return states
+
+    def ordered_rows(self) -> layout.Int64s:
+        """Returns the rows of all entities in memory, ascending by id. Do not write to the array."""
+        if self._ordered is None:
+            rows = [self._row_of[entity] for entity in sorted(self._row_of)]
+            self._ordered, self._dense = np.array(rows, np.int64), rows == list(range(len(rows)))
+        return self._ordered
 
     def state(self, entity: int) -> tuple[int, ...]:
         """Returns the state of one entity as 12 whole numbers (the columns of `layout.COLUMNS` before `cell`).
@@ -353,6 +366,7 @@ class WorldState:
             self._entities[row] = 0
             self._entities[row, layout.CELL] = -1
             self._row_of[entity] = row
+            self._ordered = None
             self._next_id = max(self._next_id, entity + 1)
         return row
 

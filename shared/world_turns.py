@@ -28,19 +28,16 @@ class TurnWorld(UncheckedWorld):
         """Takes the turns of behaviours before a step.
 
         Returns:
-            The inputs of the step: as `Input`, and without entities that the turns have removed.
-
-        Raises:
-            MissingError, SceneError: as for `World.step`; then no turn was taken.
+            The inputs of the step: as `Input` with aims of their length in a scene with an aim, and without entities
+            that the turns have removed.
         """
-        used = inputs if all(map(_is_used, inputs.values())) else _inputs(inputs)
+        used, turns = inputs, self.turns
+        if self.extras.aims and not all(map(_is_used, inputs.values())):
+            used = _inputs(inputs)
         if self.scene.behaviours:
-            self._told_of(used)  # checks them
-            if self.turns is None:
-                self.turns = Turns(self)
-            used = self.turns.take(used)
-            if self.turns.vanished:
-                used = {entity: input_ for entity, input_ in used.items() if entity in self._row_of}
+            if turns is None:
+                turns = self.turns = Turns(self)
+            used = turns.take(used)
         return used
 
     def _write_aims(self, inputs: Mapping[int, Input]) -> None:

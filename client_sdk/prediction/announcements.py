@@ -34,7 +34,8 @@ class Announcements:
 
     def __init__(self, rate: int) -> None:
         self._shift = round(SHIFT_S * rate)
-        self._pending: list[Pending] = []
+        self.pending: list[Pending] = []
+        """Announcements that are not final yet."""
         self._before: list[Pending] | None = None
         """Announcements of the prediction that a replay replaces; None: there is no replay."""
         self._count = 0
@@ -43,8 +44,8 @@ class Announcements:
 
     def confirm(self, tick: int) -> None:
         """Notes that the prediction up to a tick was right."""
-        if self._pending:
-            self._pending = [each for each in self._pending if each.tick > tick]
+        if self.pending:
+            self.pending = [each for each in self.pending if each.tick > tick]
 
     def begin(self, tick: int, final: bool) -> None:
         """Begins a replay of the ticks after `tick`.
@@ -55,7 +56,7 @@ class Announcements:
         """
         if final:
             self.confirm(tick)
-        self._before, self._pending = self._pending, []
+        self._before, self.pending = self.pending, []
 
     def end(self) -> None:
         """Ends a replay: withdraws the events that it has not announced again."""
@@ -71,7 +72,7 @@ class Announcements:
             number = self._count
             data = unpack_value(event.payload)
             self.events.append(Announced(tick, event.entity, event.name, data, number))
-        self._pending.append(Pending(tick, number, event))
+        self.pending.append(Pending(tick, number, event))
 
     def take(self) -> list[Announced | Withdrawn]:
         """Returns the events since the last call."""

@@ -278,7 +278,8 @@ class Prediction:
     def _replay(self, to: int) -> None:
         tick = self.confirmed.tick
         guess = self._states.get(tick)
-        self.announcements.begin(tick, final=guess is None or self._acts(guess) == self._acts(self._truth()))
+        final = guess is None or not self.announcements.pending or self._acts(guess) == self._acts(self._truth())
+        self.announcements.begin(tick, final)
         self.predicted.restore(self.confirmed)
         self.known.terrain_changed = self.known.edited_near = self._refused = False
         if not self.neighbours:
