@@ -239,7 +239,17 @@ def prepared(rules: Rules, scene: Scene) -> Scene:
         raise RulesError(f"{name} failed ({type(error).__name__}: {error})") from error
     if not isinstance(made, Scene):
         raise RulesError(f"{name} returned {shown(made)}: it must return the scene to play in")
-    return made.with_behaviours(rules.behaviours)
+    return equipped(made, rules)
+
+
+def equipped(scene: Scene, rules: Rules) -> Scene:
+    """Returns a scene with the behaviours of rules, as far as it does not have them.
+
+    Raises:
+        SceneError: a behaviour is not valid.
+    """
+    there = {entry.code for entry in scene.behaviours}
+    return scene.with_behaviours(each for each in rules.behaviours if each not in there)
 
 
 ASYNC = (inspect.iscoroutinefunction, inspect.isasyncgenfunction)

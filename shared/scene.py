@@ -319,7 +319,7 @@ class Scene:
         Raises:
             SceneError: a class or one of its values is not valid, or two behaviours have one template or name.
         """
-        added = tuple(entry_of(each) for each in classes)
+        added = tuple(map(entry_of, classes))
         return replace(self, behaviours=(*self.behaviours, *added)) if added else self
 
     def bound(self, classes: Iterable[object]) -> "Scene":

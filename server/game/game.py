@@ -26,7 +26,7 @@ from server.players.player import Player
 from server.replication.client_stream import Transport
 from server.replication.sender import Sender
 from server.rewind import Rewind
-from server.rules import Rules, checked_function
+from server.rules import Rules, checked_function, equipped
 from shared import messages
 from shared.checks import SceneError, shown, whole
 from shared.inputs import Input
@@ -82,6 +82,8 @@ class Game:
         for value, at, kind in ((scene, "scene", Scene), (limits, "limits", Limits), (world, "world", RecordedWorld)):
             if not isinstance(value, kind) and (value is not None or kind is Scene):
                 raise SceneError(f"{at} = {shown(value)}: must be a `{kind.__name__}`")
+        if isinstance(rules, Rules):
+            scene = equipped(scene, rules)
         if world is not None and world.scene.fingerprint != scene.fingerprint:
             raise SceneError(f"world: is one of {world.scene!r}, and not of {scene!r}")
         if authenticate is not None:

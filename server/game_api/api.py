@@ -15,7 +15,7 @@ from server.game_api.input_api import InputApi
 from server.game_api.outgoing import Outgoing
 from server.game_api.shared_values import SharedValues
 from server.game_api.turn import Turn
-from server.game_api.turns import TurnResults
+from server.game_api.turn_results import TurnResults
 from server.journal.recorded_world import RecordedWorld
 from server.observability.counters import Counters
 from server.players.persisted_state import LEFT, PersistedState

@@ -17,6 +17,8 @@ import pytest
 from client_sdk import Loopback
 from client_sdk.bots import Follow, Wander
 from client_sdk.core import Core
+from client_sdk.events import Announced, BehaviourFailed, Corrected, Withdrawn
+from client_sdk.netsim.links import PRESETS
 from server.game import Game
 from shared.inputs import make_input
 from shared.scene import Scene, Template, load_scene
@@ -29,7 +31,7 @@ from tests.readme.run_snippet import LOOPS
 ENGINES = ["pygame-ce", "pyglet", "arcade", "Panda3D", "ursina"]
 ON_A_SERVER = ["asyncio", "A bot"]
 WAITS = "Threads, timers and asyncio"
-ALONE = ["A game", "Without a socket", "Testing it", "Agents that learn", WAITS, "Buttons and aim"]
+ALONE = ["A game", "Without a socket", "Testing it", "Agents that learn", WAITS, "Buttons and aim", "Behaviours"]
 A_FILE = "Your own game"
 
 
@@ -87,6 +89,27 @@ def test_buttons_and_aim() -> None:
     assert east == pytest.approx(20 / 1.25**0.5, abs=0.01)
     assert north == 0
     assert match.game.counters.rules_failed == player.core.stats.divergences == 0
+
+
+def test_behaviours() -> None:
+    """The dash and the ball are in the prediction at once; the server confirms both, and the ball by its number."""
+    rules = alone("Behaviours")["Dash"]()
+    match = Match(load_scene(rules.scene), seed=1, rules=rules)
+    player = match.join(lambda core, _: core.input, PRESETS["typical"])
+    match.run(4)
+    player.core.set_input(make_input(1, 0), {"dash": True, "fire": True})
+    match.run(1.5 / match.game.scene.tick_rate)
+    assert [event.name for event in player.events if isinstance(event, Announced)] == ["dash"]
+    me = player.core.entity
+    assert player.core.prediction is not None
+    (ball,) = player.core.prediction.spawned()
+    assert ball not in match.game.world
+    match.run(0.3)
+    assert match.game.api.entities("ball") == [ball]
+    assert match.game.api.field(me, "stamina") == 80
+    match.run(3)
+    assert match.game.api.entities("ball") == []
+    assert not [event for event in player.events if isinstance(event, Corrected | Withdrawn | BehaviourFailed)]
 
 
 def test_single_player() -> None:
