@@ -62,8 +62,8 @@ def mypy() -> tuple[Step, str]:
 
 
 def together(markers: str, profile: str) -> Step:
-    """Runs tests two at a time."""
-    return run("tests", *pytest(markers, "not alone", profile), "-n", "2", "--dist", "worksteal")
+    """Runs tests three at a time, because many of them wait: two cores are busy all the time then."""
+    return run("tests", *pytest(markers, "not alone", profile), "-n", "3", "--dist", "worksteal")
 
 
 def alone(markers: str, profile: str) -> Step:
