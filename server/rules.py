@@ -19,7 +19,7 @@ does not.
 import importlib
 import inspect
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -49,6 +49,10 @@ class Rules:
     behaviours: Sequence[type[Behaviour]] = ()
     """The behaviours of the game (`shared.behaviours`). Clients pass the same classes to `Client.connect`."""
 
+    keys: Mapping[str, str] = {}
+    """Keys of the window of `sovereign-play`, by button: names as pygame has them, like "left shift", or "left mouse",
+    "right mouse". A button without one gets one of the window's own choice."""
+
     game: "GameApi"
     """The game API of the running game. Not available in `__init__` and `prepare`."""
 
@@ -66,6 +70,14 @@ class Rules:
             scene: the scene that the operator or `Rules.scene` names; `Scene.with_template` adds a template to it.
         """
         return scene
+
+    def bot_policy(self, random: Any) -> Any:
+        """Returns the policy of a bot of this game (`client_sdk.bots.Policy`); None: it wanders.
+
+        Args:
+            random: the source of all chance of the bot.
+        """
+        return None
 
     def on_start(self) -> None:
         """Called once, when the world exists and no player has joined. Not called when a saved game is restored."""

@@ -111,6 +111,9 @@ class Behaviour:
     its fields."""
     spawns = 0
     """Number of entities that an entity of the behaviour may have spawned (`Body.spawn`) at the same time, 0 to 32."""
+    always = False
+    """Whether an entity has a turn in every tick, also while it stands still without an input: to notice what touches
+    it, for example. It costs time for each entity, and no bytes."""
 
     def turn(self, me: "Body") -> None:
         """Is called once per tick and active entity, before the step."""
@@ -208,6 +211,7 @@ def entry_of(code: object) -> BehaviourEntry:
     templates: object = code.templates
     if isinstance(templates, str) or not isinstance(templates, Iterable):
         raise SceneError(f"behaviours.{name}.templates = {shown(templates)}: must be a tuple of names of templates")
+    boolean(code.always, f"behaviours.{name}.always")
     fields = fields_of(code)
     return BehaviourEntry(name, tuple(templates), fields, code.spawns, digest_of(code, fields), code)
 

@@ -199,6 +199,14 @@ class Body:
         """Returns the kind of a block, 0 for air; None if its segment is not loaded."""
         return self._world.block(x, y, z)
 
+    def kind(self, name: str) -> int:
+        """Returns the number of a named kind of blocks of the scene, for `block` and `edit`.
+
+        Raises:
+            SceneError: there is no such kind.
+        """
+        return self._world.scene.kind(name)
+
     def near(self, distance: float, template: str | None = None) -> list[Seen]:
         """Returns the other entities around this one, ascending by number.
 

@@ -35,6 +35,8 @@ def _attribute(declared: Field, column: int) -> property:
     def put(self: Body, value: object) -> None:
         if type(value) is not int or not low <= value <= high:
             value = declared.checked(value)
+        if value == self._values[column]:
+            return
         self.changes = True
         self._values[column] = value
         self._parts.mask |= bit

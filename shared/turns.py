@@ -1,9 +1,9 @@
 """The turns of behaviours: what happens at the start of a step, in scenes with behaviours.
 
 Theory of operation. An entity has a turn if it is *active*: its template has a behaviour, and it moves or falls, or its
-input of this tick or of the tick before is not neutral, or it has asked for a turn by now (`Body.wake`). This follows
-from its state and its input alone, so server and clients agree about it; whether the kernel has put an entity to sleep
-does not matter. An entity that rests costs a share of one comparison of an array.
+input of this tick or of the tick before is not neutral, or it has asked for a turn by now (`Body.wake`), or its
+behaviour has `always`. This follows from its state and its input alone, so server and clients agree about it; whether
+the kernel has put an entity to sleep does not matter. An entity that rests costs a share of one comparison of an array.
 
 Turns are taken in ascending order of id. A turn collects its changes in its body. Blocks change as soon as the turn is
 over; all else changes after the last turn, so every turn reads the other entities as they were before the first. The
@@ -101,6 +101,8 @@ class Turns:
             made.append(body)
         self._bodies = [made[k] if k >= 0 else None for k in extras.behaviour_of.tolist()]
         self._behaves = extras.behaviour_of >= 0
+        self._always = np.array([body is not None and body.behaviour.always for body in self._bodies], np.bool_)
+        """For each template, whether its entities have turns in every tick."""
         self.rows: Int64s | None = None
         """Rows of the entities with behaviours, ascending by id; None: to be looked up."""
         self.announced: list[Announcement] = []
@@ -118,17 +120,18 @@ class Turns:
             self.announced, self.vanished, self.steered = [], [], []
         world, bodies = self._world, self._bodies
         aims, wakes, tick = world.extras.aims, world.extras.wakes_at, world.tick + 1
-        made = _Changes(inputs)
+        made, always = _Changes(inputs), self._always.tolist()
         for row, state, values in self._candidates(inputs):
             entity = state[ID]
             due = 0 < values[wakes] <= tick
+            awake = due or always[state[TEMPLATE]]
             input_ = inputs.get(entity)
             if input_ is not None:
                 if type(input_) is not Input:
                     input_ = checked_input(input_, f"inputs[{entity}]")
-                if not due and input_ == NEUTRAL and rests(state) and not (aims and any(values[:3])):
+                if not awake and input_ == NEUTRAL and rests(state) and not (aims and any(values[:3])):
                     continue
-            elif not due and rests(state) and not (aims and any(values[:3])):
+            elif not awake and rests(state) and not (aims and any(values[:3])):
                 continue
             body = bodies[state[TEMPLATE]]
             assert body is not None
@@ -207,6 +210,7 @@ class Turns:
             (states[:, VX:CELL] != 0).any(axis=1)
             | (states[:, FLAGS] & FALLING != 0)
             | ((wakes > 0) & (wakes <= world.tick + 1))
+            | self._always[states[:, TEMPLATE]]
         )
         if world.extras.aims:
             active |= (world.extra_rows[rows, :3] != 0).any(axis=1)
