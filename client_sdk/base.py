@@ -4,7 +4,9 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, cast
 
 from client_sdk.core import Core
+from client_sdk.drawn import Drawn
 from client_sdk.stats import Stats
+from client_sdk.view import View
 from shared.buttons import Names
 from shared.inputs import make_input
 
@@ -162,6 +164,20 @@ class BaseClient:
         number = self.core.command(name, data)
         self._filed()
         return number
+
+    def drawn(self, view: View) -> Drawn:
+        """Returns the other entities of a view and the blocks, for rays and boxes: a hit that is judged ahead.
+
+        A program shows the hit as a guess, and sends the shot as a command. The rules judge it by `game.rewound`, and
+        `Answered` with the number of the command brings their word.
+
+        Raises:
+            RuntimeError: the client has not joined.
+        """
+        prediction, scene = self.core.prediction, self.core.scene
+        if prediction is None or scene is None:
+            raise RuntimeError("drawn: the client has not joined")
+        return Drawn(view, scene, prediction)
 
     def _filed(self) -> None:
         """Called after a command has been filed, for a client that sends it at once; others send with `update`."""

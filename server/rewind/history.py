@@ -15,39 +15,26 @@ its former position. A client that was not sent every tick interpolates between 
 
 import math
 from collections import deque
-from collections.abc import Collection, Iterable, Sequence
-from fractions import Fraction
-from typing import Any, NamedTuple
+from collections.abc import Iterable
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
-from server.rewind.rays import Ray
 from shared import layout
 from shared.between import between
-from shared.checks import Cell, Vec, finite, vector
+from shared.checks import Cell, Vec, finite
+from shared.hits import Hit as Hit
+from shared.hits import Targets, boxes_of
 from shared.layout import ID, TEMPLATE, Int64s, X
-from shared.scene import Scene
-from shared.units import BLOCK, SEGMENT_SHIFT
+from shared.units import SEGMENT_SHIFT
 from shared.world import World
 
 WINDOW_S = 0.5
 """Seconds that a query can look back by default."""
 KEPT = [ID, TEMPLATE, X, X + 1, X + 2]
 """Columns of a row that are kept."""
-MARGIN = 1e-3
-"""Blocks by which boxes are enlarged in the quick test in floats. Boxes that pass it are tested exactly."""
-
 Floats = npt.NDArray[np.float64]
-
-
-class Hit(NamedTuple):
-    """A hit of a ray: an entity or a block (the other is None), its distance and the point, in blocks."""
-
-    entity: int | None
-    block: Cell | None
-    distance: float
-    point: Vec
 
 
 class _Undo(NamedTuple):
@@ -76,7 +63,7 @@ class Rewind:
         self._undo: deque[_Undo] = deque()
         self._placed_at = -math.inf
         """Newest tick in which an entity was placed."""
-        self._boxes = _boxes(world.scene)
+        self._boxes = boxes_of(world.scene)
         self._tick = -1
         self._alive = 0
         self._now = np.zeros((0, len(KEPT)), np.int64)
@@ -152,8 +139,8 @@ class Rewind:
         self._alive = len(self._world)
 
 
-class Past:
-    """The world at one moment of the recent past. Valid until the next tick.
+class Past(Targets):
+    """The world at one moment of the recent past, with its queries. Valid until the next tick.
 
     Attributes:
         seen: the moment, in ticks of server time, after it was limited to what is kept.
@@ -169,15 +156,12 @@ class Past:
         own: int,
     ) -> None:
         self.seen = seen
-        states, self._places = entities
-        self._ids: Int64s = states[:, 0]
+        states, places = entities
         box = boxes[states[:, 1]]
-        self._low = self._places + box[:, 0]
-        self._high = self._low + box[:, 1]
-        self._world = world
-        self._blocks = blocks
+        low = places + box[:, 0]
+        super().__init__(states[:, 0], low, low + box[:, 1], own)
+        self._places, self._world, self._blocks = places, world, blocks
         self._floor = world.scene.origin[2] << SEGMENT_SHIFT
-        self._own = own
 
     def __contains__(self, entity: int) -> bool:
         return bool((self._ids == entity).any())
@@ -202,61 +186,9 @@ class Past:
         kind = self._blocks.get((x, y, z))
         return self._world.blocks.get(x, y, z) if kind is None else kind
 
-    def ray(
-        self, origin: Sequence[float], direction: Sequence[float], length: float, but: Collection[int] = ()
-    ) -> list[Hit]:
-        """Returns the hits of a ray, nearest first. It ends at the first solid block, or at a place that is not loaded.
-
-        Args:
-            origin: start of the ray in blocks.
-            direction: direction of the ray, of any length except zero.
-            length: length of the ray in blocks, at most 1024.
-            but: entities to ignore, besides the player's own.
-
-        Raises:
-            SceneError: a number is not finite or out of range, or the direction is zero.
-        """
-        ray = Ray(origin, direction, length)
-        wall = ray.meets(self._solid)
-        met: list[tuple[Fraction, int]] = []
-        for i in self._near(ray).tolist():
-            entity = int(self._ids[i])
-            if entity == self._own or entity in but:
-                continue
-            t = ray.enters(self._low[i].tolist(), self._high[i].tolist())
-            if t is not None and (wall is None or t <= wall[1]):
-                met.append((t, entity))
-        hits = [Hit(entity, None, ray.distance(t), ray.point(t)) for t, entity in sorted(met)]
-        if wall is not None:
-            hits.append(Hit(None, wall[0], ray.distance(wall[1]), ray.point(wall[1])))
-        return hits
-
-    def box(self, low: Sequence[float], high: Sequence[float]) -> list[int]:
-        """Returns the entities that overlap the box between two corners (in blocks), in ascending order.
-
-        Raises:
-            SceneError: a number is not finite.
-        """
-        hits = (self._low < np.array(vector(high, "high"))).all(axis=1)
-        hits &= (self._high > np.array(vector(low, "low"))).all(axis=1)
-        return sorted(entity for entity in self._ids[hits].tolist() if entity != self._own)
-
-    def _solid(self, cell: Cell) -> bool:
+    def solid(self, cell: Cell) -> bool:
         kind = self.block(*cell)
         return cell[2] >= self._floor if kind is None else self._world.blocks.stops[kind]
-
-    def _near(self, ray: Ray) -> Int64s:
-        """Returns the indices of the entities that the ray may hit, by the slab test in floats with a margin."""
-        largest = max(map(abs, ray.direction))
-        origin, way = np.array(ray.origin), np.array(ray.direction) / largest
-        low, high = self._low - origin - MARGIN, self._high - origin + MARGIN
-        steep = np.abs(way) > 1e-12
-        inside = ((low <= 0) & (high >= 0)).all(axis=1, where=~steep)
-        ends_low, ends_high = low[:, steep] / way[steep], high[:, steep] / way[steep]
-        first = np.minimum(ends_low, ends_high).max(axis=1)
-        last = np.maximum(ends_low, ends_high).min(axis=1)
-        reach = ray.length + 2 * MARGIN
-        return np.flatnonzero(inside & (first <= last) & (last >= -MARGIN) & (first <= reach))
 
 
 def _between(old: Int64s, new: Int64s, share: float, placed: set[int]) -> tuple[Int64s, Floats]:
@@ -275,9 +207,3 @@ def _between(old: Int64s, new: Int64s, share: float, placed: set[int]) -> tuple[
     places = between(ids, old[:, 2:], new[:, 2:], ids == new[:, 0], placed, share)
     there = ids != 0
     return old[there], places[there]
-
-
-def _boxes(scene: Scene) -> Any:
-    """Returns low corner (relative to the position) and sides of the box of each template, [n, 2, 3], in blocks."""
-    rows = scene.kernel_tables()[0][:, layout.LO_X : layout.LO_X + 6]
-    return rows.reshape(-1, 2, 3) / BLOCK

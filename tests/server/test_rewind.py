@@ -16,11 +16,11 @@ from server.config.limits import Limits
 from server.game import Game
 from server.rewind import Rewind
 from server.rewind.history import WINDOW_S, Hit, Past
-from server.rewind.rays import Ray
 from shared.block_kind import BlockKind
 from shared.checks import Cell, SceneError, Vec
 from shared.inputs import Input
 from shared.layout import Int64s
+from shared.rays import Ray
 from shared.scene import load_scene
 from shared.world import World
 from sovereign_netcode.playtest import Link, Match, Player
