@@ -4,6 +4,7 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, cast
 
 from client_sdk.core import Core
+from client_sdk.diagnosis import Diagnosis, Use, diagnosis
 from client_sdk.drawn import Drawn
 from client_sdk.stats import Stats
 from client_sdk.view import View
@@ -164,6 +165,15 @@ class BaseClient:
         number = self.core.command(name, data)
         self._filed()
         return number
+
+    def diagnosis(self) -> Diagnosis:
+        """Returns a verdict on the prediction in plain words, what to do about it, and warnings of wrong use.
+
+        It is meant for developers; the panel of `scripts/play` (F3) shows it.
+        """
+        core, scene = self.core, self.core.scene
+        use = Use(core.waiting, core.stats.played_s, core.controls.used, bool(scene and scene.behaviours))
+        return diagnosis(core.stats, use)
 
     def drawn(self, view: View) -> Drawn:
         """Returns the other entities of a view and the blocks, for rays and boxes: a hit that is judged ahead.

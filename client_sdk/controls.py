@@ -16,6 +16,8 @@ class Controls:
     def __init__(self) -> None:
         self.held = NEUTRAL
         """The input that was set most recently."""
+        self.used = False
+        """Whether an input was ever set."""
         self.delay = 0
         """Input delay in ticks, 0 to 3: inputs are filed this far ahead of the predicted world."""
         self._pressed = 0
@@ -34,6 +36,7 @@ class Controls:
         Raises:
             SceneError: the scene has no such button, or no aim.
         """
+        self.used = True
         named = held_names(names) if names != () else ()
         if scene is not None and (named or input_.aim != NO_AIM):
             scene.check_aim(input_.aim)

@@ -131,6 +131,11 @@ class Core:
         return play.timeline if play else None
 
     @property
+    def waiting(self) -> int:
+        """The number of events that the program has not taken."""
+        return len(self._events)
+
+    @property
     def connected(self) -> bool:
         """Whether there is a connection, as far as the core knows."""
         return self._open

@@ -30,6 +30,14 @@ class _Mark(NamedTuple):
     corrections_by_cause: dict[str, int]
 
 
+class CorrectionTime(NamedTuple):
+    """A correction on a time line: when it was made (seconds of the program's clock), its cause, its size in blocks."""
+
+    at: float
+    cause: str
+    blocks: float
+
+
 @dataclass
 class Stats:
     """Counters since the start, and current measurements. Lengths in blocks, times in seconds."""
@@ -79,9 +87,19 @@ class Stats:
     kernel: str = ""
     """Form of the kernel that computes the physics: `prebuilt`, `numba` or `plain` (`shared.kernels`), or `plain for
     now` while Numba compiles; empty before there is a world."""
+    correction_times: deque[CorrectionTime] = field(default_factory=lambda: deque(maxlen=CORRECTIONS_KEPT), repr=False)
+    """The newest corrections with their times, oldest first, for a time line."""
+    measured_at: float = 0.0
+    """Time of the latest measurement (`measure`), in seconds of the program's clock."""
+    _began_at: float | None = field(default=None, repr=False)
     _marks: deque[_Mark] = field(default_factory=deque, repr=False)
     """Counters at one time per second, for the last `CORRECTIONS_S` seconds, oldest first."""
     _round_trips: deque[float] = field(default_factory=lambda: deque(maxlen=ROUND_TRIPS), repr=False)
+
+    @property
+    def played_s(self) -> float:
+        """The time since the player joined, in seconds."""
+        return 0.0 if self._began_at is None else self.measured_at - self._began_at
 
     @property
     def late_share(self) -> float:
@@ -111,6 +129,7 @@ class Stats:
         self.corrections_by_cause[correction.cause] = self.corrections_by_cause.get(correction.cause, 0) + 1
         self.correction_blocks.append(correction.blocks)
         del self.correction_blocks[:-CORRECTIONS_KEPT]
+        self.correction_times.append(CorrectionTime(self.measured_at, correction.cause, correction.blocks))
 
     def pinged(self, round_trip_s: float) -> None:
         """Adds a measured round trip, in seconds."""
@@ -119,6 +138,9 @@ class Stats:
 
     def measure(self, now: float) -> None:
         """Measures the rates and keeps the counters, at most once per second. May be called more often."""
+        self.measured_at = now
+        if self._began_at is None:
+            self._began_at = now
         marks = self._marks
         if marks and now - marks[-1].at < RATE_S:
             return
