@@ -25,7 +25,7 @@ from typing import TYPE_CHECKING, Any
 
 from server.config.options import nearest
 from server.players.player import Player
-from shared.behaviours import Behaviour
+from shared.behaviours import Behaviour, checked_classes
 from shared.checks import SceneError, shown
 from shared.scene import Scene
 
@@ -258,10 +258,13 @@ def equipped(scene: Scene, rules: Rules) -> Scene:
     """Returns a scene with the behaviours of rules, as far as it does not have them.
 
     Raises:
-        SceneError: a behaviour is not valid.
+        RulesError: a behaviour is not valid.
     """
     there = {entry.code for entry in scene.behaviours}
-    return scene.with_behaviours(each for each in rules.behaviours if each not in there)
+    try:
+        return scene.with_behaviours([each for each in checked_classes(rules.behaviours) if each not in there])
+    except SceneError as error:
+        raise RulesError(f"{type(rules).__qualname__}.{error}") from error
 
 
 ASYNC = (inspect.iscoroutinefunction, inspect.isasyncgenfunction)

@@ -213,7 +213,32 @@ def entry_of(code: object) -> BehaviourEntry:
         raise SceneError(f"behaviours.{name}.templates = {shown(templates)}: must be a tuple of names of templates")
     boolean(code.always, f"behaviours.{name}.always")
     fields = fields_of(code)
+    taken = next((each.name for each in fields if each.name.startswith("_") or hasattr(_body(), each.name)), None)
+    if taken is not None:
+        raise SceneError(f"behaviours.{name}.{taken}: this name is taken; use another one")
     return BehaviourEntry(name, tuple(templates), fields, code.spawns, digest_of(code, fields), code)
+
+
+def _body() -> "type[Body]":
+    """Returns the class of the bodies, which reads this module itself."""
+    from shared.body import Body
+
+    return Body
+
+
+def entries_of(classes: object) -> tuple[BehaviourEntry, ...]:
+    """Returns the entries of several classes of behaviours.
+
+    Raises:
+        SceneError: `classes` is not a list of classes of behaviours, or two have the same name.
+    """
+    if isinstance(classes, type | str) or not isinstance(classes, Iterable):
+        raise SceneError(f"behaviours = {shown(classes)}: must be a list of subclasses of `Behaviour`")
+    found = tuple(map(entry_of, classes))
+    names = [entry.name for entry in found]
+    if len(set(names)) < len(names):
+        raise SceneError(f"behaviours: two have the same name ({', '.join(names)})")
+    return found
 
 
 def fields_of(code: type[Behaviour]) -> tuple[Field, ...]:
@@ -236,13 +261,13 @@ def digest_of(code: type[Behaviour], fields: Iterable[Field]) -> str:
     return digest.hexdigest()
 
 
-def checked_classes(classes: Iterable[object]) -> tuple[type[Behaviour], ...]:
+def checked_classes(classes: object) -> tuple[type[Behaviour], ...]:
     """Returns the classes of behaviours that a program has passed.
 
     Raises:
         SceneError: one of them is not valid.
     """
-    found = [entry_of(each).code for each in classes]
+    found = [entry.code for entry in entries_of(classes)]
     return tuple(each for each in found if each is not None)
 
 
@@ -253,7 +278,7 @@ def bound(entries: Iterable[BehaviourEntry], classes: Iterable[object]) -> tuple
         BehaviourError: a class is missing, or differs from the one that the scene names; the message names it.
         SceneError: a class is not valid.
     """
-    mine = {each.name: each for each in map(entry_of, classes)}
+    mine = {each.name: each for each in entries_of(classes)}
     found = []
     for entry in entries:
         own = mine.get(entry.name)

@@ -65,6 +65,10 @@ class Body:
         tick: number of the tick that is about to be computed.
     """
 
+    __slots__ = (
+        "_before", "_bits", "_drawn", "_extras", "_held", "_input", "_parts", "_state", "_values", "_world",
+        "behaviour", "changes", "entry", "id", "tick",
+    )  # fmt: skip
     behaviour: Behaviour
     entry: BehaviourEntry
     id: int
@@ -259,6 +263,7 @@ class Body:
         self._changed()[TEMPLATE] = kind
         if extras.behaviour_of[before] != extras.behaviour_of[kind]:
             self._values[extras.first :] = extras.starts[kind, extras.first :].tolist()
+            self._values[extras.wakes_at] = int(extras.new[kind, extras.wakes_at])
         return True
 
     def edit(self, x: int, y: int, z: int, kind: int) -> bool:
@@ -291,9 +296,13 @@ class Body:
         if not self.entry.spawns:
             raise SceneError(f"spawn: {self.entry.name}.spawns is 0; set it to the number of entities at a time")
         if not alive & RESERVED:
-            raise SceneError("spawn: the entity began with a template whose behaviour has no `spawns`")
+            raise SceneError(
+                "spawn: no numbers are reserved for this entity: it began with a template whose behaviour has no "
+                "`spawns`, or another entity has spawned it"
+            )
         speed = [to_velocity(v, f"velocity.{a}") for a, v in zip("xyz", vector(velocity, "velocity"), strict=True)]
-        values = extras.starts[kind].tolist()
+        values = extras.new[kind].tolist()
+        values[extras.alive] = 0  # the numbers after its own belong to this entity
         for name, value in fields.items():
             k, declared = world.field_column(kind, name)
             values[k] = declared.checked(value)
@@ -314,10 +323,12 @@ class Body:
         """Removes this entity, or one that it has spawned (`owns`), after all turns of the tick.
 
         Raises:
-            SceneError: the other entity does not belong to this one, or does not exist.
+            SceneError: the other entity does not belong to this one, or does not exist; or this one is a player's.
         """
         self.changes = True
         if entity is None or entity == self.id:
+            if self._world.scene.player in self.entry.templates:
+                raise SceneError(f"remove: entity {self.id} is a player's; only the game's rules can end a player")
             self._parts.removed.append(self.id)
         elif self.owns(entity) and entity in self._world:
             self._parts.removed.append(entity)

@@ -4,7 +4,6 @@ from typing import Any
 
 from shared.behaviours import BehaviourEntry, Field
 from shared.body import Body
-from shared.checks import SceneError
 
 
 def body_class(entry: BehaviourEntry, first: int) -> type[Body]:
@@ -13,14 +12,9 @@ def body_class(entry: BehaviourEntry, first: int) -> type[Body]:
     Args:
         entry: the behaviour.
         first: place of its first field among the extra columns.
-
-    Raises:
-        SceneError: a field has the name of something that each body has.
     """
-    names: dict[str, Any] = {}
+    names: dict[str, Any] = {"__slots__": ()}  # so that a turn that sets any other name fails
     for k, each in enumerate(entry.fields):
-        if hasattr(Body, each.name) or each.name in ("id", "tick", "behaviour", "entry") or each.name.startswith("_"):
-            raise SceneError(f"behaviours.{entry.name}.{each.name}: this name is taken; use another one")
         names[each.name] = _attribute(each, first + k)
     return type(f"{entry.name}Body", (Body,), names)
 

@@ -36,6 +36,8 @@ AIM_PART = 1 << 15
 """Bound of a part of an aim: from -AIM_PART to AIM_PART - 1."""
 HIDDEN_BITS = (32, 16, 40)
 """Sizes of the hidden columns, in bits."""
+AT_ONCE = 1
+"""Value of `wakes_at` that asks for a turn at the next tick."""
 RESERVED = 1 << 32
 """Bit of `alive`: numbers are reserved for what the entity spawns."""
 
@@ -86,7 +88,7 @@ class Extras:
         self.mask_bytes = -(-self.count // 8)
         n = len(scene.templates)
         self.starts = np.zeros((n, self.count), np.int64)
-        """Values of a new entity, [templates, count]."""
+        """Values of an entity of which nothing else is known, [templates, count]."""
         self.behaviour_of = np.full(n, -1, np.int64)
         """Number of each template's behaviour in the scene; -1: none."""
         self.blocks = [0] * n
@@ -103,6 +105,10 @@ class Extras:
                     self.blocks[kind] = self.spawns
                     self.starts[kind, self.alive] = RESERVED
                 self.starts[kind, self.first : self.first + len(entry.fields)] = [f.start for f in entry.fields]
+        self.new = self.starts.copy()
+        """Values of a new entity, [templates, count]: `starts`, but an entity with a behaviour has a turn at once."""
+        if behaviours:
+            self.new[self.behaviour_of >= 0, self.wakes_at] = AT_ONCE
 
     def widened(self, states: Int64s) -> Int64s:
         """Returns states with all columns; those with 12 columns get the start values of their templates."""

@@ -17,7 +17,7 @@ import numpy as np
 from shared import behaviours as behaviour_classes
 from shared import layout
 from shared.aim import NO_AIM, Aim
-from shared.behaviours import BehaviourEntry, checked_entries, entry_of
+from shared.behaviours import BehaviourEntry, checked_entries, entries_of
 from shared.block_kind import BlockKind, numbered, numbered_fill
 from shared.bounds import TICK_RATE_MAX
 from shared.buttons import DEFAULT_BUTTONS, Names, bits_of, checked_buttons, held_names
@@ -319,7 +319,7 @@ class Scene:
         Raises:
             SceneError: a class or one of its values is not valid, or two behaviours have one template or name.
         """
-        added = tuple(map(entry_of, classes))
+        added = entries_of(classes)
         return replace(self, behaviours=(*self.behaviours, *added)) if added else self
 
     def bound(self, classes: Iterable[object]) -> "Scene":

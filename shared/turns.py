@@ -1,9 +1,10 @@
 """The turns of behaviours: what happens at the start of a step, in scenes with behaviours.
 
 Theory of operation. An entity has a turn if it is *active*: its template has a behaviour, and it moves or falls, or its
-input of this tick or of the tick before is not neutral, or it has asked for a turn by now (`Body.wake`), or its
-behaviour has `always`. This follows from its state and its input alone, so server and clients agree about it; whether
-the kernel has put an entity to sleep does not matter. An entity that rests costs a share of one comparison of an array.
+input of this tick or of the tick before is not neutral, or it has asked for a turn by now (`Body.wake`), as each new
+entity has, or its behaviour has `always`. This follows from its state and its input alone, so server and clients agree
+about it; whether the kernel has put an entity to sleep does not matter. An entity that rests costs a share of one
+comparison of an array.
 
 Turns are taken in ascending order of id. A turn collects its changes in its body. Blocks change as soon as the turn is
 over; all else changes after the last turn, so every turn reads the other entities as they were before the first. The

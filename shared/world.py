@@ -136,7 +136,8 @@ class World(TurnWorld):
         if self._next_id + self.extras.blocks[kind] > ID_MAX:
             raise SceneError("ids: used up")
         entity = self._next_id
-        self._put([(entity, kind, self._thrown(kind, speed[2]), *at, *speed, 0, 0, 0)])
+        more = self.extras.new[kind].tolist()
+        self._put([(entity, kind, self._thrown(kind, speed[2]), *at, *speed, 0, 0, 0, *more)])
         return entity
 
     def spawn_many(self, template: str, positions: npt.ArrayLike) -> range:
@@ -230,6 +231,7 @@ class World(TurnWorld):
         extras = self.extras
         if extras.count and extras.behaviour_of[self._entities[row, TEMPLATE]] != extras.behaviour_of[state[TEMPLATE]]:
             state[STATES + extras.first :] = extras.starts[state[TEMPLATE], extras.first :].tolist()
+            state[STATES + extras.wakes_at] = int(extras.new[state[TEMPLATE], extras.wakes_at])
         self._put([tuple(state)])
 
     def set_field(self, entity: int, name: str, value: int) -> None:

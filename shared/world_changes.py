@@ -13,6 +13,7 @@ import numpy as np
 from shared import blocks, layout
 from shared.aim import NO_AIM
 from shared.checks import Cell, SceneError, shown
+from shared.extras import RESERVED
 from shared.free_places import OverlapError, box_at, free_place, overlapping
 from shared.inputs import BUTTONS_MAX, MOVE_PART_MAX, Input, checked_input
 from shared.layout import FALLING, FLAGS, ID, PREV, TEMPLATE, Int64s, X
@@ -194,8 +195,9 @@ class UncheckedWorld(WorldState):
         extras = self.extras
         if extras.count:
             self._extra[rows] = new[:, STATES:]
-            for entity, kind in zip(ids, new[:, TEMPLATE].tolist(), strict=True) if extras.spawns else ():
-                self._next_id = max(self._next_id, entity + 1 + extras.blocks[kind])
+            for entity, alive in zip(ids, new[:, STATES + extras.alive].tolist(), strict=True) if extras.spawns else ():
+                if alive & RESERVED:
+                    self._next_id = max(self._next_id, entity + 1 + extras.spawns)
             if self.turns is not None:
                 self.turns.rows = None
             new = np.ascontiguousarray(new[:, :STATES])
@@ -216,7 +218,7 @@ class UncheckedWorld(WorldState):
         states[:, X : X + 3] = positions
         rows = np.array([self._row(entity) for entity in ids], np.int64)
         if self.extras.count:
-            self._extra[rows] = self.extras.starts[template]
+            self._extra[rows] = self.extras.new[template]
         self._next_id = ids.stop
         if self.turns is not None:
             self.turns.rows = None

@@ -30,6 +30,8 @@ from server.journal.records import (
     JournalError,
     Recording,
 )
+from server.rules import RulesError, load_rules
+from shared.behaviours import BehaviourError
 from shared.inputs import Input
 from shared.layout import BUTTONS, FALLING, FLAGS, ID, MOVE_X, MOVE_Y, TEMPLATE, VX, Int64s, X
 from shared.units import BLOCK, BLOCK_SHIFT, SPEED
@@ -55,6 +57,9 @@ def arguments(argv: list[str] | None = None) -> argparse.Namespace:
         "--entity", type=int, metavar="ID", help="show what is near this entity (default: near each that changed at T)"
     )
     parser.add_argument("--around", type=int, default=8, metavar="N", help="ticks before and after (default: 8)")
+    parser.add_argument(
+        "--game", metavar="MODULE:CLASS", help="the rules of the recorded game, if it has behaviours; they are imported"
+    )
     options = parser.parse_args(argv)
     if options.tick is None and options.entity is not None:
         parser.error("--entity needs --tick")
@@ -79,12 +84,18 @@ def main(argv: list[str] | None = None) -> int:
     first = 0
     try:
         with options.file.open("rb") as file:
-            recording = Recording(file)
+            recording = Recording(file, behaviours=load_rules(options.game).behaviours if options.game else ())
             first = recording.world.tick
             status = play(recording, file, out, options, kept)
     except DivergedError as error:
         out.print(f"[red]differs at {error}[/red]", soft_wrap=True)
         status = 1
+    except RulesError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    except BehaviourError as error:
+        print(f"error: {options.file}: {error}. Name the game that was recorded: --game MODULE:CLASS", file=sys.stderr)
+        return 2
     except (JournalError, OSError) as error:
         reason = error.strerror if isinstance(error, OSError) else str(error)
         print(f"error: {options.file}: {reason}", file=sys.stderr)

@@ -5,10 +5,13 @@ client that it affected its connection, and the tick goes on. A link may report 
 `send` or `close`, so loops in which that can happen iterate over a copy of the sessions.
 """
 
+import math
+
 from server.game.roster import Roster
 from server.game.session import Session
 from server.observability.counters import Counters
 from server.observability.errors import FaultReporter
+from server.players.player import Player
 from server.replication.client_stream import Transport
 from shared import fields, messages
 from shared.messages import Bye, encode
@@ -56,6 +59,12 @@ class Connections:
         if code != messages.TOO_SLOW:  # slowness is the network's fault: the player may reconnect
             self._roster.dismiss(session)
         self.end(session, code, reason)
+
+    def remove(self, player: Player) -> None:
+        """Makes a player leave whose entity does not exist any more, because a behaviour has removed it."""
+        player.reconnect_until = -math.inf
+        if player.session is not None:
+            self.kick(player.session, messages.GOING_AWAY, "the game has removed this player's entity")
 
     def fail(self, session: Session, what: str) -> None:
         """Handles an exception in our own code that affects one client: closes its connection, and the tick goes on.

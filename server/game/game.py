@@ -222,7 +222,9 @@ class Game:
             self.api.hooks.act()
         inputs = self._take_inputs()
         self.world.step(inputs)
-        self.api.turn_results.removals()
+        for entity in self.api.turn_results.removals():
+            if entity in self.players:
+                self.connections.remove(self.players[entity])
         self.api.hooks.stepped()
         self.log.record()
         self.rewind.record()

@@ -31,13 +31,19 @@ class TurnResults:
         self._world, self._log, self._attributes, self._counters = world, log, attributes, counters
         self._faults = FaultReporter("the rules have failed")
 
-    def removals(self) -> None:
-        """Processes the entities that the turns of the latest step have removed. Call it before the log records."""
+    def removals(self) -> list[int]:
+        """Processes the entities that the turns of the latest step have removed. Call it before the log records.
+
+        Returns:
+            These entities.
+        """
         turns = self._world.turns
-        for entity in turns.vanished if turns is not None else ():
+        vanished = turns.vanished if turns is not None else []
+        for entity in vanished:
             self._attributes.forget(entity)
             self._world.note([LEFT, entity])
             self._log.note_removal(entity)
+        return vanished
 
     def others(self, players: Mapping[int, Player], most: int) -> None:
         """Queues the announcements of the latest step, and reports its exceptions. Call it after the log has recorded.

@@ -109,8 +109,8 @@ class Observer:
                 held[entity] = input_
                 news += input_record(entity, input_, aim=aim)
         first, self._first = self._first, False
-        if world.turns is not None and world.turns.steered:
-            self.forget(list(world.turns.steered))
+        if world.turns is not None:
+            self.forget([*world.turns.steered, *world.turns.vanished])
         parts: list[Any] = [news, calls, None if first else mark(world)]
         due = world.tick % HASH_TICKS == 0 and len(world) <= self._hashed_max
         if first or (due and world.blocks.stale <= self._stale_max):

@@ -7,15 +7,17 @@ record    u32 length   u32 check of the length   u32 check of the payload   payl
           each check is the CRC-32 of its bytes, begun with the payload check of the record before
           (the first one: with the CRC-32 of the 10 bytes before it; in formats 1 and 2 with 0)
 start     [scene, tick, next_id, states, segments]         the first record
-          scene: its table   states: n * 12 int64   segments: [x, y, z, packed kinds or nil if as generated]
+          scene: its table   states: n * 12 int64, and the extra columns (`shared.extras`) of scenes that have any
+          segments: [x, y, z, packed kinds or nil if as generated]
 tick      [inputs, calls, mark] or, every 32 ticks, [inputs, calls, mark, hash]
           calls: in order, before the step   inputs: [id, move_x, move_y, buttons, id, ...] that differ from the
           previous ones; in a scene with aim, aim_x, aim_y and aim_z follow each buttons
-          mark: CRC-32 of the states that the tick changed (nil in the first tick, which has a hash)
+          mark: CRC-32 of the states that the tick changed, with their extra columns (nil in the first tick, which has
+          a hash)
           hash: 20 bytes, the world's after the step (16 in formats 1 and 2: `server.journal.former`)
 end       [nil, calls, nil, hash]                           the last record, if the recording was ended
 
-call      [PUT, 12 numbers per state ...]   [REMOVE, id]   [FILL, x0, y0, z0, x1, y1, z1, kind, push]
+call      [PUT, all numbers of the states ...]   [REMOVE, id]   [FILL, x0, y0, z0, x1, y1, z1, kind, push]
           [LOAD, x, y, z, packed kinds or nil if as generated]   [UNLOAD, x, y, z]
           [WRITE, x, y, z, blocks, kinds]   [REBASE, tick]   [NOTE, packed value] (since format 2)
 
@@ -28,7 +30,7 @@ have woken entities. A note is a value of the game, which a replay passes over: 
 
 import struct
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
@@ -39,6 +41,7 @@ import numpy as np
 from server.journal import former
 from shared import states, terrain
 from shared.aim import NO_AIM
+from shared.behaviours import Behaviour, BehaviourError
 from shared.blocks import unpack
 from shared.checks import SceneError
 from shared.inputs import NEUTRAL, Input, checked_input
@@ -81,6 +84,9 @@ def mark(world: WorldState) -> int:
     It is cheap enough for every tick, so a replay finds the exact tick that differs.
     """
     rows = world.changed
+    if world.extras.count:
+        ids = {*rows[:, ID].tolist(), *(entity for entity in world.fields_set if entity in world)}
+        return zlib.crc32(world.states_of(sorted(ids)).astype("<i8", copy=False).tobytes())
     states = rows[np.argsort(rows[:, ID]), :STATES]
     states[:, FLAGS] &= FALLING
     return zlib.crc32(states.astype("<i8", copy=False).tobytes())
@@ -106,13 +112,17 @@ class Recording:
     Args:
         file: the file, opened for reading bytes.
         compiled: whether the kernel is compiled, as for `World`.
+        behaviours: this program's classes of the behaviours of the recorded scene.
 
     Raises:
         JournalError: the file is not a recording, has a newer format, or is damaged.
+        BehaviourError: a class of a behaviour is missing, or differs from the recorded one.
     """
 
-    def __init__(self, file: BinaryIO, *, compiled: bool | None = None) -> None:
-        self._file = file
+    def __init__(
+        self, file: BinaryIO, *, compiled: bool | None = None, behaviours: Iterable[type[Behaviour]] = ()
+    ) -> None:
+        self._file, self._behaviours = file, behaviours
         self._chain = 0
         self.torn = 0
         """Bytes of an incomplete last record, once the replay has reached it."""
@@ -131,6 +141,8 @@ class Recording:
             raise JournalError("a recording that broke off before its start was written")
         try:
             self.world = self._start(start, compiled)
+        except BehaviourError:
+            raise
         except (LookupError, TypeError, ValueError, OverflowError) as error:
             raise JournalError(f"its start state cannot be used ({error})") from error
         self.scene = self.world.scene
@@ -160,7 +172,7 @@ class Recording:
 
     def _start(self, record: list[Any], compiled: bool | None) -> World:
         table, tick, next_id, states, segments = record
-        world = World(Scene.from_table(table), compiled=compiled)
+        world = World(Scene.from_table(table).bound(self._behaviours), compiled=compiled)
         for x, y, z, packed in segments:
             apply(world, [LOAD, x, y, z, packed])
         world.write(checked_states(world.scene, np.frombuffer(states, "<i8").astype(np.int64)))
@@ -192,20 +204,24 @@ class Recording:
         return JournalError(f"damaged before byte {self._file.tell()}{after}: {reason}")
 
 
-def replay(path: str | Path, *, compiled: bool | None = None) -> Iterator[Moment]:
+def replay(
+    path: str | Path, *, compiled: bool | None = None, behaviours: Iterable[type[Behaviour]] = ()
+) -> Iterator[Moment]:
     """Replays a recording tick by tick and compares each tick with it.
 
     Args:
         path: the file.
         compiled: whether the kernel is compiled, as for `World`.
+        behaviours: this program's classes of the behaviours of the recorded scene.
 
     Raises:
         DivergedError: a tick differs from the recording.
         JournalError: the file is not a recording, has a newer format, or is damaged.
+        BehaviourError: a class of a behaviour is missing, or differs from the recorded one.
         OSError: the file cannot be read.
     """
     with Path(path).open("rb") as file:
-        yield from Recording(file, compiled=compiled)
+        yield from Recording(file, compiled=compiled, behaviours=behaviours)
 
 
 def redo(world: World, record: list[Any]) -> Moment:

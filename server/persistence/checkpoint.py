@@ -40,7 +40,7 @@ class Checkpoint(NamedTuple):
     tick: int
     next_id: int
     states: bytes
-    """States of all entities, n * 12 int64, little-endian, ascending by the entity's number."""
+    """States of all entities with their extra columns, int64, little-endian, ascending by the entity's number."""
     hash: bytes
     """State hash of the world at that tick (`World.state_hash`)."""
     kept: bytes
@@ -54,7 +54,7 @@ class Checkpoint(NamedTuple):
 class Copy:
     """A copy of a world at one moment, whose blocks are copied piece by piece later.
 
-    The data that the kernel changes are copied at once: a row of 128 bytes per entity. Of the segments only the
+    The data that the kernel changes are copied at once: the state of each entity. Of the segments only the
     versions are copied at once. `pieces` copies and packs the segments that were touched since the last checkpoint, one
     by one, in another thread. The world may go on meanwhile if it calls `touch` before every change of a segment, which
     copies that segment first.
@@ -67,7 +67,8 @@ class Copy:
     def __init__(self, world: World, kept: bytes) -> None:
         blocks = world.blocks
         self.tick, self._next_id, self._kept = world.tick, world.next_id, kept
-        self._entities = world.matrix.copy()
+        self._entities = world.matrix[:, :STATES].copy()
+        self._extra = world.extra_rows[: len(self._entities)].copy() if world.extras.count else None
         self._rows = dict(blocks.rows)
         self._versions = blocks.versions[: blocks.count].copy()
         self.saved: dict[Cell, Known | None] = {}
@@ -88,7 +89,7 @@ class Copy:
         Args:
             saved: the segments of the last checkpoint.
         """
-        states = self._entities[:, :STATES]
+        states = self._entities if self._extra is None else np.concatenate((self._entities, self._extra), axis=1)
         states = states[states[:, ID] != 0]
         states = states[np.argsort(states[:, ID])]
         states[:, FLAGS] &= FALLING
