@@ -10,7 +10,7 @@ from sovereign_netcode.play.iso import Colour
 
 KEYS = (
     "WASD / arrows: walk    Space: jump    left / right mouse: dig / place    1-6: colour    "
-    "G: confirmed position    [ ]: latency    Esc: quit"
+    "G: confirmed position    F3: diagnosis    [ ]: latency    Esc: quit"
 )
 FAINT: Colour = (168, 182, 206)
 TOAST_S = 4.0

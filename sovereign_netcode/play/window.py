@@ -15,6 +15,7 @@ from shared.checks import Cell, Vec
 from sovereign_netcode.play.figures import INK, OWN, TONES, WHITE, Actor, draw_ghost, label, screen
 from sovereign_netcode.play.hud import Hud
 from sovereign_netcode.play.iso import CHOICE, FIRST_KIND, Colour, Ground, Point, colour_of, project, target_of, top_of
+from sovereign_netcode.play.panel import Panel
 
 SIZE = 1280, 800
 SKY = (122, 184, 232), (222, 240, 250)
@@ -54,6 +55,7 @@ class Window:
         """Keys that went down since the frame before."""
         self.actors: list[Actor] = []
         """All figures in sight."""
+        self.panel = Panel()
         self.ghost = False
         self.lag_s = 0.0
         self.kind = FIRST_KIND
@@ -129,6 +131,8 @@ class Window:
             self.pressed.add(event.key)
             if event.key == pygame.K_g:
                 self.ghost = not self.ghost
+            elif event.key == pygame.K_F3:
+                self.panel.shown = not self.panel.shown
             elif event.key == pygame.K_LEFTBRACKET:
                 self.lag(max(self.lag_s - LAG_STEP_S, 0.0))
             elif event.key == pygame.K_RIGHTBRACKET:
@@ -192,6 +196,7 @@ class Window:
             lag_s=self.lag_s,
             choice=colour_of(self.kind),
         )
+        self.panel.draw(target, self.client)
         pygame.display.flip()
 
     def _cast(self, view: View) -> list[Actor]:
