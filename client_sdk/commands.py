@@ -7,7 +7,7 @@ import numpy as np
 from client_sdk.events import Answered
 from shared import edits, fields, messages, payloads
 from shared.checks import text
-from shared.messages import Command, encode
+from shared.messages import Command, Refusal, encode
 from shared.snapshot import VERDICT
 
 
@@ -17,6 +17,8 @@ class SentCommands:
     def __init__(self) -> None:
         self._number = 0
         self._unanswered: dict[int, bytes] = {}
+        self._reasons: dict[int, str] = {}
+        """Reasons of refusals whose verdicts have not arrived yet."""
 
     def number(self) -> int:
         """Allocates the next command number."""
@@ -56,8 +58,14 @@ class SentCommands:
         for number, verdict in np.frombuffer(verdicts, VERDICT).tolist() if verdicts else ():
             if self._unanswered.pop(number, None) is not None:
                 text = messages.VERDICT_TEXTS[min(verdict, len(messages.VERDICT_TEXTS) - 1)]
+                text = self._reasons.pop(number, "") or text
                 answers.append(Answered(number, verdict == messages.DONE, text))
         return answers
+
+    def refused(self, refusal: Refusal) -> None:
+        """Takes the reason of a refusal, for the verdict that follows."""
+        if refusal.number in self._unanswered:
+            self._reasons[refusal.number] = refusal.reason
 
     def again(self) -> list[bytes]:
         """Returns the messages to send again after a reconnect; the server knows which commands it has carried out."""
@@ -67,4 +75,5 @@ class SentCommands:
         """Forgets all commands, because the player is a new one to the server. Returns a failed result for each."""
         numbers = list(self._unanswered)
         self._unanswered.clear()
+        self._reasons.clear()
         return [Answered(number, False, "the connection was lost") for number in numbers]

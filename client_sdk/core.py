@@ -300,6 +300,8 @@ class Core:
                 self._welcome(message, now)
             case messages.Happened() | messages.Announce():
                 self._game_events.happened(message, hold=self._joins)
+            case messages.Refusal():
+                self._commands.refused(message)
             case messages.NextHappened():
                 self._game_events.next(message.number, hold=self._joins)
             case messages.Shared():

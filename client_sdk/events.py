@@ -73,7 +73,8 @@ class Corrected:
 class Answered:
     """The result of an edit or a command, named by the `number` that `edit` or `command` returned.
 
-    `verdict` is "done", or says why it was refused. The client then takes back a predicted edit.
+    `verdict` is "done", or says why it was refused: the reason that the rules gave, or a text of the SDK. The client
+    then takes back a predicted edit.
     """
 
     number: int

@@ -94,7 +94,7 @@ class Rules:
         `game.held`, `pressed`, `released`, `move` and `aim` give the inputs that the step of this tick uses.
         """
 
-    def on_command(self, player: Player, name: str, payload: Any) -> bool | None:
+    def on_command(self, player: Player, name: str, payload: Any) -> bool | str | None:
         """Called for each command that a client sends with `Client.command`, except for edits of blocks.
 
         Args:
@@ -103,7 +103,8 @@ class Rules:
             payload: data of the command: any MessagePack value. A client can send anything, so check it.
 
         Returns:
-            False if the command is not allowed: the client gets that as the result. True or None if it was done.
+            False if the command is not allowed, or a text that says why: the client gets that as the result, with at
+            most 500 characters. True or None if it was done.
         """
         return False
 
@@ -118,9 +119,10 @@ class Rules:
         """
         return False
 
-    def can_edit(self, player: Player, x: int, y: int, z: int, kind: int) -> bool:
+    def can_edit(self, player: Player, x: int, y: int, z: int, kind: int) -> bool | str:
         """Returns whether a player may place (kind 1 to 255) or remove (kind 0) the block at (x, y, z).
 
+        A text refuses it, with that reason in the result that the client gets.
         The server checks reach and overlap with entities besides.
         """
         return True

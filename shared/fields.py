@@ -26,7 +26,7 @@ NAME_MAX = 32
 SCENE_FIELDS_MAX = 32
 """Limit of the scene's fields in `Hello.scene`."""
 REASON_MAX = 500
-"""Longest reason in a `Bye`, in characters."""
+"""Longest reason in a `Bye` or a `Refusal`, in characters."""
 STATUSES_MAX = in_ticks(STATUSES_S, TICK_RATE_MAX, 1)
 """Limit of the margins, and of the input statuses, in one snapshot."""
 DROPS_MAX = 4096
@@ -80,7 +80,7 @@ tick, first, index = _whole(-1, TICK_MAX), _whole(0, FIRST_MAX), _whole(0, TICK_
 segment, offset, total = _whole(-(1 << 23), (1 << 23) - 1), _whole(0, PACKED_MAX), _whole(1, PACKED_MAX)
 """Checks: index of a segment along an axis, place within a packed segment, length of a packed segment."""
 name, token, reason = _text(NAME_MAX), _text(TOKEN_MAX), _text(REASON_MAX)
-"""Checks: name, identity token, reason in a `Bye`."""
+"""Checks: name, identity token, reason in a `Bye` or a `Refusal`."""
 rows = _bytes(INPUT_ROWS_MAX * AIM_ROW_BYTES, INPUT_ROW_BYTES)
 """Check of packed inputs, for scenes with and without aim; `whole_rows` checks the rest."""
 payload, chunk = _bytes(PAYLOAD_MAX), _bytes(PACKED_MAX)

@@ -13,6 +13,7 @@ packed little-endian records in a MessagePack `bin`. docs/protocol.md explains e
       7 Restart  tick                                      22 Shared    values
                                                            23 NextHappened  number
                                                            24 Announce  tick entity name payload
+                                                           25 Refusal   number reason
                                                             4 Bye       code reason wait
 
     Inputs.rows    n * [i8 move_x, i8 move_y, u8 buttons], for the ticks first, first + 1, ...; in a scene with aim
@@ -34,6 +35,7 @@ packed little-endian records in a MessagePack `bin`. docs/protocol.md explains e
                    dropped or lost with a connection. The first event that a player gets has the number 0.
     Announce       an event of an entity's behaviour; its own player does not get it. It counts as a `Happened`.
     Shared         all shared values of the game by name, each time: a score, for example.
+    Refusal        a reason for the verdict FORBIDDEN; it comes ahead of the snapshot with that verdict.
     Ping           `corrections`: number of corrections of the client's prediction so far, for the operator.
     Pong.tick      the server time in ticks when it answered: 17.25 is a quarter of a tick after tick 17.
 
@@ -58,6 +60,11 @@ from shared.fields import (
     shown,
     whole_rows,
 )
+from shared.game_messages import Announce as Announce
+from shared.game_messages import Happened as Happened
+from shared.game_messages import NextHappened as NextHappened
+from shared.game_messages import Refusal as Refusal
+from shared.game_messages import Shared as Shared
 
 VERSION = 3
 """Version of the protocol; both sides must have the same one."""
@@ -201,35 +208,6 @@ class Pong(NamedTuple):
     tick: float
 
 
-class Happened(NamedTuple):
-    """A game event, which the rules sent at the end of `tick`."""
-
-    tick: int
-    name: str
-    payload: bytes
-
-
-class Announce(NamedTuple):
-    """A game event that the behaviour of `entity` has announced in `tick` (`shared.body.Body.announce`)."""
-
-    tick: int
-    entity: int
-    name: str
-    payload: bytes
-
-
-class Shared(NamedTuple):
-    """All shared values of the game, by name."""
-
-    values: dict[str, Any]
-
-
-class NextHappened(NamedTuple):
-    """The number of the next `Happened`, counted from the player's first one; earlier ones not received are lost."""
-
-    number: int
-
-
 Message = (
     Hello
     | Inputs
@@ -246,6 +224,7 @@ Message = (
     | Shared
     | NextHappened
     | Announce
+    | Refusal
 )
 KINDS: dict[int, tuple[type[Any], tuple[fields.Check, ...]]] = {
     1: (Hello, (fields.version, fields.digests, fields.name, fields.token, fields.resume)),
@@ -266,12 +245,13 @@ KINDS: dict[int, tuple[type[Any], tuple[fields.Check, ...]]] = {
     22: (Shared, (fields.names,)),
     23: (NextHappened, (fields.index,)),
     24: (Announce, (fields.tick, fields.entity, fields.name, fields.payload)),
+    25: (Refusal, (fields.count, fields.reason)),
 }
 """Message class and checks of the fields, by the number of the kind. A snapshot's last field has no check here:
 `shared.snapshot` checks the segments."""
 CLIENT_KINDS = frozenset({1, 2, 3, 4, 5, 6, 7})
 """Kinds of messages that a client may send."""
-SERVER_KINDS = frozenset({4, 17, 18, 19, 20, 21, 22, 23, 24})
+SERVER_KINDS = frozenset({4, 17, 18, 19, 20, 21, 22, 23, 24, 25})
 """Kinds of messages that a server may send."""
 _KIND_OF = {kind: number for number, (kind, _) in KINDS.items()}
 _INPUTS_HEAD = bytes((0x94, _KIND_OF[Inputs]))

@@ -31,8 +31,8 @@ class Commands:
     ) -> None:
         self._world, self._api, self._limits, self._faults, self._saves = world, api, limits, faults, saves
         self._ahead = bounds(world.scene.tick_rate).ahead
-        self._unanswered: deque[tuple[int, Player, int, int]] = deque()
-        """Verdicts that are not durable yet: tick, player, number, verdict."""
+        self._unanswered: deque[tuple[int, Player, tuple[Any, ...]]] = deque()
+        """Verdicts that are not durable yet: tick, player, and the arguments of `Player.settle`."""
 
     @property
     def trouble(self) -> bool:
@@ -70,26 +70,29 @@ class Commands:
                 if self.trouble:
                     player.settle(command.number, messages.UNSAVED)
                     continue
+                self._api.hooks.reason = ""
                 try:
                     verdict = self._verdict(player, command)
                 except Exception:
                     self._faults.report("a command")
                     verdict = messages.FAILED
-                self._unanswered.append((tick, player, command.number, verdict))
-                self._world.note([persisted_state.ANSWERED, player.entity, command.number, verdict])
+                reason = self._api.hooks.reason
+                answer = (command.number, verdict, reason) if reason else (command.number, verdict)
+                self._unanswered.append((tick, player, answer))
+                self._world.note([persisted_state.ANSWERED, player.entity, *answer])
 
     def answer(self) -> None:
         """Queues the verdicts that are durable now to be sent to the players."""
         durable = self.durable_tick
         while self._unanswered and self._unanswered[0][0] <= durable:
-            _, player, number, verdict = self._unanswered.popleft()
-            player.settle(number, verdict)
+            _, player, answer = self._unanswered.popleft()
+            player.settle(*answer)
 
     def notes(self) -> Iterator[list[Any]]:
         """Yields the verdicts that are not durable yet, as notes for a checkpoint."""
-        for _, player, number, verdict in self._unanswered:
+        for _, player, answer in self._unanswered:
             if player.entity in self._api.players:
-                yield [persisted_state.ANSWERED, player.entity, number, verdict]
+                yield [persisted_state.ANSWERED, player.entity, *answer]
 
     def _verdict(self, player: Player, command: Command) -> int:
         if command.name != edits.NAME:

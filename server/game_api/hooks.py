@@ -18,6 +18,7 @@ from server.players.player import Player
 from server.rules import Rules, RulesError, checked_function, checked_result
 from shared import messages
 from shared.edits import Edit
+from shared.fields import REASON_MAX
 from shared.messages import Command, ProtocolError
 from shared.payloads import unpack_value
 
@@ -48,6 +49,8 @@ class Hooks:
     ) -> None:
         self.seen = 0.0
         """View tick of the latest command: server time in ticks at which its sender drew the other entities."""
+        self.reason = ""
+        """Reason that the rules gave for refusing the latest command; empty: none."""
         self._api, self._world, self._rules, self._counters = stage, world, rules, counters
         self._soon: deque[tuple[Callable[..., object], tuple[Any, ...]]] = deque()
         self._contacts = Contacts(world, goes_on=goes_on)
@@ -97,11 +100,18 @@ class Hooks:
         done = self._call(self._rules.on_command, player, command.name, payload, failed=_FAILED)
         if done is _FAILED:
             return messages.FAILED
+        if isinstance(done, str):
+            self.reason = _sendable(done)
+            return messages.FORBIDDEN
         return messages.FORBIDDEN if isinstance(done, TRUTH) and not done else messages.DONE
 
     def may_edit(self, player: Player, edit: Edit) -> bool:
         """Returns whether the rules allow an edit. A `can_edit` that raises does not allow it."""
-        return bool(self._call(self._can_edit, player, edit, failed=False))
+        allowed = self._call(self._can_edit, player, edit, failed=False)
+        if isinstance(allowed, str):
+            self.reason = _sendable(allowed)
+            return False
+        return bool(allowed)
 
     def act(self) -> None:
         """Calls `on_contact` for new contacts, then `on_tick`."""
@@ -143,7 +153,7 @@ class Hooks:
     def _can_edit(self, player: Player, edit: Edit) -> object:
         allowed: object = self._rules.can_edit(player, *edit)
         if allowed is None:
-            raise RulesError("can_edit returned None: it must return True or False")
+            raise RulesError("can_edit returned None: it must return True, False or a reason")
         return checked_result(allowed, "can_edit")
 
     def _call(self, hook: Any, *arguments: Any, failed: Any = None) -> Any:
@@ -154,6 +164,11 @@ class Hooks:
             self._counters.rules_failed += 1
             self._faults.report(getattr(hook, "__qualname__", repr(hook)))
             return failed
+
+
+def _sendable(reason: str) -> str:
+    """Returns a reason as a text that a message can hold: at most `REASON_MAX` characters that UTF-8 can encode."""
+    return reason[:REASON_MAX].encode(errors="replace").decode()
 
 
 def _overrides(rules: Rules, name: str) -> bool:

@@ -4,8 +4,9 @@ It consists of players, attributes and shared values. Each change is noted (`Rec
 has the whole state, as the notes that lead to it:
 
     ["player", entity, name, subject, tokens]    a player has joined or reconnected; digests of the resume tokens
-    ["answered", entity, number, verdict]        a command of a player was carried out
+    ["answered", entity, number, verdict]        a command of a player was carried out; a reason follows if there is one
     ["settled", entity, verdicts]                the latest verdicts by number; in checkpoints only
+    ["reasons", entity, reasons]                 the reasons of refusals among them by number; in checkpoints only
     ["left", entity]                             an entity was removed, or its player has left
     ["said", entity, attributes]                 all attributes of an entity
     ["shared", values]                           all shared values
@@ -19,6 +20,7 @@ from typing import Any, NamedTuple
 from server.players.player import Player
 
 PLAYER, ANSWERED, SETTLED, LEFT, ATTRIBUTES, SHARED = "player", "answered", "settled", "left", "said", "shared"
+REASONS = "reasons"
 
 
 class PersistedState(NamedTuple):
@@ -38,6 +40,7 @@ def whole(kept: PersistedState) -> list[list[Any]]:
     """Returns the whole state as the notes that lead to it."""
     notes = [note_of(player) for player in kept.players.values()]
     notes += [[SETTLED, entity, player.settled] for entity, player in kept.players.items() if player.settled]
+    notes += [[REASONS, entity, player.reasons] for entity, player in kept.players.items() if player.reasons]
     notes += [[ATTRIBUTES, entity, attributes] for entity, attributes in kept.attributes.items()]
     return [*notes, [SHARED, kept.shared]]
 
@@ -55,10 +58,12 @@ def restored(notes: Iterable[list[Any]]) -> PersistedState:
             case "player", (entity, name, subject, tokens):
                 player = kept.players.setdefault(entity, Player(entity, name, subject))
                 player.tokens = list(tokens)
-            case "answered", (entity, number, verdict):
-                kept.players[entity].settle(number, verdict)
+            case "answered", (entity, number, verdict, *reason):
+                kept.players[entity].settle(number, verdict, *reason)
             case "settled", (entity, verdicts):
                 kept.players[entity].settled.update(verdicts)
+            case "reasons", (entity, reasons):
+                kept.players[entity].reasons.update(reasons)
             case "left", (entity,):
                 kept.players.pop(entity, None)
                 kept.attributes.pop(entity, None)

@@ -41,6 +41,8 @@ class Player:
         self.settled: dict[int, int] = {}
         """Latest verdicts by the number of the command. A client that lost its connection before it received a verdict
         sends the command again and gets the same verdict."""
+        self.reasons: dict[int, str] = {}
+        """Reasons of the refusals among `settled` for which the rules gave one."""
         self.edits_left = math.inf
         """Number of edits that the player may do now; it grows with time."""
         self.tokens: list[bytes] = []
@@ -59,9 +61,19 @@ class Player:
         """Invalidates all resume tokens but the newest one, which the client has now."""
         del self.tokens[:-1]
 
-    def settle(self, number: int, verdict: int) -> None:
-        """Queues the verdict of a command to be sent, and keeps it in case that the client asks again."""
+    def settle(self, number: int, verdict: int, reason: str = "") -> None:
+        """Queues the verdict of a command to be sent, and keeps it in case that the client asks again.
+
+        Args:
+            number: number of the command.
+            verdict: its verdict.
+            reason: the reason that the rules gave for a refusal; empty: none.
+        """
         self.verdicts.append((number, verdict))
         self.settled[number] = verdict
+        if reason:
+            self.reasons[number] = reason
         if len(self.settled) > SETTLED_MAX:
-            del self.settled[next(iter(self.settled))]
+            oldest = next(iter(self.settled))
+            del self.settled[oldest]
+            self.reasons.pop(oldest, None)

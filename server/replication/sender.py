@@ -120,7 +120,10 @@ class Sender:
         n, parts = sight.take(self._log, tick, room)
         verdicts = b""
         if player.verdicts:
-            verdicts = np.array(player.verdicts[: fields.VERDICTS_MAX], VERDICT).tobytes()
+            answers = player.verdicts[: fields.VERDICTS_MAX]
+            verdicts = np.array(answers, VERDICT).tobytes()
+            for number in [number for number, _ in answers if number in player.reasons] if player.reasons else ():
+                stream.send(encode(messages.Refusal(number, player.reasons[number])))
             del player.verdicts[: fields.VERDICTS_MAX]
         margins, statuses = inputs.take_feedback()
         header = (tick, inputs.newest, margins, tick - len(statuses) + 1, statuses, verdicts, drops)
