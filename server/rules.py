@@ -7,9 +7,9 @@
     sovereign-server --game my_game:Tag
 
 The server calls all hooks within a tick, before the step, in this order: `on_start`, the functions given to
-`game.soon`, `on_leave`, `on_join`, `on_fell_out`, `on_command` and `can_edit`, `on_contact`, `on_tick`. If a hook
-raises, the exception is logged and counted, and the game goes on. A hook is a plain function and must not wait. Code
-that waits runs in a task or a thread of its own and hands its result back with `game.soon`.
+`game.soon`, `on_leave`, `can_join` and `on_join`, `on_fell_out`, `on_command` and `can_edit`, `on_contact`, `on_tick`.
+If a hook raises, the exception is logged and counted, and the game goes on. A hook is a plain function and must not
+wait. Code that waits runs in a task or a thread of its own and hands its result back with `game.soon`.
 
 Hooks read and change the game through `self.game`, a `server.game_api.api.GameApi`. Decisions about the world must use
 nothing else: `self.game.random` gives the same numbers when a game is computed again, but a clock or the order of a set
@@ -45,6 +45,10 @@ class Rules:
 
     scene = ""
     """The scene to play if the operator names none: a name or the path of a file. Empty: the server's default."""
+
+    names = "any"
+    """Rule for the names of players. "any": as the client gives it. "clean": without hidden characters and double
+    spaces, and never empty. "unique": clean, and with a number behind it if another player has the name."""
 
     behaviours: Sequence[type[Behaviour]] = ()
     """The behaviours of the game (`shared.behaviours`). Clients pass the same classes to `Client.connect`."""
@@ -119,6 +123,17 @@ class Rules:
         """
         return False
 
+    def can_join(self, name: str, subject: str) -> bool | str:
+        """Returns whether a new player may join. A text refuses it; the client gets that reason with `Left`.
+
+        Not called when a player reconnects.
+
+        Args:
+            name: the name that the player would have.
+            subject: the subject of the client's token; empty if the server does not ask for tokens.
+        """
+        return True
+
     def can_edit(self, player: Player, x: int, y: int, z: int, kind: int) -> bool | str:
         """Returns whether a player may place (kind 1 to 255) or remove (kind 0) the block at (x, y, z).
 
@@ -165,6 +180,8 @@ def check_rules(rules: object) -> None:
     owner = type(rules).__qualname__
     if not isinstance(rules.scene, str):
         raise RulesError(f"{owner}.scene = {shown(rules.scene)}: must be the name of a scene, or the path of its file")
+    if rules.names not in NAMES:
+        raise RulesError(f"{owner}.names = {shown(rules.names)}: must be one of {', '.join(NAMES)}")
     plain = {hook.replace("_", ""): hook for hook in HOOKS}
     for name in dir(rules):
         meant = plain.get(name.lower().replace("_", ""), "")
@@ -269,6 +286,8 @@ def equipped(scene: Scene, rules: Rules) -> Scene:
         raise RulesError(f"{type(rules).__qualname__}.{error}") from error
 
 
+NAMES = ("any", "clean", "unique")
+"""Choices of `Rules.names`."""
 ASYNC = (inspect.iscoroutinefunction, inspect.isasyncgenfunction)
 """Tests that recognise an async function."""
 HOOKS = ("prepare", *(name for name in vars(Rules) if name.startswith(("on_", "can_"))))

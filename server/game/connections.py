@@ -60,11 +60,11 @@ class Connections:
             self._roster.dismiss(session)
         self.end(session, code, reason)
 
-    def remove(self, player: Player) -> None:
-        """Makes a player leave whose entity does not exist any more, because a behaviour has removed it."""
-        player.reconnect_until = -math.inf
-        if player.session is not None:
-            self.kick(player.session, messages.GOING_AWAY, "the game has removed this player's entity")
+    def remove(self, player: Player, code: int, reason: str) -> None:
+        """Makes a player leave in the next tick, and closes its connection with a code and a reason."""
+        if player.session is not None and not player.session.closed:
+            self.kick(player.session, code, reason)
+        player.session, player.reconnect_until = None, -math.inf
 
     def fail(self, session: Session, what: str) -> None:
         """Handles an exception in our own code that affects one client: closes its connection, and the tick goes on.

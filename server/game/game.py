@@ -224,7 +224,8 @@ class Game:
         self.world.step(inputs)
         for entity in self.api.turn_results.removals():
             if entity in self.players:
-                self.connections.remove(self.players[entity])
+                reason = "the game has removed this player's entity"
+                self.connections.remove(self.players[entity], messages.GOING_AWAY, reason)
         self.api.hooks.stepped()
         self.log.record()
         self.rewind.record()
@@ -234,6 +235,7 @@ class Game:
         self.api.turn_results.others(self.players, self.limits.outbox_max)
         self.clocks.refill()
         self._send(now)
+        self._kick()
         self.clocks.check(now)
 
     def _take_inputs(self) -> dict[int, Input]:
@@ -242,6 +244,12 @@ class Game:
         inputs.update(self.api.steered)
         self.api.steered.clear()
         return inputs
+
+    def _kick(self) -> None:
+        """Removes the players whom the rules have kicked in this tick."""
+        for player, reason in self.api.kicked:
+            self.connections.remove(player, messages.KICKED, reason or "kicked by the game")
+        self.api.kicked.clear()
 
     def _send(self, now: float) -> None:
         """Sends each client that has joined what is due: its welcome, or the newest snapshot and events."""

@@ -130,7 +130,11 @@ class Joining:
             self._connections.refuse(session, messages.FULL, reason)
             return
         else:
-            player, new = self._roster.enter(session, session.hello.name), True
+            name, reason = self._roster.admit(session.hello.name, session.subject)
+            if reason:
+                self._connections.refuse(session, messages.NOT_ADMITTED, reason)
+                return
+            player, new = self._roster.enter(session, name), True
             if player is None:
                 self._connections.refuse(session, messages.FULL, "no room to spawn")
                 return

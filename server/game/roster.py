@@ -10,6 +10,7 @@ import math
 import secrets
 
 from server.config.limits import Limits
+from server.game.names import named
 from server.game.session import Session
 from server.game.spawning import Spawns
 from server.game_api.api import GameApi
@@ -19,7 +20,7 @@ from server.players import persisted_state
 from server.players.input_queue import InputQueue
 from server.players.player import Player
 from shared.bounds import bounds
-from shared.fields import RESUME_BYTES
+from shared.fields import NAME_MAX, RESUME_BYTES
 
 UNACKNOWLEDGED_S = 2.0
 """Seconds that a new player may take to reconnect if its client has not acknowledged anything yet."""
@@ -77,6 +78,18 @@ class Roster:
             self.expel(player)
             raise
         return player
+
+    def admit(self, wanted: str, subject: str) -> tuple[str, str]:
+        """Returns the name of a new player, and the reason why it may not join; empty if it may.
+
+        Args:
+            wanted: the name that the client gave.
+            subject: the subject of the client.
+        """
+        rule = self._api.hooks.names
+        taken = () if rule == "any" else [player.name for player in self._api.players.values()]
+        name = named(wanted, rule, taken, min(NAME_MAX, self._limits.name_max))
+        return name, self._api.hooks.not_admitted(name, subject)
 
     def issue(self, player: Player) -> bytes:
         """Makes a new resume token for a player and returns it."""

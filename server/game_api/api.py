@@ -13,6 +13,7 @@ from server.game_api.attributes import Attributes
 from server.game_api.hooks import Hooks
 from server.game_api.input_api import InputApi
 from server.game_api.outgoing import Outgoing
+from server.game_api.players_api import PlayersApi
 from server.game_api.shared_values import SharedValues
 from server.game_api.turn import Turn
 from server.game_api.turn_results import TurnResults
@@ -29,7 +30,7 @@ from shared.layout import TEMPLATE
 from shared.scene import Scene
 
 
-class GameApi(InputApi):
+class GameApi(InputApi, PlayersApi):
     """The game API of one running game. Positions are in blocks, velocities in blocks/s.
 
     A method raises `MissingError` (a `KeyError`) if there is no entity with the given number, and `SceneError`, which
@@ -58,8 +59,9 @@ class GameApi(InputApi):
         seed: int = 0,
     ) -> None:
         check_rules(rules)
-        self.kept = kept or PersistedState({}, {}, {})
+        self.kept = kept or PersistedState()
         super().__init__(world, self.kept.players, Turn())
+        self._init_players()
         self.log = ChangeLog(world, self.kept.attributes)
         self.shared_values = SharedValues(world, self.kept.shared)
         self.outgoing = Outgoing(counters)

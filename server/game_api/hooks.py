@@ -29,6 +29,8 @@ SOON_MAX = 10_000
 """Maximum number of functions that wait for the next tick."""
 TRUTH = (bool, np.bool_)
 """Types of the results of hooks that count as a truth value."""
+NOT_ADMITTED = "the game does not let this player join"
+"""Reason for a client that the rules refuse without one."""
 _FAILED = object()
 """Result of `Hooks._call` for a command whose hook raised."""
 
@@ -56,6 +58,7 @@ class Hooks:
         self._contacts = Contacts(world, goes_on=goes_on)
         self._reports_contacts = _overrides(rules, "on_contact")
         self._started = goes_on
+        self.names = rules.names
         self._faults = FaultReporter("the rules have failed")
 
     # -- in the order of a tick ------------------------------------------------------------------------------
@@ -82,6 +85,19 @@ class Hooks:
             self._api.set(player.entity, "name", player.name)
         player.announced = True
         self._call(self._rules.on_join, player)
+
+    def not_admitted(self, name: str, subject: str) -> str:
+        """Returns the reason why a client may not join: it was kicked, or `can_join` refuses it; empty if it may.
+
+        A `can_join` that raises refuses the client.
+        """
+        banned = self._api.banned(name, subject)
+        if banned or not _overrides(self._rules, "can_join"):
+            return banned
+        allowed = self._call(self._can_join, name, subject, failed=False)
+        if isinstance(allowed, str):
+            return _sendable(allowed) or NOT_ADMITTED
+        return "" if allowed else NOT_ADMITTED
 
     def fell_out(self, entity: int) -> bool:
         """Calls `on_fell_out` for an entity below the floor. Returns whether the rules dealt with it or removed it."""
@@ -155,6 +171,12 @@ class Hooks:
         if allowed is None:
             raise RulesError("can_edit returned None: it must return True, False or a reason")
         return checked_result(allowed, "can_edit")
+
+    def _can_join(self, name: str, subject: str) -> object:
+        allowed: object = self._rules.can_join(name, subject)
+        if allowed is None:
+            raise RulesError("can_join returned None: it must return True, False or a reason")
+        return checked_result(allowed, "can_join")
 
     def _call(self, hook: Any, *arguments: Any, failed: Any = None) -> Any:
         """Calls a hook and returns its result. If it raises, counts and logs that, and returns `failed`."""

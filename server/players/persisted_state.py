@@ -10,25 +10,32 @@ has the whole state, as the notes that lead to it:
     ["left", entity]                             an entity was removed, or its player has left
     ["said", entity, attributes]                 all attributes of an entity
     ["shared", values]                           all shared values
+    ["entry", table, key, value]                 an entry of another table (`Entries`); nil: it was removed
 
 Variables of the rules' class are not persisted. State that must survive belongs in attributes or shared values.
 """
 
 from collections.abc import Iterable, Mapping
-from typing import Any, NamedTuple
+from dataclasses import dataclass, field
+from typing import Any
 
 from server.players.player import Player
 
 PLAYER, ANSWERED, SETTLED, LEFT, ATTRIBUTES, SHARED = "player", "answered", "settled", "left", "said", "shared"
-REASONS = "reasons"
+REASONS, ENTRY = "reasons", "entry"
 
 
-class PersistedState(NamedTuple):
-    """The persisted state: players and attributes by entity, and shared values by name."""
+@dataclass
+class PersistedState:
+    """The persisted state: players and attributes by entity, shared values by name, and further tables by their names.
 
-    players: dict[int, Player]
-    attributes: dict[int, dict[str, Any]]
-    shared: dict[str, Any]
+    The keys of a further table are texts or whole numbers.
+    """
+
+    players: dict[int, Player] = field(default_factory=dict)
+    attributes: dict[int, dict[str, Any]] = field(default_factory=dict)
+    shared: dict[str, Any] = field(default_factory=dict)
+    tables: dict[str, dict[Any, Any]] = field(default_factory=dict)
 
 
 def note_of(player: Player) -> list[Any]:
@@ -42,6 +49,7 @@ def whole(kept: PersistedState) -> list[list[Any]]:
     notes += [[SETTLED, entity, player.settled] for entity, player in kept.players.items() if player.settled]
     notes += [[REASONS, entity, player.reasons] for entity, player in kept.players.items() if player.reasons]
     notes += [[ATTRIBUTES, entity, attributes] for entity, attributes in kept.attributes.items()]
+    notes += [[ENTRY, name, *entry] for name, table in kept.tables.items() for entry in table.items()]
     return [*notes, [SHARED, kept.shared]]
 
 
@@ -51,7 +59,7 @@ def restored(notes: Iterable[list[Any]]) -> PersistedState:
     Raises:
         ValueError: there is no such kind of note.
     """
-    kept = PersistedState({}, {}, {})
+    kept = PersistedState()
     shared: Mapping[str, Any] = {}
     for kind, *parts in notes:
         match kind, parts:
@@ -71,6 +79,10 @@ def restored(notes: Iterable[list[Any]]) -> PersistedState:
                 kept.attributes[entity] = attributes
             case "shared", (shared,):
                 pass
+            case "entry", (name, key, None):
+                kept.tables.setdefault(name, {}).pop(key, None)
+            case "entry", (name, key, value):
+                kept.tables.setdefault(name, {})[key] = value
             case _:
                 raise ValueError(f"{kind!r}: no such note")
     for player in kept.players.values():

@@ -1,0 +1,89 @@
+"""The part of the game API that removes players and keeps them out."""
+
+import math
+
+from server.game_api.entries import Entries
+from server.game_api.turn import Turn
+from server.journal.recorded_world import RecordedWorld
+from server.players.persisted_state import PersistedState
+from server.players.player import Player
+from shared.checks import SceneError, duration, shown, text
+from shared.fields import REASON_MAX, TICK_MAX
+
+BANS_MAX = 10_000
+"""Maximum number of players that are kept out. If there are more, the one whose time ends first may join again."""
+
+
+class PlayersApi:
+    """The players of a game, for its rules."""
+
+    turn: Turn
+    kept: PersistedState
+    _world: RecordedWorld
+
+    def _init_players(self) -> None:
+        self._bans = Entries(self._world, self.kept, "bans")
+        self.kicked: list[tuple[Player, str]] = []
+        """Players to remove, each with the reason. The game removes them at the end of the tick."""
+
+    def kick(self, player: Player, reason: str = "", for_s: float | None = None) -> None:
+        """Removes a player from the game. The client gets the reason with `Left`, and does not reconnect by itself.
+
+        The connection closes at the end of this tick. `on_leave` follows in the next one.
+
+        Args:
+            player: the player.
+            reason: text of at most 500 characters for the client.
+            for_s: seconds of the game's time for which the player may not join again; `math.inf`: for good; None: the
+                player may join again at once. The player is recognised by the subject of the token, or by the name if
+                the server does not ask for tokens. This survives a restart.
+
+        Raises:
+            SceneError: `player` is not a player of this game, or a value is wrong.
+        """
+        self.turn.check("kick")
+        if not isinstance(player, Player) or self.kept.players.get(player.entity) is not player:
+            raise SceneError(f"player = {shown(player)}: must be a `Player` of this game")
+        reason = text(reason, "reason", REASON_MAX, shortest=0)
+        if for_s is not None:
+            wait_s = duration(for_s, "for_s", endless=True)
+            wait = TICK_MAX if wait_s == math.inf else round(wait_s * self._world.scene.tick_rate)
+            self._ban(_identity(player.name, player.subject), min(self._world.tick + wait, TICK_MAX), reason)
+        if player not in [known for known, _ in self.kicked]:
+            self.kicked.append((player, reason))
+
+    def pardon(self, who: str) -> bool:
+        """Lets players who were kicked for some time join again. Returns whether there was one.
+
+        Args:
+            who: the subject of their tokens, or the name if the server does not ask for tokens.
+        """
+        self.turn.check("pardon")
+        keys = [key for key in (_identity("", who), _identity(who, "")) if key in self._bans.table]
+        for key in keys:
+            self._bans.drop(key)
+        return bool(keys)
+
+    def banned(self, name: str, subject: str) -> str:
+        """Returns the reason why a client may not join because of a `kick`; empty if it may."""
+        if not self._bans.table:
+            return ""
+        key = _identity(name, subject)
+        until, reason = self._bans.table.get(key, (0, ""))
+        left = until - self._world.tick
+        if left <= 0:
+            return ""
+        kicked = "kicked" if not reason else f"kicked: {reason}"
+        return kicked if until == TICK_MAX else f"{kicked}; come back in {left / self._world.scene.tick_rate:.0f} s"
+
+    def _ban(self, key: str, until: int, reason: str) -> None:
+        for old in [old for old, (end, _) in self._bans.table.items() if end <= self._world.tick]:
+            self._bans.drop(old)
+        if len(self._bans.table) >= BANS_MAX and key not in self._bans.table:
+            self._bans.drop(min(self._bans.table, key=lambda old: (self._bans.table[old][0], old)))
+        self._bans.put(key, [until, reason])
+
+
+def _identity(name: str, subject: str) -> str:
+    """Returns the key by which a player is recognised."""
+    return f"subject {subject}" if subject else f"name {name.casefold()}"
