@@ -42,7 +42,7 @@ class PlayersApi:
             SceneError: `player` is not a player of this game, or a value is wrong.
         """
         self.turn.check("kick")
-        if not isinstance(player, Player) or self.kept.players.get(player.entity) is not player:
+        if player not in self.kept.players.values():
             raise SceneError(f"player = {shown(player)}: must be a `Player` of this game")
         reason = text(reason, "reason", REASON_MAX, shortest=0)
         if for_s is not None:
