@@ -78,7 +78,7 @@ def verdict(world: WorldState, entity: int, edit: Edit) -> int:
     if world.blocks.get(x, y, z) is None:
         return INVALID
     low = [part * BLOCK for part in edit[:3]]
-    in_the_way = kind != AIR and overlapping(world, -1, low + [part + BLOCK for part in low])
+    in_the_way = world.blocks.stops[kind] and overlapping(world, -1, low + [part + BLOCK for part in low])
     return OVERLAPS if in_the_way else DONE
 
 

@@ -2,7 +2,7 @@
 
 Theory of operation. `step` gives every awake entity a turn, in ascending order of id. A turn is
 
-    input  ->  supported?  ->  gravity  ->  move along z, x, y, each up to the first obstacle  ->  stays awake?
+    input  ->  supported?  ->  gravity, friction  ->  move along z, x, y, each to the first obstacle  ->  stays awake?
 
 Entities that sleep are not examined. An event that could make a sleeping entity move wakes it (`wake`): a block or an
 entity under it goes away, or it is written. An entity that was woken by one with a lower id has its turn in the same
@@ -15,6 +15,17 @@ overlapped nothing overlaps nothing afterwards, at any speed, with no epsilon an
 box already overlaps does not stop it, so the box can get out. Rejected: the rewind along the whole velocity (loses 93 %
 of the motion along a wall), and merged slabs (4 times slower than the dense look-up, and a sliding box catches on their
 seams).
+
+Where a template has an acceleration or a friction, the horizontal velocity approaches the wished one as a vector, by a
+bounded step per tick (`pace`, `toward`). `advance`, which has no surroundings, computes the same from the state alone.
+It relies on two facts: a part of a velocity that is not 0 always moves the entity or is stopped, and a part that is 0
+stays 0 without an event.
+
+An entity that carries others (`layout.CARRIES`) moves them in its own turn: first it, then along each axis all that
+stand on it and on each other, the foremost first. Upwards they move together, as far as all of them can. So they keep
+their places on it exactly, whatever the order of ids. An entity that stands on two carriers is carried by the first
+that moves. Rejected: riders that add the carrier's motion in their own turn. They would lag behind by a tick where
+their id is lower, and a lift could not rise under them.
 
 This source runs compiled by Numba and, unchanged, in plain Python (`shared.kernels`), so it uses whole numbers, loops
 and comparisons only. In all functions, `w` has the arrays of the world (`shared.layout`), `x0, y0, z0` is the low
@@ -30,6 +41,8 @@ from shared.layout import (
     AWAKE,
     BUTTONS,
     CANDIDATE,
+    CARRIED,
+    CARRIES,
     CELL,
     CELL_SHIFT,
     CELL_SHIFT_Z,
@@ -68,6 +81,7 @@ from shared.layout import (
     RATE,
     REACH_HI,
     REACH_LO,
+    RIDER,
     SIZE_X,
     SLOW_DOWN,
     SOLID,
@@ -113,6 +127,8 @@ CELL_TO_SEGMENT_Z = SEGMENT_SHIFT - CELL_SHIFT_Z
 """Shift from cells to segments, along z."""
 MOVES = 2 * MOVE_MAX + 1
 """Number of walk velocities per template: one for each part of a direction, -127 to 127."""
+FAR_AWAY = 1 << 60
+"""Coordinate that no box reaches, in grid steps."""
 
 
 # -- looking things up ---------------------------------------------------------------------------------------
@@ -480,6 +496,168 @@ def sweep(w: Arrays, k: int, d: int, n: int, a0: int, a1: int, i0: int, i1: int,
     return d
 
 
+# -- carrying ------------------------------------------------------------------------------------------------
+
+
+@jit
+def among(w: Arrays, n: int, row: int) -> bool:
+    """Returns whether a row is among the first `n` of `riders`."""
+    i = 0
+    while i < n * RIDER and w.riders[i] != row:
+        i += RIDER
+    return bool(i < n * RIDER)
+
+
+@jit
+def others(w: Arrays, riders: int, n: int) -> None:
+    """Takes the first `riders` of `riders` out of the `n` values in `candidates`, so that they stop nothing."""
+    c = w.candidates
+    for m in range(0, n, CANDIDATE):
+        if among(w, riders, c[m + 6]):
+            for k in range(3):
+                c[m + k] = FAR_AWAY
+                c[m + k + 3] = -FAR_AWAY
+
+
+@jit
+def board(w: Arrays, row: int, tick: int) -> int:
+    """Writes an entity that carries others to `riders`, and after it all that stand on it, directly or on each other.
+
+    An entity that another one carried in this tick does not count as standing directly on this one. Returns the number
+    of entries.
+    """
+    e, t, c, riders = w.entities, w.templates, w.candidates, w.riders
+    riders[0] = row
+    riders[1] = 0
+    count = 1
+    i = 0
+    while i < count:
+        at = riders[i * RIDER] << WIDTH_SHIFT
+        kind = e[at + TEMPLATE] * TEMPLATE_COLUMNS
+        x0 = e[at + X] + t[kind + LO_X]
+        y0 = e[at + Y] + t[kind + LO_X + 1]
+        x1 = x0 + t[kind + SIZE_X]
+        y1 = y0 + t[kind + SIZE_X + 1]
+        top = e[at + Z] + t[kind + LO_X + 2] + t[kind + SIZE_X + 2]
+        for m in range(0, gather(w, riders[i * RIDER], True, x0, y0, top, x1, y1, top), CANDIDATE):
+            if c[m + 2] == top and c[m] < x1 and c[m + 3] > x0 and c[m + 1] < y1 and c[m + 4] > y0:
+                changed = e[(c[m + 6] << WIDTH_SHIFT) + CHANGED]
+                carried = changed >> EVENT_BITS == tick and changed & CARRIED != 0
+                if (i > 0 or not carried) and not among(w, count, c[m + 6]):
+                    riders[count * RIDER] = c[m + 6]
+                    riders[count * RIDER + 1] = int(i == 0)
+                    count += 1
+        i += 1
+    return count
+
+
+@jit
+def swept(w: Arrays, riders: int, row: int, k: int, d: int) -> int:
+    """Returns how far an entity can move along axis k, at most d, without the first `riders` of `riders` in its way."""
+    e, t = w.entities, w.templates
+    at = row << WIDTH_SHIFT
+    kind = e[at + TEMPLATE] * TEMPLATE_COLUMNS
+    x0 = e[at + X] + t[kind + LO_X]
+    y0 = e[at + Y] + t[kind + LO_X + 1]
+    z0 = e[at + Z] + t[kind + LO_X + 2]
+    x1 = x0 + t[kind + SIZE_X]
+    y1 = y0 + t[kind + SIZE_X + 1]
+    z1 = z0 + t[kind + SIZE_X + 2]
+    dx = d if k == 0 else 0
+    dy = d if k == 1 else 0
+    dz = d if k == 2 else 0
+    n = gather(
+        w, row, True,
+        x0 + min(dx, 0), y0 + min(dy, 0), z0 + min(dz, 0), x1 + max(dx, 0), y1 + max(dy, 0), z1 + max(dz, 0),
+    )  # fmt: skip
+    others(w, riders, n)
+    if k == 1:
+        x0, x1, y0, y1, z0, z1 = y0, y1, z0, z1, x0, x1
+    elif k == 2:
+        x0, x1, y0, y1, z0, z1 = z0, z1, x0, x1, y0, y1
+    return sweep(w, k, d, n, x0, x1, y0, y1, z0, z1)
+
+
+@jit
+def lift(w: Arrays, riders: int, d: int) -> int:
+    """Returns how far all riders can move up together, at most d, in grid steps."""
+    for i in range(1, riders):
+        d = swept(w, riders, w.riders[i * RIDER], 2, d)
+        if d == 0:
+            break
+    return d
+
+
+@jit
+def shift(w: Arrays, row: int, direct: int, k: int, d: int, key: int, tick: int) -> None:
+    """Moves a rider along axis k. Wakes it and those that stand on it, and notes the events of its move.
+
+    An entity at rest is sent as one that stopped at its new place. Any other is sent whole.
+    """
+    e, t = w.entities, w.templates
+    at = row << WIDTH_SHIFT
+    kind = e[at + TEMPLATE] * TEMPLATE_COLUMNS
+    x0 = e[at + X] + t[kind + LO_X]
+    y0 = e[at + Y] + t[kind + LO_X + 1]
+    x1 = x0 + t[kind + SIZE_X]
+    y1 = y0 + t[kind + SIZE_X + 1]
+    top = e[at + Z] + t[kind + LO_X + 2] + t[kind + SIZE_X + 2]
+    wake_riders(w, gather(w, row, False, x0, y0, top, x1, y1, top), x0, y0, x1, y1, top, key)
+    wake(w, row, key)
+    before = e[at + X + k]
+    e[at + X + k] = before + d
+    events = STOP_X << k
+    rests = e[at + VX] == 0 and e[at + VY] == 0 and e[at + VZ] == 0 and e[at + FLAGS] & FALLING == 0
+    if not rests or (before ^ before + d) >> TO_SEGMENT != 0:
+        events |= WHOLE
+    if direct != 0:
+        events |= CARRIED
+    relink(w, row)
+    mark(w, row, tick, events)
+
+
+@jit
+def leads(w: Arrays, a: int, b: int, k: int, d: int) -> bool:
+    """Returns whether the entity at row `a` is ahead of that at row `b` in the direction of d along axis k.
+
+    If their leading faces are equal, the lower id is ahead.
+    """
+    e, t = w.entities, w.templates
+    at = a << WIDTH_SHIFT
+    by = b << WIDTH_SHIFT
+    kind = e[at + TEMPLATE] * TEMPLATE_COLUMNS
+    face = e[at + X + k] + t[kind + LO_X + k] + (t[kind + SIZE_X + k] if d > 0 else 0)
+    kind = e[by + TEMPLATE] * TEMPLATE_COLUMNS
+    other = e[by + X + k] + t[kind + LO_X + k] + (t[kind + SIZE_X + k] if d > 0 else 0)
+    if face != other:
+        return bool((face > other) == (d > 0))
+    return bool(e[at + ID] < e[by + ID])
+
+
+@jit
+def carry(w: Arrays, riders: int, k: int, d: int, key: int, tick: int) -> None:
+    """Moves the riders along axis k by d, each up to the first obstacle, and the foremost first.
+
+    Upwards they move together, because `lift` has found the way free.
+    """
+    r = w.riders
+    for i in range(RIDER, riders * RIDER, RIDER):
+        first = i
+        for j in range(i + RIDER, riders * RIDER, RIDER):
+            if leads(w, r[j], r[first], k, d):
+                first = j
+        for column in range(RIDER):
+            value = r[i + column]
+            r[i + column] = r[first + column]
+            r[first + column] = value
+        went = d if k == 2 and d > 0 else swept(w, 0, r[i], k, d)
+        if went != 0:
+            shift(w, r[i], r[i + 1], k, went, key, tick)
+
+
+# -- the whole turn -------------------------------------------------------------------------------------------
+
+
 @inlined
 def turn(w: Arrays, row: int, key: int, tick: int) -> bool:
     """Makes the whole turn of one entity. Returns whether it stays awake."""
@@ -552,15 +730,24 @@ def turn(w: Arrays, row: int, key: int, tick: int) -> bool:
         dy = displacement(p, 2 * vy)
         dz = displacement(p, from_vz + vz)
         n = 0
+        riders = 0
+        up = dz
         if meets:
+            if t[kind + CARRIES] != 0:
+                riders = board(w, row, tick)
+                if dz > 0:
+                    up = lift(w, riders, dz)
             n = gather(
                 w, row, True,
                 x0 + min(dx, 0), y0 + min(dy, 0), z0 + min(dz, 0),
                 x1 + max(dx, 0), y1 + max(dy, 0), z1 + max(dz, 0),
             )  # fmt: skip
+            if riders > 1 and dz > 0:
+                others(w, riders, n)
         went_z = 0
         if dz != 0:
-            went_z = sweep(w, 2, dz, n, z0, z1, x0, x1, y0, y1)
+            if up != 0:
+                went_z = sweep(w, 2, up, n, z0, z1, x0, x1, y0, y1)
             if went_z != dz:
                 vz = 0
                 events |= STOP_Z
@@ -587,11 +774,23 @@ def turn(w: Arrays, row: int, key: int, tick: int) -> bool:
                 relink(w, row)
                 if borders >> TO_SEGMENT != 0:
                     events |= WHOLE
+            if riders > 0:
+                n = gather(w, row, True, x0, y0, z1, x1, y1, z1)
             if n > 0 and p[GRAVITY] != 0:
                 wake_riders(w, n, x0, y0, x1, y1, z1, key)
+            if riders > 1:
+                if went_z != 0:
+                    carry(w, riders, 2, went_z, key, tick)
+                if went_x != 0:
+                    carry(w, riders, 0, went_x, key, tick)
+                if went_y != 0:
+                    carry(w, riders, 1, went_y, key, tick)
             z0 += went_z
 
-    told = e[at + CHANGED] == tick << EVENT_BITS | TOLD
+    before = e[at + CHANGED] if e[at + CHANGED] >> EVENT_BITS == tick else 0
+    told = before & (TOLD | WHOLE) == TOLD
+    if before & (STOP_X | STOP_Y | STOP_Z) != 0 and (vx != 0 or vy != 0 or vz != 0 or falling != 0):
+        events |= WHOLE
     if went_x != dx:
         if told or went_x != 0 or e[at + VX] != 0:
             events |= STOP_X

@@ -27,27 +27,29 @@ FALLING = 1
 AWAKE = 2
 """Flag of an entity, for bookkeeping: the row is in the list of awake entities."""
 
-EVENT_BITS = 9
-"""Number of bits for the events of a turn."""
-STOP_X, STOP_Y, STOP_Z, GO_X, GO_Y, FALL, LAUNCH, TOLD, WHOLE = (1 << bit for bit in range(EVENT_BITS))
+EVENT_BITS = 10
+"""Number of bits for the events of a turn. The first eight are sent."""
+STOP_X, STOP_Y, STOP_Z, GO_X, GO_Y, FALL, LAUNCH, TOLD, WHOLE, CARRIED = (1 << bit for bit in range(EVENT_BITS))
 """Events of a turn. STOP_X, STOP_Y, STOP_Z: it stopped along that axis. GO_X, GO_Y: it begins to move along that axis
 without a new input, as its input says. FALL: nothing supports it any more. LAUNCH: it jumped. TOLD: it has a new input.
-WHOLE: it was written from outside, or came into another segment, so its whole state is needed."""
+WHOLE: it was written from outside, or came into another segment, so its whole state is needed. CARRIED: an entity on
+which it stands moved it in this tick."""
 TURN = 8
 """Number of columns of an explicit turn: id (for the kernel: row, or -1), events, input (3), position (3)."""
 
-LO_X, LO_Y, LO_Z, SIZE_X, SIZE_Y, SIZE_Z, SOLID, WALKS, JUMP_SPEED, WEIGHT, TOP_SQUARE, GROUND, AIR = (
-    *range(12), 14,
+LO_X, LO_Y, LO_Z, SIZE_X, SIZE_Y, SIZE_Z, SOLID, WALKS, JUMP_SPEED, WEIGHT, TOP_SQUARE, GROUND, AIR, CARRIES = (
+    *range(12), 14, 17,
 )  # fmt: skip
 """Columns of a template's row. LO and SIZE: low corner of the box relative to the position, and its sides, in grid
 steps. SOLID, WALKS: 0 or 1. JUMP_SPEED: in velocity steps. WEIGHT: change of the velocity by gravity, in velocity steps
 per tick; 0: the entity floats. TOP_SQUARE: square of the greatest walking speed in velocity steps; 0: the horizontal
 velocity follows the input at once, and the columns behind have no meaning. GROUND: the first of three columns, each
 the greatest change of the horizontal velocity in velocity steps per tick: with an input (SPEED_UP), without one
-(SLOW_DOWN), and above the walking speed (OVERSPEED). AIR: the first of the three for an entity that falls."""
+(SLOW_DOWN), and above the walking speed (OVERSPEED). AIR: the first of the three for an entity that falls.
+CARRIES: 0 or 1."""
 SPEED_UP, SLOW_DOWN, OVERSPEED = range(3)
 """Offsets from the columns GROUND and AIR."""
-TEMPLATE_COLUMNS = 17
+TEMPLATE_COLUMNS = 18
 """Number of columns of a template's row."""
 
 GRAVITY, TERMINAL, RATE, EXACT, MEAN, PAIRS, FLOOR = range(7)
@@ -77,6 +79,8 @@ CELLS = 1 << CELLS_SHIFT
 """Number of cells of a segment."""
 CANDIDATE = 7
 """Number of columns of a candidate: low corner (3), high corner (3), row."""
+RIDER = 2
+"""Number of columns of an entry of `Arrays.riders`."""
 NOWHERE = 0
 """Segment row whose cells hold the entities of all segments that are not loaded; these are still obstacles."""
 
@@ -90,7 +94,7 @@ class Arrays(NamedTuple):
     """
 
     entities: Any  # [rows * 16]
-    templates: Any  # [templates * 17]
+    templates: Any  # [templates * 18]
     walk: Any  # [templates * 255] velocity for a move intent of -127..127
     parameters: Any  # [13]
     solid: Any  # uint32 [segments * 1024] bit x of word z << 5 | y within the segment
@@ -106,3 +110,4 @@ class Arrays(NamedTuple):
     fell: Any  # [rows + 1] ids of entities below the scene's floor
     lengths: Any  # [7] lengths of the lists, and other counts (N_AWAKE ...)
     near: Any  # [4] index and row of the segment that was looked up last
+    riders: Any  # [(rows + 1) * 2] an entity that carries others, and these: row, and whether it stands on the first

@@ -42,7 +42,7 @@ INTEGRATORS = ("mean", "semi")
 CHANCE_MAX = (1 << 63) - 1
 """Greatest seed of `Scene.chance`."""
 
-OPTIONAL = frozenset({"aim", "behaviours", "buttons", "chance", "kinds"})
+OPTIONAL = frozenset({"aim", "behaviours", "buttons", "carries", "chance", "kinds"})
 """Fields of scenes and templates that a table leaves out if they have their default, so that scenes without them keep
 their bytes and their fingerprint. A field that is None is left out, too."""
 
@@ -350,7 +350,7 @@ class Scene:
 
     def kernel_tables(self) -> tuple[layout.Int64s, layout.Int64s, layout.Int64s]:
         """Returns templates, walk velocities and parameters for `layout.Arrays`; each number is rounded once."""
-        rows = [[*template.row(), *template.rates(self.gravity, self.tick_rate)] for template in self.templates]
+        rows = [[*t.row(), *t.rates(self.gravity, self.tick_rate), t.carries] for t in self.templates]
         templates = np.array(rows, np.int64)
         walk = np.array([_walk_velocities(template.walk_speed) for template in self.templates], np.int64)
         p = np.zeros(layout.PARAMETERS, np.int64)

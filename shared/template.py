@@ -48,6 +48,8 @@ class Template:
             entities that walk, and no friction for the others.
         air_control: share of acceleration and friction while the entity falls, 0 to 1; None: 1 for entities that walk,
             and 0 for the others.
+        carries: whether an entity that stands on one of this template, and those on top of it, move along with it. A
+            template that carries has to be solid.
 
     Raises:
         SceneError: a value is not valid; the message names it.
@@ -64,6 +66,7 @@ class Template:
     acceleration: float | None = None
     friction: float | None = None
     air_control: float | None = None
+    carries: bool = False
 
     def __post_init__(self) -> None:
         own_numbers(self)
@@ -79,6 +82,8 @@ class Template:
             if to_velocity(getattr(self, name), f"{at}.{name}") < 0:
                 raise SceneError(f"{at}.{name} = {getattr(self, name)!r}: must not be negative")
         boolean(self.solid, f"{at}.solid")
+        if boolean(self.carries, f"{at}.carries") and not self.solid:
+            raise SceneError(f"{at}.carries = True: needs solid = True")
         choice(self.shown, f"{at}.shown", SHOWN)
         for name in ("gravity", "acceleration", "friction", "air_control"):
             value = getattr(self, name)
@@ -109,7 +114,7 @@ class Template:
         return [*low, *sides, self.solid, self.walk_speed > 0, to_velocity(self.jump_speed, "jump_speed")]
 
     def rates(self, gravity: float, tick_rate: int) -> list[int]:
-        """Returns the columns of `layout.Arrays.templates` from `layout.WEIGHT` on.
+        """Returns the columns of `layout.Arrays.templates` from `layout.WEIGHT` up to `layout.CARRIES` (excluded).
 
         Args:
             gravity: gravity of the scene, in blocks/s^2.

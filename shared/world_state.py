@@ -327,6 +327,7 @@ class WorldState:
         for name in ("_awake", "_next_awake", "_woken", "_later", "_changed", "_fell"):
             setattr(self, name, blocks.grown(getattr(self, name), 0, rows + 1))
         self.candidates = np.zeros((rows + 1, layout.CANDIDATE), np.int64)
+        self._riders = np.zeros((rows + 1, layout.RIDER), np.int64)
 
     def _bind(self) -> None:
         """Passes the arrays to the kernel; called whenever one has moved in memory."""
@@ -334,7 +335,7 @@ class WorldState:
         arrays: tuple[np.ndarray[Any, Any], ...] = (
             self._entities, self.templates, self._walk, self.parameters, b.solid, b.segments, b.table, b.heads,
             self._awake, self._next_awake, self._woken, self._later, self.candidates, self._changed, self._fell,
-            self._lengths, b.near,
+            self._lengths, b.near, self._riders,
         )  # fmt: skip
         self._arrays = Arrays(*map(self.kernel.lent, arrays))
         self.bound = self.kernel.bound(self._arrays)

@@ -5,7 +5,7 @@
 
 typedef int64_t i64;
 enum {ID, TEMPLATE, FLAGS, X, Y, Z, VX, VY, VZ, MOVE_X, MOVE_Y, BUTTONS, CELL, NEXT, PREV, CHANGED, WIDTH};
-enum {LO_X, SIZE_X = 3, SOLID = 6, WALKS, JUMP_SPEED, WEIGHT, TEMPLATE_COLUMNS = 17};
+enum {LO_X, SIZE_X = 3, SOLID = 6, WALKS, JUMP_SPEED, WEIGHT, TEMPLATE_COLUMNS = 18};
 enum {GRAVITY, TERMINAL, RATE, EXACT, MEAN, PAIRS, FLOOR, REACH_LO, REACH_HI = 10};
 enum {N_AWAKE, N_WOKEN, N_CHANGED, N_FELL, N_LATER, N_HOMELESS, N_STEPPED};
 enum {FALLING = 1, AWAKE = 2, JUMP = 1, MOVES = 255, MOVE_MAX = 127, NOWHERE = 0, CANDIDATE = 7};
@@ -19,7 +19,7 @@ typedef struct { /* shared.layout.Arrays, and one length */
     uint32_t *solid;
     i64 *segments, *table;
     int32_t *heads;
-    i64 *awake, *next_awake, *woken, *later, *found, *changed, *fell, *n, *near, table_length;
+    i64 *awake, *next_awake, *woken, *later, *found, *changed, *fell, *n, *near, *riders, table_length;
 } W;
 
 static inline i64 segment_row(W *w, i64 x, i64 y, i64 z) {

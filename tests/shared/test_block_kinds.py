@@ -1,15 +1,18 @@
 """Kinds of blocks with a name: those that are not solid stop nothing, support nothing and are in nobody's way."""
 
+import itertools
 import random
 from typing import Any
 
 import numpy as np
 import pytest
 
+from shared import edits
 from shared.block_kind import BlockKind
 from shared.checks import SceneError
 from shared.inputs import Input, clamp
 from shared.layout import VX, X
+from shared.messages import DONE, OVERLAPS
 from shared.scene import SCENES, Scene, load_scene
 from shared.world import OverlapError, World
 from tests.worlds import EAST, build, floor, settle, steps
@@ -214,6 +217,16 @@ def test_water_may_be_placed_where_an_entity_is_and_stone_may_not(compiled: bool
     assert world.set_block(0, 0, 0, LADDER)
     assert world.set_block(0, 0, 0, STONE, push=True)
     assert world.position(entity) != (0.1, 0.1, 0)
+
+
+def test_the_verdict_on_an_edit_is_what_it_does(compiled: bool) -> None:
+    for kind, before in itertools.product((0, STONE, WATER, LADDER, 77), (0, WATER, LADDER)):
+        world = pool(compiled=compiled)
+        entity = world.spawn("box", (0.1, 0.1, 0))
+        world.set_block(0, 0, 0, before)
+        edit = edits.Edit(0, 0, 0, kind)
+        told = edits.verdict(world, entity, edit)
+        assert told == edits.apply(world, entity, edit) == (OVERLAPS if kind in (STONE, 77) else DONE)
 
 
 def test_water_is_a_free_place_for_spawns_teleports_and_boxes(compiled: bool) -> None:

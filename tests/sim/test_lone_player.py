@@ -246,3 +246,48 @@ def test_edits_are_predicted_and_undone_where_the_server_refuses() -> None:
     assert answers[refused].verdict == "an entity is in the way"
     assert core.stats.corrections == 0
     assert core.stats.divergences == 0
+
+
+def ferry() -> Scene:
+    """Returns a flat world with a template that carries."""
+    return load_scene("flat").with_template(
+        "ferry", box_offset=(-2.0, -2.0, 0.0), box_size=(4.0, 4.0, 0.5), walk_speed=0, jump_speed=0,
+        gravity=0, carries=True, shown="predicted",
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(("preset", "ticks"), [("typical", 600), *long(*((preset, 3_000) for preset in PRESETS))])
+def test_every_correction_of_a_player_on_a_moving_platform_has_its_cause(preset: str, ticks: int) -> None:
+    """The ferry goes to and fro and up and down; its turns are acts of the server, the ways between are predicted."""
+    match = Match(ferry(), 2)
+    world = match.game.world
+    boat = world.spawn("ferry", (60.0, 60.0, 9.0))
+    wishes = random.Random(4)
+
+    def ride(core: Core, rng: random.Random) -> Input:
+        return Input(wishes.randint(-40, 40), wishes.randint(-40, 40), 0) if wishes.random() < 0.02 else Input()
+
+    player = match.join(ride, PRESETS[preset])
+    match.run_until(lambda: player.core.state == "playing", 20)
+    me = player.core.entity
+    carried = turns = 0
+    ways = [(2, 0, 0), (0, 0, 1.5), (-2, 0, 0), (0, 0, -1.5)]
+
+    def steer() -> None:
+        nonlocal carried, turns
+        if world.tick % 96 == 0:
+            world.set_velocity(boat, ways[world.tick // 96 % 4])
+            turns += 1
+        x, y, z = world.position(boat)
+        if abs(world.position(me)[0] - x) > 1.8 or abs(world.position(me)[1] - y) > 1.8:
+            world.place(me, (x, y, z + 0.5))
+            match.game.log.note_act(me)
+        carried += world.position(me)[2] == z + 0.5
+
+    match.on_tick.append(steer)
+    match.run(ticks / 32)
+    causes = [event.cause for event in player.events if isinstance(event, Corrected)]
+    assert set(causes) <= {"late input", "server act", "other entity"}
+    assert causes.count("other entity") <= 2 * turns
+    assert player.core.stats.divergences == 0
+    assert carried > 0.8 * ticks
