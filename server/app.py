@@ -31,7 +31,7 @@ from server.observability.pages import Pages, json_page, ready_page
 from server.persistence.database import StoreError
 from server.persistence.store import Store
 from server.rules import Rules, RulesError, load_rules, prepared
-from server.runtime import healthcheck, log
+from server.runtime import healthcheck, log, reload
 from server.runtime.event_loop import announce_compiling, freeze, leave, loop_factory, on_signals, rss_mb, signals
 from server.runtime.ticker import Ticker, best_alarm
 from server.runtime.warmup import warm_up
@@ -66,7 +66,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if isinstance(settings, str):
             print(settings, end="")
             return 0
-        return run(settings)
+        return reload.serve(settings, arguments) if settings.reload else run(settings)
     except (SettingsError, SceneError, StoreError, RulesError) as error:
         print("error:", *str(error).split(), file=sys.stderr)
         return 2

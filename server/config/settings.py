@@ -108,6 +108,9 @@ class Settings:
     log_level: str = setting("info", Option(str, "lowest level of the log lines on stderr", choices=LOG_LEVELS))
     log_format: str = setting("pretty", Option(str, "format of the log", choices=LOG_FORMATS))
     game: str | None = setting(None, Option(str, "class with the rules of a game (default: none)", "MODULE:CLASS"))
+    reload: bool = setting(
+        False, Option(bool, "restart when a file beside the game changes; players come back by themselves")
+    )
     seed: int = setting(0, Option(int, "seed of the random numbers of the rules", "N", 0, (1 << 63) - 1))
     record: str | None = setting(None, Option(str, "record every change of the world into this new file", "FILE"))
     kernel: str = setting(

@@ -1,0 +1,120 @@
+"""Reloading while a game is developed: a changed file restarts the server, and its players come back by themselves.
+
+`sovereign-server --reload` runs the server as a child process. If a source or a scene file beside the game changes, the
+child gets SIGTERM, tells its clients to reconnect at once, and another child starts on the same port. With `--data` the
+world goes on; without it, it is a new world. A game that cannot be loaded is shown with its error; the next change
+starts it again.
+"""
+
+import importlib.util
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TextIO
+
+from server.config.settings import Settings
+
+LOOK_S = 0.2
+"""Seconds between two looks at the files."""
+END_S = 5.0
+"""Seconds that a child has to end. Then it is killed."""
+RESTART_S = 0.9
+"""Seconds after which clients reconnect."""
+FILES_MAX = 2000
+"""Maximum number of files that are watched."""
+SUFFIXES = (".py", ".toml")
+"""Suffixes of the files that are watched."""
+LISTENING = "listening on "
+"""Beginning of the line by which a server says that it is ready."""
+
+Stamps = dict[Path, int]
+"""Times of the last change of files, in nanoseconds."""
+
+
+def folder_of(game: str | None) -> Path:
+    """Returns the folder of a game's module, or the working directory."""
+    here = str(Path.cwd())
+    if here not in sys.path:
+        sys.path.insert(0, here)
+    spec = importlib.util.find_spec((game or "").partition(":")[0]) if game else None
+    return Path(spec.origin).parent if spec is not None and spec.origin else Path(here)
+
+
+def stamps(folder: Path) -> Stamps:
+    """Returns the times of the watched files in a folder and the folders in it; hidden folders are left out."""
+    found: Stamps = {}
+    for path in folder.rglob("*"):
+        hidden = any(part.startswith(".") for part in path.relative_to(folder).parts)
+        if path.suffix in SUFFIXES and not hidden and path.is_file() and len(found) < FILES_MAX:
+            found[path] = path.stat().st_mtime_ns
+    return found
+
+
+class Child:
+    """A server in a process of its own.
+
+    Args:
+        arguments: its command line.
+    """
+
+    def __init__(self, arguments: Sequence[str]) -> None:
+        self.port: str | None = None
+        """Port on which it listens; None: it does not yet."""
+        self.process = subprocess.Popen(
+            [sys.executable, "-m", "sovereign_netcode.server", *arguments], stdout=subprocess.PIPE, text=True
+        )
+        assert self.process.stdout is not None
+        threading.Thread(target=self._read, args=(self.process.stdout,), daemon=True).start()
+
+    def end(self) -> int:
+        """Ends the process, and returns its exit code."""
+        self.process.terminate()
+        try:
+            return self.process.wait(END_S)
+        except subprocess.TimeoutExpired:
+            self.process.kill()
+            return self.process.wait()
+
+    def _read(self, out: TextIO) -> None:
+        """Passes on what the server prints, and takes the port from it."""
+        for line in out:
+            if line.startswith(LISTENING):
+                self.port = line.strip().rpartition(":")[2]
+            print(line, end="", flush=True)
+
+
+def serve(settings: Settings, arguments: Sequence[str]) -> int:
+    """Runs the server until a signal, and restarts it at each change of a file. Returns the exit code.
+
+    Args:
+        settings: the settings.
+        arguments: the command line that they come from.
+    """
+    folder = folder_of(settings.game)
+    own = [*arguments, "--reload", "false", "--restart-s", str(RESTART_S)]
+    child = Child(own)
+    try:
+        known = stamps(folder)
+        print(f"watching {folder} for changes", flush=True)
+        failed = False
+        while True:
+            time.sleep(LOOK_S)
+            code = child.process.poll()
+            if code == 0:
+                return 0
+            if code is not None and not failed:
+                failed = True
+                print("the server has ended; it starts again when a file changes", file=sys.stderr, flush=True)
+            found = stamps(folder)
+            if found == known:
+                continue
+            known, failed, port = found, False, child.port
+            print("a file has changed: restarting", flush=True)
+            child.end()
+            child = Child([*own, *(["--port", port] if port else [])])
+            child.port = port
+    finally:
+        child.end()
