@@ -10,8 +10,8 @@ from shared import edits, layout
 from shared.aim import AIM_MAX, NO_AIM
 from shared.behaviours import Behaviour, BehaviourEntry
 from shared.chance import drawn
+from shared.changes import Changes
 from shared.checks import SceneError, Vec, finite, shown, text, vector, whole
-from shared.edits import Edit
 from shared.extras import RESERVED
 from shared.free_places import OverlapError, box_at, free_place, taken
 from shared.inputs import NEUTRAL, Input, make_input
@@ -28,31 +28,6 @@ NEAR_MAX = 64.0
 """Greatest distance of `Body.near`, in blocks."""
 WAKE_MAX = (1 << 32) - 1
 """Greatest tick at which an entity can ask to have a turn."""
-
-
-class Changes:
-    """The changes of one turn.
-
-    Attributes:
-        state: the new state, 12 columns; None: it stays.
-        values: the extra columns.
-        mask: bits of the extra columns that were set.
-        steered: the input that replaces the player's; None: there is none.
-        edits: changes of blocks.
-        spawned: states of new entities, with all columns.
-        removed: entities to remove.
-        announced: names and payloads of events.
-    """
-
-    def __init__(self) -> None:
-        self.state: list[int] | None = None
-        self.values: list[int] = []
-        self.mask = 0
-        self.steered: Input | None = None
-        self.edits: list[Edit] = []
-        self.spawned: list[list[int]] = []
-        self.removed: list[int] = []
-        self.announced: list[tuple[str, bytes]] = []
 
 
 class Body:
