@@ -267,9 +267,26 @@ class Prediction:
         mine = states[states[:, ID] == entity]
         return tuple(mine[0].tolist()) if len(mine) else None
 
-    def sync_test(self) -> None:
-        """Runs the sync test: replays everything since the confirmed world. Changes nothing unless state is hidden."""
+    def sync_test(self) -> tuple[int, Int64s, Int64s] | None:
+        """Runs the sync test: replays everything since the confirmed world. Changes nothing unless state is hidden.
+
+        Returns:
+            The first tick whose states differ, with its states before and after; None: there is none.
+        """
+        ticks = range(self.confirmed.tick + 1, self.predicted.tick + 1)
+        guess = self._states.get(self.confirmed.tick)
+        known = (
+            guess is not None  # and nothing is new, and nothing far away, that a replay would correct
+            and not (self.known.terrain_changed or self._refused)
+            and guess.tobytes() == self._truth().tobytes()
+        )
+        before = [(tick, self._states.get(tick)) for tick in ticks] if known else []
         self._replay(self.predicted.tick)
+        for tick, was in before:
+            now = self._states.get(tick)
+            if was is not None and now is not None and was.tobytes() != now.tobytes():
+                return tick, was, now
+        return None
 
     def _truth(self) -> Int64s:
         states = self.known.states

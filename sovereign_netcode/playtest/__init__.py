@@ -6,6 +6,18 @@ Nothing sleeps, and the result does not depend on the machine. A seed reproduces
 """
 
 from client_sdk.netsim.links import PRESETS, Link
+from sovereign_netcode.playtest.checking import BehaviourCheckError, RandomPlayer, check_behaviours
 from sovereign_netcode.playtest.match import Match, Player, Policy, bot, wander
 
-__all__ = ["PRESETS", "Link", "Match", "Player", "Policy", "bot", "wander"]
+__all__ = [
+    "PRESETS",
+    "BehaviourCheckError",
+    "Link",
+    "Match",
+    "Player",
+    "Policy",
+    "RandomPlayer",
+    "bot",
+    "check_behaviours",
+    "wander",
+]
