@@ -45,16 +45,14 @@ class Dodge(Rules):
     def prepare(self, scene: Scene) -> Scene:
         player = replace(scene.templates[scene.template(scene.player)], friction=24.0)
         others = [each for each in scene.templates if each.name != scene.player]
-        scene = replace(scene, templates=(player, *others), buttons=("jump", "dash", "fire"), aim=True)
+        scene = replace(scene, templates=(player, *others), reach=0.0)
+        scene = replace(scene, buttons=("jump", "dash", "fire"), aim=True)
         scene = scene.with_template("dashing", walk_speed=14.0)
         scene = scene.with_template("out", walk_speed=0.0, jump_speed=0.0)
         return replace(scene, templates=(*scene.templates, BALL))
 
     def bot_policy(self, random: Any) -> DodgePlayer:
         return DodgePlayer(random)
-
-    def can_edit(self, player: Player, x: int, y: int, z: int, kind: int) -> bool:
-        return False
 
     def on_start(self) -> None:
         self._next_round()

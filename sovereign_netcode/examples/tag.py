@@ -7,8 +7,9 @@ template (clients predict its speed), scores are attributes, and the end of the 
 """
 
 import contextlib
+from typing import Any
 
-from sovereign_netcode.examples.tag_brain import wish
+from sovereign_netcode.examples.tag_brain import TagPlayer, wish
 from sovereign_netcode.server import Player, Rules
 from sovereign_netcode.shared.scene import Scene
 from sovereign_netcode.shared.units import SEGMENT
@@ -34,6 +35,9 @@ class Tag(Rules):
 
     def prepare(self, scene: Scene) -> Scene:
         return scene.with_template("it", walk_speed=5.75)
+
+    def bot_policy(self, random: Any) -> TagPlayer:
+        return TagPlayer(random)
 
     def on_start(self) -> None:
         self._plant_trees(12)

@@ -64,7 +64,7 @@ class TagPlayer:
         self._attributes = attributes
 
     def __call__(self, world: World, me: int) -> Input:
-        it = world.scene.index_of["it"]
+        it = world.scene.index_of.get("it", -1)
         states = world.states()
         places = {entity: world.position(entity) for entity in states[:, 0].tolist()}
         its = states[states[:, 1] == it, 0].tolist()

@@ -6,6 +6,7 @@ import os
 import signal
 import sys
 import time
+from collections.abc import Mapping
 
 os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
 
@@ -13,6 +14,7 @@ import pygame
 
 from client_sdk.client import Client
 from client_sdk.transports.connection import ConnectError
+from server.rules import RulesError, load_rules
 from sovereign_netcode.play import own_server
 from sovereign_netcode.play.script import Script
 from sovereign_netcode.play.window import CLOSED, Window, keyboard
@@ -29,7 +31,11 @@ def arguments(argv: list[str] | None = None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(prog="sovereign-play", description=__doc__, allow_abbrev=False)
     parser.add_argument("--url", metavar="ws://...", help="URL of the server to play on (default: starts one)")
     parser.add_argument(
-        "--game", default=GAME, metavar="MODULE:CLASS", help="game of the server that is started (default: tag)"
+        "--game",
+        default=GAME,
+        metavar="MODULE:CLASS",
+        help="game of the server that is started (default: tag); with --url, the game that is played there: its "
+        "behaviours, keys and bots are used",
     )
     parser.add_argument("--scene", help="scene of the server that is started (default: the game's)")
     parser.add_argument(
@@ -50,6 +56,11 @@ def main(argv: list[str] | None = None) -> int:
     if options.script_demo and (options.game != GAME or options.url):
         print("error: --script-demo plays tag on a server of its own; it takes no --game or --url", file=sys.stderr)
         return 2
+    try:
+        rules = load_rules(options.game)
+    except RulesError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
     script = Script(options.script_demo) if options.script_demo else None
     if script:
         os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
@@ -62,10 +73,10 @@ def main(argv: list[str] | None = None) -> int:
                 print("starting a server (the first start on a machine takes longer) ...", flush=True)
                 url = stack.enter_context(own_server.server(options.game, options.scene))
             count = options.bots if options.bots is not None else 0 if options.url else 4
-            stack.enter_context(own_server.bots(url, count))
-            client = stack.enter_context(Client.connect(url, name=options.name))
+            stack.enter_context(own_server.bots(url, count, options.game))
+            client = stack.enter_context(Client.connect(url, name=options.name, behaviours=rules.behaviours))
             title = "Sovereign Netcode" if options.url else options.game.rpartition(":")[2]
-            return play(client, options.lag / 1000, script, title)
+            return play(client, options.lag / 1000, script, title, rules.keys)
     except (ConnectError, RuntimeError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 1
@@ -92,10 +103,10 @@ def open_display(*, unseen: bool) -> None:
         raise RuntimeError(f"no display to open a window on ({found}); --script-demo OUT.png needs none")
 
 
-def play(client: Client, lag_s: float, script: Script | None, title: str) -> int:
+def play(client: Client, lag_s: float, script: Script | None, title: str, keys: Mapping[str, str]) -> int:
     """Plays until the player, the server or the script ends the session. Returns the exit code."""
     pygame.font.init()
-    window = Window(client, script or keyboard, title)
+    window = Window(client, script or keyboard, title, keys)
     window.lag(lag_s)
     clock, started = pygame.time.Clock(), time.monotonic()
     while not window.over:
@@ -105,7 +116,8 @@ def play(client: Client, lag_s: float, script: Script | None, title: str) -> int
         if script and now - started > SCRIPT_S:
             window.over = "the script took too long"
     pygame.quit()
-    print(window.over)
+    advice = "; start the window with --game MODULE:CLASS" if window.over.startswith("behaviours: ") else ""
+    print(window.over + advice)
     if script is None:
         return int(window.over != CLOSED)
     print(*(f"{what} {much:.3g}" for what, much in script.done.items()), sep=", ")

@@ -8,6 +8,7 @@ import pygame
 
 from client_sdk.view import EntityView
 from shared.checks import Vec
+from shared.template import Template
 from sovereign_netcode.play.iso import HALF, QUARTER, RISE, Colour, Ground, Point, mixed, project
 
 FINE = 4
@@ -27,6 +28,14 @@ TONES: tuple[Colour, ...] = (
     (70, 90, 130), (150, 215, 245), (120, 80, 60),
 )  # fmt: skip
 OWN: Colour = (255, 146, 60)
+PIP: Colour = (120, 230, 120)
+PIPS_MAX, FUEL_MAX, BAR = 10, 96, 48
+"""Most pips of health that are drawn, the fuel of a full bar, and the width of the bar in pixels."""
+SMALL, LOW = 0.7, 1.2
+"""Longest side below which an entity that does not walk is drawn as a ball, and height below which one that walks is
+drawn as a car, in blocks."""
+CAR_LABEL = round(24 * UNIT)
+"""Distance of the name of a car from its position, in pixels."""
 
 Solid = Callable[[int, int, int], int | None]
 
@@ -98,11 +107,28 @@ def disc(width: int, colour: Colour, alpha: int, ring: int = 0) -> pygame.Surfac
 
 
 class Actor:
-    """A figure and the way in which it is drawn."""
+    """A figure and the way in which it is drawn.
 
-    def __init__(self, figure: EntityView, tone: Colour, *, it: bool, own: bool, safe: bool) -> None:
+    Args:
+        figure: the entity in the view.
+        template: its template, which decides on its shape: a small one that does not walk is a ball, a low one a car.
+        tone: its colour.
+        heading: direction (east, north) in which it last moved.
+        it: whether it is "it" in tag.
+        own: whether it is the player's own.
+        safe: whether it cannot be tagged.
+    """
+
+    def __init__(
+        self, figure: EntityView, template: Template, tone: Colour, heading: Point, *, it: bool, own: bool, safe: bool
+    ) -> None:
         self.figure, self.it, self.own, self.safe = figure, it, own, safe
-        self.tone = IT if it else tone
+        self.tone, self.heading = IT if it else tone, heading
+        self.size = [abs(side) for side in template.box_size]
+        walks = template.walk_speed > 0
+        self.ball = not walks and max(self.size) < SMALL
+        self.car = walks and self.size[2] < LOW
+        self.alpha = 255 if walks else 110
 
     @property
     def depth(self) -> float:
@@ -110,32 +136,83 @@ class Actor:
         x, y, z = self.figure.position
         return x - y + z
 
-    def draw(self, target: pygame.Surface, camera: Point, ground: Ground, solid: Solid, looks: int) -> None:
+    def draw(self, target: pygame.Surface, camera: Point, ground: Ground, solid: Solid) -> None:
         """Draws the shadow, the figure, and the blocks that cover it."""
         x, y, z = self.figure.position
         below = ground_below(solid, (x, y, z))
+        if self.ball:
+            draw_ball(target, camera, (x, y, z), below, self.size[0], self.tone)
+            return
         rings = [disc(40 - min(int(2 * (z - below)), 16), (20, 40, 20), 110)]
         rings += [disc(66, IT, 235, 4), disc(50, IT, 90)] if self.it else []
         rings += [disc(62, SHIELD, 235, 3)] if self.safe else []
         rings += [disc(56, WHITE, 235, 2)] if self.own and not self.it else []
         for ring in reversed(rings):
             _centred(target, ring, screen((x, y, below), camera))
+        if self.car:
+            draw_car(target, camera, (x, y, z), self.heading, self.tone)
+            return
         px, py = screen((x, y, z), camera)
+        looks = look_of(self.heading)
         box = pygame.Rect(px - WIDTH // 2, py - FEET, WIDTH, HEIGHT)
         clip = target.get_clip()
-        target.blit(body(self.tone, looks), box)
+        target.blit(body(self.tone, looks, self.alpha), box)
         target.set_clip(box.clip(clip))
         if ground.cover(target, camera, (x - 0.3, y - 0.3, z), (x + 0.3, y + 0.3, z + HIGH)):
             target.blit(body(self.tone, looks, 70), box)  # faintly visible through the blocks that cover it
         target.set_clip(clip)
 
     def draw_name(self, target: pygame.Surface, camera: Point) -> None:
-        """Draws the name, over everything else."""
+        """Draws the name, and the fields "health" and "fuel" if there are any, over everything else."""
+        if self.ball:
+            return
         name = str(self.figure.attributes.get("name") or f"#{self.figure.entity}")
         px, py = screen(self.figure.position, camera)
+        top = py - (CAR_LABEL if self.car else FEET) - 20
         text = ("You are it!" if self.own else f"{name} is it!") if self.it else name
         plate = label(text, IT if self.it else (60, 130, 60) if self.own else INK)
-        target.blit(plate, (px - plate.get_width() // 2, py - FEET - 20))
+        target.blit(plate, (px - plate.get_width() // 2, top))
+        health = min(self.figure.fields.get("health", 0), PIPS_MAX)
+        for pip in range(health):
+            at = (px + 10 * pip - 5 * (health - 1), top - 7)
+            pygame.draw.circle(target, INK, at, 5)
+            pygame.draw.circle(target, PIP, at, 4)
+        if self.own and "fuel" in self.figure.fields:
+            left = min(self.figure.fields["fuel"], FUEL_MAX) * BAR // FUEL_MAX
+            pygame.draw.rect(target, INK, (px - BAR // 2 - 1, top - 9, BAR + 2, 7))
+            pygame.draw.rect(target, PIP, (px - BAR // 2, top - 8, left, 5))
+
+
+def draw_ball(target: pygame.Surface, camera: Point, at: Vec, below: float, size: float, tone: Colour) -> None:
+    """Draws a ball and its shadow on the ground."""
+    radius = max(round(size * HALF * 0.7), 3)
+    _centred(target, disc(2 * radius, (20, 40, 20), 110), screen((at[0], at[1], below), camera))
+    pygame.draw.circle(target, mixed(tone, 0.45), screen(at, camera), radius + 2)
+    pygame.draw.circle(target, tone, screen(at, camera), radius)
+
+
+def draw_car(target: pygame.Surface, camera: Point, at: Vec, heading: Point, tone: Colour) -> None:
+    """Draws a car: two slabs and a window."""
+    length = math.hypot(*heading)
+    east, north = heading[0] / length, heading[1] / length
+
+    def slab(back: float, front: float, half: float, up: float) -> list[tuple[int, int]]:
+        corners = ((back, -half), (front, -half), (front, half), (back, half))
+        return [
+            screen((at[0] + a * east - b * north, at[1] + a * north + b * east, at[2] + up), camera) for a, b in corners
+        ]
+
+    for k in range(5):
+        pygame.draw.polygon(target, mixed(tone, 0.5), slab(-0.65, 0.65, 0.36, 0.1 + 0.06 * k))
+    pygame.draw.polygon(target, tone, slab(-0.65, 0.65, 0.36, 0.4))
+    for k in range(4):
+        pygame.draw.polygon(target, INK, slab(-0.45, 0.25, 0.3, 0.45 + 0.06 * k))
+    pygame.draw.polygon(target, mixed(tone, 0.75, WHITE), slab(-0.42, 0.15, 0.28, 0.68))
+
+
+def look_of(heading: Point) -> int:
+    """Returns a direction (east, north) in eighths of a turn on the screen."""
+    return round(math.atan2(heading[0] - heading[1], heading[0] + heading[1]) * 4 / math.pi) % 8
 
 
 def draw_ghost(target: pygame.Surface, camera: Point, at: Vec, own: Vec, looks: int) -> None:

@@ -8,10 +8,8 @@ import pygame
 from sovereign_netcode.play.figures import INK, IT, WHITE, Actor, font
 from sovereign_netcode.play.iso import Colour
 
-KEYS = (
-    "WASD / arrows: walk    Space: jump    left / right mouse: dig / place    1-6: colour    "
-    "G: confirmed position    F3: diagnosis    [ ]: latency    Esc: quit"
-)
+WALK_KEYS, EDIT_KEYS = "WASD / arrows: walk", "left / right mouse: dig / place    1-6: colour"
+WINDOW_KEYS = "G: confirmed position    F3: diagnosis    [ ]: latency    Esc: quit"
 FAINT: Colour = (168, 182, 206)
 TOAST_S = 4.0
 MARGIN = 14
@@ -63,13 +61,28 @@ class Hud:
         now: float,
         *,
         title: str,
+        keys: str,
+        edits: bool,
         left_s: float | None,
         actors: Sequence[Actor],
         network: Sequence[tuple[str, str]],
         lag_s: float,
         choice: Colour,
     ) -> None:
-        """Draws all panels. `left_s` is the rest of the round in seconds; None if the game has no rounds."""
+        """Draws all panels.
+
+        Args:
+            target: the window.
+            now: the present time.
+            title: text at the top.
+            keys: the keys of the game's buttons.
+            edits: whether players may change blocks.
+            left_s: the rest of the round in seconds; None if the game has no rounds.
+            actors: the figures in sight.
+            network: figures of the network, as name and value.
+            lag_s: the latency that the slider shows.
+            choice: colour of the blocks to place.
+        """
         width, height = target.get_size()
         clock = "" if left_s is None else f"{int(left_s) // 60}:{int(left_s) % 60:02}"
         top = _panel(title, clock, 30)
@@ -80,13 +93,15 @@ class Hud:
         scores = _scores(actors)
         if scores:
             marks = tuple(tone for _, _, tone in scores)
-            board = _table("Seconds free", tuple((name, score) for name, score, _ in scores), marks)
+            board = _table("Score", tuple((name, score) for name, score, _ in scores), marks)
             target.blit(board, (width - board.get_width() - MARGIN, MARGIN))
-        keys = _panel(KEYS, "", 19)
-        target.blit(keys, ((width - keys.get_width()) // 2, height - keys.get_height() - MARGIN))
-        hand = pygame.Rect(MARGIN, height - 44, 30, 30)
-        pygame.draw.rect(target, choice, hand, border_radius=6)
-        pygame.draw.rect(target, WHITE, hand, 2, border_radius=6)
+        parts = (WALK_KEYS, keys, EDIT_KEYS if edits else "", WINDOW_KEYS)
+        line = _panel("    ".join(part for part in parts if part), "", 19)
+        target.blit(line, ((width - line.get_width()) // 2, height - line.get_height() - MARGIN))
+        if edits:
+            hand = pygame.Rect(MARGIN, height - 44, 30, 30)
+            pygame.draw.rect(target, choice, hand, border_radius=6)
+            pygame.draw.rect(target, WHITE, hand, 2, border_radius=6)
         self._toasts = [entry for entry in self._toasts if entry[0] > now]
         for n, (_, text) in enumerate(reversed(self._toasts)):
             toast = _panel(text, "", 26)

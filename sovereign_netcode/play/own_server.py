@@ -8,13 +8,12 @@ import signal
 import subprocess
 import sys
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 
 from client_sdk.async_client import AsyncClient
 from client_sdk.bots import Bot, Wander
-from client_sdk.core import Core
 from client_sdk.transports.connection import ConnectError
-from sovereign_netcode.examples.tag_brain import TagPlayer
+from server.rules import Rules, load_rules
 from sovereign_netcode.stderr import Stderr
 
 START_S = 120.0
@@ -98,27 +97,29 @@ def server(game: str, scene: str | None) -> Iterator[str]:
 
 
 @contextlib.contextmanager
-def bots(url: str, count: int) -> Iterator[None]:
-    """Runs a process of `count` bots that play on a server."""
+def bots(url: str, count: int, game: str) -> Iterator[None]:
+    """Runs a process of `count` bots that play a game, given as MODULE:CLASS, on a server."""
     if count == 0:
         yield
         return
-    with process("-m", __name__, url, str(count)):
+    with process("-m", __name__, url, str(count), game):
         yield
 
 
-def policy(seed: int) -> Callable[[Core], None]:
-    """Returns a policy that plays tag if the server does, and wanders otherwise."""
-    tag, stroll = Bot(TagPlayer()), Bot(Wander(random.Random(seed)))
-    return lambda core: (tag if core.scene is not None and "it" in core.scene.index_of else stroll)(core)
+def policy(rules: Rules, seed: int) -> Bot:
+    """Returns a bot that plays a game as its rules say (`Rules.bot_policy`), and wanders otherwise."""
+    made = rules.bot_policy(random.Random(seed))
+    return Bot(Wander(random.Random(seed)) if made is None else made)
 
 
-async def play(url: str, count: int) -> None:
-    """Plays with `count` bots until the server ends."""
+async def play(url: str, count: int, game: str) -> None:
+    """Plays a game, given as MODULE:CLASS, with `count` bots until the server ends."""
+    rules = load_rules(game)
 
     async def one(number: int) -> None:
         name = NAMES[number % len(NAMES)]
-        client = await AsyncClient.connect(url, name=name, before_update=policy(number))
+        policy_ = policy(rules, number)
+        client = await AsyncClient.connect(url, name=name, before_update=policy_, behaviours=rules.behaviours)
         async for _ in client:
             pass
 
@@ -127,6 +128,6 @@ async def play(url: str, count: int) -> None:
 
 if __name__ == "__main__":
     try:
-        asyncio.run(play(sys.argv[1], int(sys.argv[2])))
+        asyncio.run(play(sys.argv[1], int(sys.argv[2]), sys.argv[3]))
     except ConnectError as error:
         sys.exit(f"error: the bots cannot play: {error}")

@@ -42,7 +42,7 @@ class Script:
                 self.done["tagged"] = self.done.get("tagged", 0) + 1
                 self._tagged_at = now
         if view.me is None:
-            return 0.0, 0.0, False
+            return Wish()
         place = view.me.position
         if self._start is None:
             self._start, self._began = place, now
@@ -52,15 +52,15 @@ class Script:
             way = math.dist(place[:2], self._start[:2])
             if way > WALK_BLOCKS:
                 self.done["walked"] = way
-            return -0.7, 0.7, not all(view.me.velocity[:2])
+            return Wish(-0.7, 0.7, not all(view.me.velocity[:2]))
         if "jumped" not in self.done and _can_jump(window):
             self._lowest = min(self._lowest, place[2])
             if place[2] - self._lowest > JUMP_BLOCKS:
                 self.done["jumped"] = place[2] - self._lowest
-            return 0.0, 0.0, True
+            return Wish(jump=True)
         if not self._asked and not self._plan:
             if view.me.velocity[2] != 0:
-                return 0.0, 0.0, False
+                return Wish()
             x, y, z = (int(part // 1) for part in place)
             self._plan = [(x + i, y + j, z + k) for n, (i, j) in enumerate(TOWER) for k in range(n + 1)]
             self._placed_at = now
@@ -69,7 +69,7 @@ class Script:
             self._asked.add(window.client.edit(*self._plan[0], FIRST_KIND + len(self._plan) % 3))
             self._plan.pop(0)
         if self._plan:
-            return 0.0, 0.0, False
+            return Wish()
         self._take_picture(window, view, now)
         return self._play(window)
 
@@ -78,10 +78,10 @@ class Script:
         prediction = window.core.prediction
         assert prediction is not None
         if window.core.entity not in prediction.predicted:
-            return 0.0, 0.0, False
+            return Wish()
         self._player.learn(prediction.attributes)
         input_ = self._player(prediction.predicted, window.core.entity)
-        return input_.move_x / MOVE_MAX, input_.move_y / MOVE_MAX, bool(input_.buttons & JUMP)
+        return Wish(input_.move_x / MOVE_MAX, input_.move_y / MOVE_MAX, bool(input_.buttons & JUMP))
 
     def _take_picture(self, window: Window, view: View, now: float) -> None:
         """Takes the picture soon after a tag, with many figures in sight and in motion, or after `PATIENCE_S`."""

@@ -3,7 +3,7 @@
 import functools
 import math
 from collections.abc import Mapping
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import pygame
 
@@ -11,10 +11,24 @@ from client_sdk.client import Client
 from client_sdk.events import Answered, Disconnected, Diverged, Event, Happened, Left, Resumed
 from client_sdk.netsim.links import Link
 from client_sdk.view import EntityView, View
+from shared.buttons import JUMP_NAME
 from shared.checks import Cell, Vec
-from sovereign_netcode.play.figures import INK, OWN, TONES, WHITE, Actor, draw_ghost, label, screen
+from shared.scene import Scene
+from sovereign_netcode.play.figures import INK, OWN, TONES, WHITE, Actor, draw_ghost, label, look_of, screen
 from sovereign_netcode.play.hud import Hud
-from sovereign_netcode.play.iso import CHOICE, FIRST_KIND, Colour, Ground, Point, colour_of, project, target_of, top_of
+from sovereign_netcode.play.iso import (
+    CHOICE,
+    FIRST_KIND,
+    Colour,
+    Ground,
+    Point,
+    colour_of,
+    project,
+    target_of,
+    top_of,
+    unproject,
+)
+from sovereign_netcode.play.keys import Keys
 from sovereign_netcode.play.panel import Panel
 
 SIZE = 1280, 800
@@ -22,13 +36,25 @@ SKY = (122, 184, 232), (222, 240, 250)
 LAG_STEP_S, LAG_MAX_S = 0.05, 1.0
 CLOSED = "closed by the player"
 """Reason of the end (`Window.over`) when the player has closed the window."""
-Wish = tuple[float, float, bool]
-"""A direction (east, north), and whether to jump."""
+DIG, PLACE = -1, -3
+"""Numbers of the mouse buttons that remove and place blocks, unless the game has them for its own buttons."""
+EYES = 1.1
+"""Height above its position from which a figure aims, in blocks."""
 KEYS: dict[int, Point] = {
     pygame.K_w: (-1, 1), pygame.K_UP: (-1, 1), pygame.K_s: (1, -1), pygame.K_DOWN: (1, -1),
     pygame.K_d: (1, 1), pygame.K_RIGHT: (1, 1), pygame.K_a: (-1, -1), pygame.K_LEFT: (-1, -1),
 }  # fmt: skip
 """Direction (east, north) of each key. North-west is up on the screen."""
+
+
+class Wish(NamedTuple):
+    """A direction (east, north), whether to jump, the buttons that are held, and the aim."""
+
+    x: float = 0.0
+    y: float = 0.0
+    jump: bool = False
+    buttons: tuple[str, ...] = ()
+    aim: Vec | None = None
 
 
 class Pilot(Protocol):
@@ -45,14 +71,15 @@ class Window:
         client: a client that is connecting or has joined; the keys [ and ] change its simulated link.
         pilot: decides on the inputs.
         title: text at the top of the window.
+        keys: names of the keys of the game's buttons (`Rules.keys`).
     """
 
-    def __init__(self, client: Client, pilot: Pilot, title: str) -> None:
+    def __init__(self, client: Client, pilot: Pilot, title: str, keys: Mapping[str, str] | None = None) -> None:
         self.client, self.core, self.title = client, client.core, title
         self.events: list[Event] = []
         """Events of the latest frame."""
         self.pressed: set[int] = set()
-        """Keys that went down since the frame before."""
+        """Keys, and with a minus mouse buttons, that went down since the frame before."""
         self.actors: list[Actor] = []
         """All figures in sight."""
         self.panel = Panel()
@@ -61,11 +88,12 @@ class Window:
         self.kind = FIRST_KIND
         self.over = ""
         """Reason of the session's end; empty while it lasts."""
-        self._pilot = pilot
+        self._pilot, self._wanted = pilot, keys or {}
+        self._keys: tuple[Scene, Keys] | None = None
         self._screen = pygame.display.set_mode(SIZE, pygame.RESIZABLE)
         self._ground, self._hud = Ground(), Hud(LAG_MAX_S)
         self._camera: Point | None = None
-        self._looks: dict[int, int] = {}
+        self._headings: dict[int, Point] = {}
         self._tones: dict[int, int] = {}
         self._at = 0.0
         pygame.display.set_caption(f"{title} - Sovereign Netcode")
@@ -82,8 +110,8 @@ class Window:
         for act in pygame.event.get():
             self._handle(act, view)
         if self.client.playing:
-            x, y, jump = self._pilot(self, view, now)
-            self.client.set_input(x, y, jump=jump)
+            x, y, jump, buttons, aim = self._pilot(self, view, now)
+            self.client.set_input(x, y, jump=jump, buttons=buttons, aim=aim)
         self.client.update(now)
         self._draw(self.client.view(now), now)
         self._at = now
@@ -92,6 +120,16 @@ class Window:
         """Sets the latency that the simulated link adds to the round trip."""
         self.lag_s = seconds
         self.client.link = Link(seconds / 2) if seconds else None
+
+    @property
+    def keys(self) -> Keys:
+        """The keys of the scene's buttons."""
+        scene = self.core.scene
+        if scene is None:
+            return Keys((), {})
+        if self._keys is None or self._keys[0] is not scene:
+            self._keys = scene, Keys(scene.buttons, self._wanted)
+        return self._keys[1]
 
     def save(self, path: str) -> None:
         """Saves the window's content to an image file."""
@@ -139,11 +177,13 @@ class Window:
                 self.lag(min(self.lag_s + LAG_STEP_S, LAG_MAX_S))
             elif pygame.K_1 <= event.key < pygame.K_1 + len(CHOICE):
                 self.kind = FIRST_KIND + event.key - pygame.K_1
-        elif event.type == pygame.MOUSEBUTTONDOWN and event.button in (1, 3):
-            found = self._pointed(view)
-            if found is not None and self.client.playing:
-                cell, kind = (found[0], 0) if event.button == 1 else (found[1], self.kind)
-                self.client.edit(*cell, kind)
+        elif event.type == pygame.MOUSEBUTTONDOWN:
+            self.pressed.add(-event.button)
+            if -event.button in (DIG, PLACE) and -event.button not in self.keys:
+                found = self._pointed(view)
+                if found is not None and self.client.playing:
+                    cell, kind = (found[0], 0) if -event.button == DIG else (found[1], self.kind)
+                    self.client.edit(*cell, kind)
 
     def _pointed(self, view: View) -> tuple[Cell, Cell] | None:
         """Returns the block under the mouse and the free cell in front of it; None if there is none within reach."""
@@ -156,6 +196,20 @@ class Window:
             return None
         centre = [part + 0.5 for part in found[0]]
         return found if math.dist(centre, view.me.position) <= prediction.predicted.scene.reach else None
+
+    def aim(self, view: View) -> Vec | None:
+        """Returns the direction from the own figure to what is under the mouse; None if there is no own figure."""
+        prediction = self.core.prediction
+        if prediction is None or view.me is None or self._camera is None:
+            return None
+        x, y, z = view.me.position
+        mouse = pygame.mouse.get_pos()
+        at = mouse[0] + self._camera[0], mouse[1] + self._camera[1]
+        found = target_of(prediction.predicted.blocks, at, z)
+        if found is None:
+            east, north = unproject(*at, z)
+            return east - x, north - y, 0.0
+        return found[1][0] + 0.5 - x, found[1][1] + 0.5 - y, found[1][2] + EYES - (z + EYES)
 
     # -- drawing ---------------------------------------------------------------------------------------------
 
@@ -178,10 +232,10 @@ class Window:
             pygame.draw.polygon(target, WHITE, rim, 2)
         self.actors = self._cast(view)
         for actor in sorted(self.actors, key=lambda actor: actor.depth):
-            actor.draw(target, camera, self._ground, blocks.get, self._look(actor.figure))
+            actor.draw(target, camera, self._ground, blocks.get)
         if self.ghost and view.me.entity in prediction.confirmed:
             at = prediction.confirmed.position(view.me.entity)
-            draw_ghost(target, camera, at, view.me.position, self._look(view.me))
+            draw_ghost(target, camera, at, view.me.position, look_of(self._heading(view.me)))
         for actor in self.actors:
             actor.draw_name(target, camera)
         ends = self.client.shared.get("ends")
@@ -189,7 +243,9 @@ class Window:
         self._hud.draw(
             target,
             now,
-            title=self.title,
+            title=f"{self.title}{_points(self.client.shared.get('points'))}",
+            keys=self.keys.text(),
+            edits=scene.reach > 0,
             left_s=left_s,
             actors=self.actors,
             network=self.client.stats.figures(),
@@ -202,15 +258,21 @@ class Window:
     def _cast(self, view: View) -> list[Actor]:
         """Returns the figures in sight, with their state in the game."""
         found = []
+        scene = self.core.scene
+        assert scene is not None
         for figure in view.figures:
             own = figure is view.me
             safe = figure.attributes.get("safe", 0)
             safe = isinstance(safe, int) and safe > view.tick
-            tone = OWN if own else self._tone(figure.entity)
-            found.append(Actor(figure, tone, it=figure.template == "it", own=own, safe=safe))
+            team = figure.attributes.get("team", figure.fields.get("team"))
+            tone = TONES[team % len(TONES)] if isinstance(team, int) else OWN if own else self._tone(figure.entity)
+            template = scene.templates[scene.index_of[figure.template]]
+            heading = self._heading(figure)
+            it = figure.template == "it"
+            found.append(Actor(figure, template, tone, heading, it=it, own=own, safe=safe))
         seen = {actor.figure.entity for actor in found}
         self._tones = {entity: tone for entity, tone in self._tones.items() if entity in seen}
-        self._looks = {entity: look for entity, look in self._looks.items() if entity in seen}
+        self._headings = {entity: way for entity, way in self._headings.items() if entity in seen}
         return found
 
     def _tone(self, entity: int) -> Colour:
@@ -222,12 +284,12 @@ class Window:
             self._tones[entity] = counts.index(min(counts))
         return TONES[self._tones[entity]]
 
-    def _look(self, figure: EntityView) -> int:
-        """Returns the direction in which a figure last moved, in eighths of a turn on the screen."""
+    def _heading(self, figure: EntityView) -> Point:
+        """Returns the direction (east, north) in which a figure last moved."""
         vx, vy, _ = figure.velocity
         if vx or vy:
-            self._looks[figure.entity] = round(math.atan2(vx - vy, vx + vy) * 4 / math.pi) % 8
-        return self._looks.get(figure.entity, 2)
+            self._headings[figure.entity] = vx, vy
+        return self._headings.get(figure.entity, (1.0, -1.0))
 
     def _follow(self, me: Vec, now: float) -> Point:
         """Moves the camera smoothly towards the player's own figure. Returns its position."""
@@ -243,12 +305,19 @@ class Window:
 
 
 def keyboard(window: Window, view: View, now: float) -> Wish:
-    """Returns the input of the keys that are held; the space bar also counts if it went down and up again."""
-    held = pygame.key.get_pressed()
+    """Returns the input of the keys that are held; a button also counts if its key went down and up again."""
+    held, mouse = pygame.key.get_pressed(), pygame.mouse.get_pressed()
+
+    def down(code: int) -> bool:
+        return code in window.pressed or (held[code] if code > 0 else mouse[-code - 1])
+
     x = sum(way[0] for key, way in KEYS.items() if held[key])
     y = sum(way[1] for key, way in KEYS.items() if held[key])
     length = math.hypot(x, y) or 1.0
-    return x / length, y / length, held[pygame.K_SPACE] or pygame.K_SPACE in window.pressed
+    scene, buttons = window.core.scene, window.keys.held(down)
+    aims = scene is not None and scene.aim and any(button != JUMP_NAME for button in buttons)  # an aim costs bytes
+    jump = scene is not None and JUMP_NAME not in scene.buttons and down(pygame.K_SPACE)
+    return Wish(x / length, y / length, jump, buttons, window.aim(view) if aims else None)
 
 
 @functools.lru_cache(1)
@@ -271,8 +340,20 @@ def _sentence(name: str, data: Any, view: View) -> str:
     match name, data:
         case "tagged", {"by": by, "who": who}:
             return f"{called(by)} tagged {called(who)}"
+        case "out", {"by": by, "who": who}:
+            return f"{called(by)} puts {called(who)} out"
+        case "round", {"winner": str(winner)}:
+            return f"{winner} wins the round"
         case "round", {"winner": winner}:
             return f"{called(winner)} wins the round"
     if isinstance(data, Mapping):
-        return name + "".join(f"  {key} {value}" for key, value in data.items())
+        named = {key: called(value) if key in ("by", "who") else value for key, value in data.items()}
+        return name + "".join(f"  {key} {value}" for key, value in named.items())
     return f"{name} {'' if data is None else data}"
+
+
+def _points(points: Any) -> str:
+    """Returns the shared value "points", a table of teams and their points, as a text; empty if there is none."""
+    if not isinstance(points, Mapping):
+        return ""
+    return "".join(f"    {team} {count}" for team, count in points.items())

@@ -31,9 +31,15 @@ os.environ["PYGAME_HIDE_SUPPORT_PROMPT"] = "1"
 
 import pygame  # noqa: E402
 
+from client_sdk.bots import Wander  # noqa: E402
+from sovereign_netcode.examples.dodge import Dodge  # noqa: E402
+from sovereign_netcode.examples.dodge_brain import DodgePlayer  # noqa: E402
 from sovereign_netcode.examples.freeze import Freeze  # noqa: E402
+from sovereign_netcode.examples.race import Race  # noqa: E402
 from sovereign_netcode.examples.tag import Tag  # noqa: E402
+from sovereign_netcode.examples.tag_brain import TagPlayer  # noqa: E402
 from sovereign_netcode.play import app, iso, own_server  # noqa: E402
+from sovereign_netcode.play.keys import Keys  # noqa: E402
 from sovereign_netcode.play.window import SIZE, Window, keyboard  # noqa: E402
 
 
@@ -121,10 +127,11 @@ class Session:
     """A window with a player of a match, by default of tag."""
 
     def __init__(self, latency_s: float = 0.01, scene: str = "meadow", rules: Rules | None = None) -> None:
-        self.match = Match(load_scene(scene), 5, rules=rules or Tag())
-        self.core = Core("Ann")
+        rules = rules or Tag()
+        self.match = Match(load_scene(scene), 5, rules=rules)
+        self.core = Core("Ann", behaviours=rules.behaviours)
         self.player: Player = self.match.join(self._input, Line(latency_s), self.core)
-        self.window = Window(Client(self.core, Idle()), keyboard, "Tag")
+        self.window = Window(Client(self.core, Idle()), keyboard, "Tag", rules.keys)
         self.run(2)
 
     def _input(self, core: object, rng: random.Random) -> Input:
@@ -233,6 +240,51 @@ def test_every_game_is_drawn_in_every_scene(make: type[Rules], scene: str) -> No
     assert {actor.figure.entity for actor in session.window.actors} == set(session.match.game.api.entities())
     assert session.colours() > 200
     assert session.match.game.counters.rules_failed == 0
+
+
+def test_balls_cars_and_health_are_drawn_and_the_mouse_throws(monkeypatch: pytest.MonkeyPatch) -> None:
+    session = Session(rules=Dodge())
+    window, game, me = session.window, session.match.game.api, session.core.entity
+    assert window.keys.names == {"jump": "space", "dash": "left shift", "fire": "left mouse"}
+    assert "Left shift: dash    Left mouse: fire" in window.keys.text()
+    session.run(1)
+    camera = window._camera
+    assert camera is not None
+    x, y, z = game.position(me)
+    at = tuple(int(a - b) for a, b in zip(iso.project(x + 4, y, z), camera, strict=True))
+    monkeypatch.setattr(pygame.mouse, "get_pos", lambda: at)
+    pygame.event.post(pygame.event.Event(pygame.MOUSEBUTTONDOWN, button=1))
+    session.run(0.3)
+    mine = [actor for actor in window.actors if actor.ball and actor.figure.fields["by"] == me]
+    assert len(mine) == 1
+    assert mine[0].figure.velocity[0] > 5, "it flies east, to the mouse"
+    assert mine[0].tone == next(actor.tone for actor in window.actors if actor.own), "the colour of the team"
+    assert not any(actor.car for actor in window.actors)
+    assert session.core.stats.corrections_by_cause.get("nondeterminism", 0) == 0
+    session = Session(scene="topdown", rules=Race())
+    assert all(actor.car for actor in session.window.actors)
+    assert session.colours() > 200
+
+
+def test_keys_are_those_of_the_rules_and_else_of_the_window() -> None:
+    keys = Keys(("jump", "a", "b", "c"), {"b": "left mouse"})
+    assert keys.names == {"jump": "space", "a": "left shift", "b": "left mouse", "c": "e"}
+    assert keys.held(lambda code: code in (pygame.K_e, -1)) == ("b", "c")
+    assert -1 in keys
+    assert -3 not in keys
+    with pytest.raises(RuntimeError, match=r"keys\.a = 'leftt': there is no such key"):
+        Keys(("a",), {"a": "leftt"})
+
+
+def test_a_game_that_cannot_be_loaded_is_an_error(capsys: pytest.CaptureFixture[str]) -> None:
+    assert app.main(["--game", "no_such_module:Game"]) == 2
+    assert "error: game = 'no_such_module:Game': cannot be loaded" in capsys.readouterr().err
+
+
+def test_bots_play_the_game_of_the_window() -> None:
+    assert isinstance(own_server.policy(Dodge(), 1)._policy, DodgePlayer)
+    assert isinstance(own_server.policy(Tag(), 1)._policy, TagPlayer)
+    assert isinstance(own_server.policy(Freeze(), 1)._policy, Wander)
 
 
 @pytest.mark.parametrize("driver", ["dummy", "offscreen", "no_such_driver"])
