@@ -3,12 +3,17 @@
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, cast
 
+import numpy as np
+import numpy.typing as npt
+
 from client_sdk.core import Core
 from client_sdk.diagnosis import Diagnosis, Use, diagnosis
 from client_sdk.drawn import Drawn
+from client_sdk.picture_blocks import PictureBlocks
 from client_sdk.stats import Stats
 from client_sdk.view import View
 from shared.buttons import Names
+from shared.checks import Cell
 from shared.inputs import make_input
 
 if TYPE_CHECKING:
@@ -25,6 +30,7 @@ class BaseClient:
 
     def __init__(self, core: Core) -> None:
         self.core = core
+        self._picture_blocks = PictureBlocks(core)
 
     @property
     def joining(self) -> bool:
@@ -165,6 +171,21 @@ class BaseClient:
         number = self.core.command(name, data)
         self._filed()
         return number
+
+    def block(self, x: int, y: int, z: int) -> int | None:
+        """Returns the kind of a block as the client shows it, 0 for air; None if its segment is not loaded."""
+        return self._picture_blocks.block(x, y, z)
+
+    def segment(self, index: Cell) -> npt.NDArray[np.uint8]:
+        """Returns the kinds of a segment's blocks, [z, y, x], 32 each, as a copy; air if it is not loaded."""
+        return self._picture_blocks.segment(index)
+
+    def blocks_changed(self) -> set[Cell]:
+        """Returns the segments whose blocks have changed, arrived or gone since the last call, to draw them anew.
+
+        The first call returns all loaded segments. Own edits count at once; an edit that is taken back counts again.
+        """
+        return self._picture_blocks.changed()
 
     def diagnosis(self) -> Diagnosis:
         """Returns a verdict on the prediction in plain words, what to do about it, and warnings of wrong use.

@@ -17,7 +17,7 @@ from client_sdk.prediction.prediction import Prediction, Reconciled
 from client_sdk.timing.server_clock import ServerClock
 from client_sdk.timing.timeline import Timeline
 from shared.checks import Vec
-from shared.layout import CELL, ID, TEMPLATE, VX, X
+from shared.layout import CELL, ID, MOVE_X, TEMPLATE, VX, X
 from shared.scene import Scene
 from shared.units import BLOCK, SPEED
 
@@ -27,7 +27,8 @@ class EntityView:
     """One entity to draw: its number, position in blocks, velocity in blocks/s, and the name of its template.
 
     `attributes` are the named values that the rules of the game gave to the entity, for example "name". `fields` are
-    the fields of its behaviour.
+    the fields of its behaviour. `facing` is a direction of length 1, east and north: the one in which the entity aims,
+    or else last walked or moved.
     """
 
     entity: int
@@ -36,6 +37,7 @@ class EntityView:
     velocity: Vec
     attributes: Mapping[str, Any] = field(default_factory=dict)
     fields: Mapping[str, int] = field(default_factory=dict)
+    facing: tuple[float, float] = (1.0, 0.0)
 
 
 @dataclass(frozen=True)
@@ -58,6 +60,8 @@ class View:
         return self.others if self.me is None else [*self.others, self.me]
 
 
+FACINGS_MIN = 64
+"""Number of kept directions up to which those of entities out of view are not dropped."""
 NOTHING = View(0.0, None, [])
 """The view before the client has joined."""
 NO_ATTRIBUTES: Mapping[str, Any] = MappingProxyType({})
@@ -74,6 +78,7 @@ class ViewBuilder:
         self._predicted = {i for i, template in enumerate(scene.templates) if template.shown == "predicted"}
         self._smoothing: dict[int, Smoothing] = {}
         self._extras = scene.extras
+        self._facings: dict[int, tuple[float, float]] = {}
         self._delay = 0.0  # the input delay of the latest view, in ticks
         self._viewed = -math.inf  # the timeline's tick of the latest view
 
@@ -104,6 +109,9 @@ class ViewBuilder:
         self._delay = min(prediction.ahead, self._delay + max(tick - self._viewed, 0.0))
         self._viewed = tick
         states, places = self.interpolation.sample(server_tick)
+        if len(self._facings) > 2 * len(states) + FACINGS_MIN:
+            there = set(states[:, ID].tolist())
+            self._facings = {entity: facing for entity, facing in self._facings.items() if entity in there}
         others = []
         for state, place in zip(states.tolist(), places.tolist(), strict=True):
             entity = state[ID]
@@ -136,7 +144,19 @@ class ViewBuilder:
         vx, vy, vz = (part / SPEED for part in state[VX : VX + 3])
         attributes = self._prediction.attributes.get(state[ID], NO_ATTRIBUTES)
         template = self._templates[state[TEMPLATE]]
+        facing = self._facing(state)
         if not self._extras.count:
-            return EntityView(state[ID], template, (x, y, z), (vx, vy, vz), attributes)
+            return EntityView(state[ID], template, (x, y, z), (vx, vy, vz), attributes, facing=facing)
         fields = self._prediction.predicted.fields_of(state[TEMPLATE], list(state[CELL:]))
-        return EntityView(state[ID], template, (x, y, z), (vx, vy, vz), attributes, fields)
+        return EntityView(state[ID], template, (x, y, z), (vx, vy, vz), attributes, fields, facing)
+
+    def _facing(self, state: Sequence[int]) -> tuple[float, float]:
+        """Returns the direction in which an entity looks, and keeps it for when it stands still."""
+        aims = self._extras.aims and (state[CELL] or state[CELL + 1])
+        for part in (CELL if aims else MOVE_X, VX):
+            east, north = state[part], state[part + 1]
+            if east or north:
+                length = math.hypot(east, north)
+                self._facings[state[ID]] = east / length, north / length
+                break
+        return self._facings.get(state[ID], (1.0, 0.0))
