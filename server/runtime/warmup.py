@@ -8,11 +8,15 @@ from server.config.limits import Limits
 from server.game import Game
 from server.journal.recorded_world import RecordedWorld
 from shared import edits, messages
+from shared.aim import NO_AIM, make_aim
 from shared.checks import SceneError
+from shared.inputs import Input, row
 from shared.messages import Bye, Command, Hello, Inputs, Message, Ping, Resync, encode
 from shared.scene import Scene
 from shared.units import SEGMENT
 
+BUTTONS = 0xFF
+"""All buttons of an input."""
 TICKS = 40
 """Length of the warm-up in ticks: more than 32, so that a checksum of a segment is sent at least once."""
 
@@ -61,9 +65,10 @@ def warm_up(scene: Scene) -> RecordedWorld:
         raise SceneError(f"spawns = {scene.spawns}: no room for a {scene.player!r} at or near any of them")
     shooter, other = joined[0], joined[-1]
     x, y, z = (int(part // 1) for part in game.world.position(shooter.entity))
+    aim = make_aim((1, 0, 0)) if scene.aim else NO_AIM
     for n in range(TICKS):
         at = game.world.tick
-        send(Inputs(at + 1, at, bytes((127, 0, n % 2))), Ping(now))
+        send(Inputs(at + 1, at, row(Input(127, 0, n % 2 * BUTTONS, aim), aim=scene.aim)), Ping(now))
         # Edits of the block in which they stand (refused), on which they stand (dug), and above them (placed).
         cell = (x, y, z + (0, -1, 3)[n % 3])
         for kind in (1, 0):
@@ -72,7 +77,8 @@ def warm_up(scene: Scene) -> RecordedWorld:
         past = game.rewind.at(game.world.tick - 2.5, shooter.entity)
         past.ray((x, y, z + 1.0), (1.0, 0.25, -0.125), 32.0)
         past.box((x - 2.0, y - 2.0, z - 2.0), (x + 2.0, y + 2.0, z + 2.0))
-    game.world.place(other.entity, (x, y, scene.origin[2] * SEGMENT - 64.0))  # falls out, and is put at a spawn
+    if other.entity in game.world:  # no behaviour has removed it
+        game.world.place(other.entity, (x, y, scene.origin[2] * SEGMENT - 64.0))  # falls out, and is put at a spawn
     send(Resync())
     tick()
     tick()
