@@ -264,11 +264,12 @@ def overlapping(world: World) -> list[tuple[int, int]]:
 
 
 def in_blocks(world: World) -> list[int]:
-    """Returns the entities that overlap a block."""
+    """Returns the solid entities that overlap a block. A block may be placed where one is that is not solid."""
     return [
         entity
         for entity in world.states()[:, 0].tolist()
-        if any(
+        if world.scene.templates[world.state(entity)[TEMPLATE]].solid
+        and any(
             world.blocks.get(x, y, z)
             for low in [box(world, entity)]
             for z in range(low[2] // BLOCK, -(-low[5] // BLOCK))
