@@ -327,6 +327,7 @@ class Core:
         try:
             world = worlds.replica(welcome, now)
         except BehaviourError as error:
+            self._send(messages.Bye(messages.WRONG_SCENE, str(error)[: fields.REASON_MAX], -1.0))  # no seat is kept
             self._fail(messages.WRONG_SCENE, str(error))
             return
         if self.scene is not None and world.scene.digests != self.scene.digests:

@@ -149,11 +149,17 @@ def scene(classes: tuple[type[Behaviour], ...] = CLASSES, **changes: Any) -> Sce
     return Scene("behaving", **(values | changes)).with_behaviours(classes)
 
 
+_scene = scene
+
+
 class Playground(Rules):
     """Rules with the behaviours of this module and some crates."""
 
     behaviours = CLASSES
     crates = ((26.5, 26.5, 2.0), (33.5, 36.5, 2.0), (38.5, 30.5, 2.0))
+
+    def prepare(self, scene: Scene) -> Scene:
+        return _scene(())
 
     def on_start(self) -> None:
         for place in self.crates:

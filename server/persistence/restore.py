@@ -2,6 +2,7 @@
 
 import logging
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
 
@@ -47,7 +48,8 @@ def load(path: Path, scene: Scene, game: str = "", *, compiled: bool | None = No
 
     Args:
         path: the database.
-        scene: the scene; it must be the one with which the world was saved.
+        scene: the scene; it must be the one with which the world was saved. Only the code of its behaviours may differ,
+            if the world was saved by a clean stop.
         game: the name of the game, which must be the same, too; empty: none.
         compiled: whether the kernel is compiled, as for `World`.
 
@@ -68,9 +70,13 @@ def load(path: Path, scene: Scene, game: str = "", *, compiled: bool | None = No
             "another directory"
         )
     try:
-        theirs = Scene.from_table(msgpack.unpackb(saved.scene, strict_map_key=False)).digests
+        former = Scene.from_table(msgpack.unpackb(saved.scene, strict_map_key=False))
+        theirs = former.digests
         differ = sorted(name for name in theirs | scene.digests if theirs.get(name) != scene.digests.get(name))
-        if differ:
+        rewritten = _rewritten(former, scene) if differ == ["behaviours"] else ""
+        if rewritten:
+            _take_code(path, scene, saved, game, rewritten)
+        elif differ:
             raise StoreError(
                 f"{path}: was saved with another scene (different: {', '.join(differ)}). Start with the scene that it "
                 "was saved with, or use another directory"
@@ -85,6 +91,35 @@ def load(path: Path, scene: Scene, game: str = "", *, compiled: bool | None = No
         ) from error
     except (LookupError, TypeError, ValueError, OverflowError) as error:
         raise database.damaged(path, error) from error
+
+
+def _rewritten(former: Scene, scene: Scene) -> str:
+    """Returns the names of the behaviours whose code has changed, if nothing else of the behaviours has; otherwise ""."""
+    before, now = ([replace(entry, digest="x") for entry in each.behaviours] for each in (former, scene))
+    if before != now:
+        return ""
+    pairs = zip(former.behaviours, scene.behaviours, strict=True)
+    return ", ".join(entry.name for entry, other in pairs if entry.digest != other.digest)
+
+
+def _take_code(path: Path, scene: Scene, saved: Saved, game: str, names: str) -> None:
+    """Saves the new code of behaviours with a checkpoint that no log follows.
+
+    Raises:
+        StoreError: a log follows, which only the former code can replay.
+    """
+    if saved.log:
+        raise StoreError(
+            f"{path}: the code of the behaviours {names} has changed, and the last {len(saved.log)} ticks of the saved "
+            "world need the former code. Start it once with the former code, and stop that: then there is nothing to "
+            "replay"
+        )
+    logger.warning("%s: the code of the behaviours %s has changed since it was saved", path, names)
+    file = Database(path)
+    try:
+        file.save(saved.checkpoint._replace(segments=[]), msgpack.packb(scene.to_table()), saved.chain, game)
+    finally:
+        file.close()
 
 
 def _served(game: str) -> str:
