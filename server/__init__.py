@@ -1,12 +1,13 @@
 """The authoritative game server.
 
 `Rules` is the base class of a game, `Player` what its hooks get, `Limits` the bounds of a server, and `Game` one world
-with its clients.
+with its clients. `whole_number`, `number`, `words`, `one_of` and `flag` declare the fields of a game's commands.
 """
 
 from server.config.limits import Limits
+from server.declared import flag, number, one_of, whole_number, words
 from server.game import Game
 from server.players.player import Player
 from server.rules import Rules
 
-__all__ = ["Game", "Limits", "Player", "Rules"]
+__all__ = ["Game", "Limits", "Player", "Rules", "flag", "number", "one_of", "whole_number", "words"]

@@ -24,6 +24,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from server.config.options import nearest
+from server.declared import Value, check_declaration
 from server.players.player import Player
 from shared.behaviours import Behaviour, checked_classes
 from shared.checks import SceneError, shown
@@ -52,6 +53,15 @@ class Rules:
 
     behaviours: Sequence[type[Behaviour]] = ()
     """The behaviours of the game (`shared.behaviours`). Clients pass the same classes to `Client.connect`."""
+
+    commands: Mapping[str, Mapping[str, Value]] = {}
+    """Declared commands (`server.declared`), whose fields are checked before `on_command`. Empty: any command."""
+
+    events: Mapping[str, str] = {}
+    """Meanings of the game's events by name, for `sovereign-server describe`."""
+
+    attributes: Mapping[str, str] = {}
+    """Meanings of the attributes of entities by name, for `sovereign-server describe`."""
 
     keys: Mapping[str, str] = {}
     """Keys of the window of `sovereign-play`, by button: names as pygame has them, like "left shift", or "left mouse",
@@ -104,7 +114,8 @@ class Rules:
         Args:
             player: the sender.
             name: name of the command, chosen by the game.
-            payload: data of the command: any MessagePack value. A client can send anything, so check it.
+            payload: data of the command: any MessagePack value. A client can send anything, so check it, or declare
+                the commands (`Rules.commands`): then it is a table of checked values.
 
         Returns:
             False if the command is not allowed, or a text that says why: the client gets that as the result, with at
@@ -182,6 +193,10 @@ def check_rules(rules: object) -> None:
         raise RulesError(f"{owner}.scene = {shown(rules.scene)}: must be the name of a scene, or the path of its file")
     if rules.names not in NAMES:
         raise RulesError(f"{owner}.names = {shown(rules.names)}: must be one of {', '.join(NAMES)}")
+    try:
+        check_declaration(rules.commands, f"{owner}.commands")
+    except SceneError as error:
+        raise RulesError(str(error)) from None
     plain = {hook.replace("_", ""): hook for hook in HOOKS}
     for name in dir(rules):
         meant = plain.get(name.lower().replace("_", ""), "")

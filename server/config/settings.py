@@ -42,12 +42,13 @@ An authoritative game server for WebSocket clients: a world of blocks at a fixed
   sovereign-server --game sovereign_netcode.examples.tag:Tag    the sample game; sovereign-play opens a window on it
 """
 EPILOG = f"""\
-Other commands: `sovereign-server token --help` issues tokens; `sovereign-server check --help` asks whether a server is
-ready. Each setting can also come from an environment variable ({ENV_PREFIX}PORT=9000) or from a TOML file (port = 9000;
-see --print-config). A flag takes precedence over the environment, the environment over the file, the file over the
-default. When the server is ready, it prints "listening on ws://HOST:PORT" and then the address of its live page. It
-answers GET /healthz, /readyz, /stats and /metrics on the same port. After SIGTERM, SIGINT or SIGHUP it tells its
-clients to reconnect later and exits with code 0. If a setting cannot be used, it exits with code 2.
+Other commands: `sovereign-server token --help` issues tokens; `sovereign-server check --help` asks whether a
+server is ready; `sovereign-server describe --game MODULE:CLASS` prints what a game consists of. Each setting
+can also come from an environment variable ({ENV_PREFIX}PORT=9000) or from a TOML file (port = 9000; see
+--print-config). A flag takes precedence over the environment, the environment over the file, the file over the
+default. When the server is ready, it prints "listening on ws://HOST:PORT" and then the address of its live
+page. It answers GET /healthz, /readyz, /stats and /metrics on the same port. After SIGTERM, SIGINT or SIGHUP it
+tells its clients to reconnect later and exits with code 0. If a setting cannot be used, it exits with code 2.
 """
 
 

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from server.declared import RefusedError, checked
 from server.game_api.contacts import Contacts
 from server.game_api.turn import OutOfTurnError
 from server.journal.recorded_world import RecordedWorld
@@ -113,6 +114,12 @@ class Hooks:
         self.seen = command.seen
         if not _overrides(self._rules, "on_command"):
             return messages.INVALID
+        if self._rules.commands:
+            try:
+                payload = checked(self._rules.commands, command.name, payload)
+            except RefusedError as error:
+                self.reason = _sendable(str(error))
+                return messages.INVALID
         done = self._call(self._rules.on_command, player, command.name, payload, failed=_FAILED)
         if done is _FAILED:
             return messages.FAILED

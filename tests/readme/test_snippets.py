@@ -17,7 +17,7 @@ import pytest
 from client_sdk import Loopback
 from client_sdk.bots import Follow, Wander
 from client_sdk.core import Core
-from client_sdk.events import Announced, BehaviourFailed, Corrected, Withdrawn
+from client_sdk.events import Announced, Answered, BehaviourFailed, Corrected, Happened, Withdrawn
 from client_sdk.netsim.links import PRESETS
 from server.game import Game
 from shared.inputs import make_input
@@ -31,7 +31,8 @@ from tests.readme.run_snippet import LOOPS
 ENGINES = ["pygame-ce", "pyglet", "arcade", "Panda3D", "ursina"]
 ON_A_SERVER = ["asyncio", "A bot"]
 WAITS = "Threads, timers and asyncio"
-ALONE = ["A game", "Without a socket", "Testing it", "Agents that learn", WAITS, "Buttons and aim", "Behaviours"]
+GAMES = ["Buttons and aim", "Behaviours", "Declared commands"]
+ALONE = ["A game", "Without a socket", "Testing it", "Agents that learn", WAITS, *GAMES]
 A_FILE = "Your own game"
 
 
@@ -110,6 +111,25 @@ def test_behaviours() -> None:
     match.run(3)
     assert match.game.api.entities("ball") == []
     assert not [event for event in player.events if isinstance(event, Corrected | Withdrawn | BehaviourFailed)]
+
+
+def test_declared_commands() -> None:
+    rules = alone("Declared commands")["Shop"]()
+    match = Match(load_scene(rules.scene), seed=1, rules=rules)
+    player = match.join(wander)
+    match.run(2)
+    for name, data in (("say", {"text": "hello"}), ("buy", {"item": "bow"}), ("buy", {"item": "shoe"})):
+        player.core.command(name, data)
+    match.run(1)
+    answers = [(event.done, event.verdict) for event in player.events if isinstance(event, Answered)]
+    assert answers == [
+        (True, "done"),
+        (False, "no bow left"),
+        (False, "buy.item = 'shoe': must be one of sword, bow"),
+    ]
+    assert [event.data for event in player.events if isinstance(event, Happened)] == [
+        {"text": "hello", "by": player.core.entity}
+    ]
 
 
 def test_single_player() -> None:
