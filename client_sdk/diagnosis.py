@@ -25,7 +25,7 @@ ADVICE = {
     DIVERGING: "A behaviour reads more than its state and inputs (a clock, random, the order of a set), or a copy is "
     "damaged. sovereign_netcode.playtest.check_behaviours finds the behaviour in a test of the game.",
 }
-"""What to do about each verdict."""
+"""Advice for each verdict."""
 
 
 class Diagnosis(NamedTuple):
@@ -42,7 +42,7 @@ class Diagnosis(NamedTuple):
 
 
 class Use(NamedTuple):
-    """How a program uses its client.
+    """The use that a program makes of its client.
 
     `waiting` is the number of events that it has not taken, `playing_s` the time of play in seconds, `steered` whether
     any input was set, `predicts` whether its scene has behaviours.

@@ -103,7 +103,7 @@ class Turns:
         self._bodies = [made[k] if k >= 0 else None for k in extras.behaviour_of.tolist()]
         self._behaves = extras.behaviour_of >= 0
         self._always = np.array([body is not None and body.behaviour.always for body in self._bodies], np.bool_)
-        """For each template, whether its entities have turns in every tick."""
+        """Truth values by template: whether its entities have turns in every tick, [templates]."""
         self.rows: Int64s | None = None
         """Rows of the entities with behaviours, ascending by id; None: to be looked up."""
         self.announced: list[Announcement] = []

@@ -168,7 +168,7 @@ def _check_again(player: Player, scene: Scene) -> None:
 
 
 def _check_events(player: Player) -> None:
-    """Checks what a player's client was told.
+    """Checks the events of a player's client.
 
     Raises:
         BehaviourCheckError: a turn has failed, or client and server differ without a cause.

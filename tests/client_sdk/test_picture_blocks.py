@@ -1,4 +1,4 @@
-"""What a picture needs besides positions: blocks, the segments that have changed, and where entities look."""
+"""A picture's needs besides positions: blocks, the segments that have changed, and where entities look."""
 
 import numpy as np
 import pytest

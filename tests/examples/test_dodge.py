@@ -45,7 +45,7 @@ class Hand:
     def __init__(self) -> None:
         self.next = NEUTRAL
         self.frames: list[tuple[int, str, set[int]]] = []
-        """Of each frame: the predicted tick, the own template there, and the own balls in the view."""
+        """Frames: the predicted tick, the own template there, and the own balls in the view."""
 
     def __call__(self, core: Core, rng: random.Random) -> Input:
         prediction = core.prediction

@@ -44,7 +44,7 @@ class Hand:
     def __init__(self) -> None:
         self.now = NEUTRAL
         self.templates: list[tuple[int, str]] = []
-        """Of each predicted tick: its number, and the own template."""
+        """Predicted ticks: the number, and the own template."""
 
     def __call__(self, core: Core, rng: random.Random) -> Input:
         assert core.prediction is not None

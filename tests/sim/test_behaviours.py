@@ -1,4 +1,4 @@
-"""Behaviours in a match: predicted in the next frame, confirmed to the bit, and corrected for reasons that are told."""
+"""Behaviours in a match: predicted in the next frame, confirmed to the bit, and corrected with a cause."""
 
 import io
 import random
@@ -39,7 +39,7 @@ def causes(players: Sequence[Player]) -> Counter[str]:
 
 
 def told(player: Player) -> Counter[str]:
-    """Returns how often a player was told of each announced event, less those that were withdrawn."""
+    """Returns the number of announcements that a player got, by name, less those that were withdrawn."""
     count: Counter[str] = Counter()
     for event in player.events:
         if isinstance(event, Announced) and event.number:
