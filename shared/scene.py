@@ -17,7 +17,7 @@ import numpy as np
 from shared import behaviours as behaviour_classes
 from shared import layout
 from shared.aim import NO_AIM, Aim
-from shared.behaviours import BehaviourEntry, checked_entries, entries_of
+from shared.behaviours import BehaviourEntry, checked_entries
 from shared.block_kind import BlockKind, numbered, numbered_fill
 from shared.bounds import TICK_RATE_MAX
 from shared.buttons import DEFAULT_BUTTONS, Names, bits_of, checked_buttons, held_names
@@ -25,6 +25,7 @@ from shared.checks import Cell, SceneError, Vec, boolean, cell, choice, finite, 
 from shared.extras import Extras
 from shared.fields import AIM_ROW_BYTES, INPUT_ROW_BYTES
 from shared.inputs import MOVE_MAX
+from shared.scene_copies import SceneCopies
 from shared.tables import in_order, made, plain, table_of
 from shared.template import Template, own_numbers
 from shared.units import RANGE_BLOCKS, SEGMENT, SPEED, rounded, to_position, to_velocity
@@ -51,7 +52,7 @@ SCENES = Path(__file__).parent / "scenes"
 
 
 @dataclass(frozen=True)
-class Scene:
+class Scene(SceneCopies):
     """The description of a world: its physics, its extent, its templates and its terrain.
 
     A feature that a scene switches off costs no time.
@@ -271,22 +272,6 @@ class Scene:
             raise SceneError(f"{at} = {shown(name)}: no such template (there are {', '.join(self.index_of)})")
         return kind
 
-    def with_template(self, name: str, like: str | None = None, **changes: Any) -> "Scene":
-        """Returns a copy of the scene with one more template.
-
-        Args:
-            name: name of the new template.
-            like: name of the template to copy; None: the players' template.
-            changes: fields of the new template that differ, by name.
-
-        Raises:
-            SceneError: there is no template `like`, a field is unknown or out of range, or the name is in use.
-        """
-        base = self.templates[self.template(self.player if like is None else like, "like")]
-        entry = {f.name: getattr(base, f.name) for f in fields(Template)}
-        new = made(Template, {**entry, **changes, "name": name}, "templates")
-        return replace(self, templates=(*self.templates, new))
-
     def kind(self, name: object, at: str = "kind") -> int:
         """Returns the number of a named kind of blocks.
 
@@ -304,23 +289,10 @@ class Scene:
             f"{at} = {shown(name)}: no such kind (there are {', '.join(each.name for each in self.kinds)})"
         )
 
-    def with_kind(self, name: str, number: int | None = None, *, solid: bool = True) -> "Scene":
-        """Returns a copy of the scene with one more kind of blocks; `BlockKind` describes the arguments."""
-        return replace(self, kinds=(*self.kinds, BlockKind(name, number, solid)))
-
     @functools.cached_property
     def passable(self) -> tuple[int, ...]:
         """The numbers of the kinds of blocks that are not solid, besides air."""
         return tuple(kind.number for kind in self.kinds if not kind.solid and kind.number is not None)
-
-    def with_behaviours(self, classes: Iterable[object]) -> "Scene":
-        """Returns a copy of the scene with further behaviours.
-
-        Raises:
-            SceneError: a class or one of its values is not valid, or two behaviours have one template or name.
-        """
-        added = entries_of(classes)
-        return replace(self, behaviours=(*self.behaviours, *added)) if added else self
 
     def bound(self, classes: Iterable[object]) -> "Scene":
         """Returns a copy of the scene that has this program's classes of its behaviours.

@@ -43,10 +43,8 @@ class Dodge(Rules):
     round_s = 120.0
 
     def prepare(self, scene: Scene) -> Scene:
-        player = replace(scene.templates[scene.template(scene.player)], friction=24.0)
-        others = [each for each in scene.templates if each.name != scene.player]
-        scene = replace(scene, templates=(player, *others), reach=0.0)
-        scene = replace(scene, buttons=("jump", "dash", "fire"), aim=True)
+        scene = replace(scene, reach=0.0).with_changes(scene.player, friction=24.0)
+        scene = scene.with_buttons("dash", "fire", aim=True)
         scene = scene.with_template("dashing", walk_speed=14.0)
         scene = scene.with_template("out", walk_speed=0.0, jump_speed=0.0)
         return replace(scene, templates=(*scene.templates, BALL))

@@ -40,10 +40,9 @@ class Race(Rules):
     def prepare(self, scene: Scene) -> Scene:
         if scene.name != "topdown":
             raise SceneError(f"scene = {scene.name!r}: the race has its course in the scene 'topdown'")
-        player = replace(scene.templates[0], walk_speed=10.0, acceleration=9.0, friction=2.5)
-        scene = replace(scene, templates=(player,), spawns=GRID, buttons=("boost",), reach=0.0)
-        scene = scene.with_template("boosting", walk_speed=17.0, acceleration=20.0)
-        return scene.with_kind("pad", 9)
+        scene = replace(scene, spawns=GRID, buttons=("boost",), reach=0.0)
+        scene = scene.with_changes("player", walk_speed=10.0, acceleration=9.0, friction=2.5)
+        return scene.with_template("boosting", walk_speed=17.0, acceleration=20.0).with_kind("pad", 9)
 
     def bot_policy(self, random: Any) -> RacePlayer:
         return RacePlayer(random)

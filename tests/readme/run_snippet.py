@@ -11,13 +11,15 @@ import itertools
 import math
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from types import SimpleNamespace
 from typing import Any
 
 from sovereign_netcode.client_sdk import AsyncClient, Client, Loopback, View, client
 from sovereign_netcode.server import Game, Player, Rules
 from sovereign_netcode.server.config.settings import Settings
+from sovereign_netcode.shared.behaviours import Behaviour
+from sovereign_netcode.shared.buttons import Names
 from sovereign_netcode.shared.scene import load_scene
 from tests.readme import engines
 from tests.readme.pages import programs
@@ -63,8 +65,9 @@ def in_this_process(
     jumps: list[float] = []
     poll, set_input, view = Client.poll, Client.set_input, Client.view
 
-    def connect(url: str, *, name: str) -> Client:
+    def connect(url: str, *, name: str, behaviours: Iterable[type[Behaviour]] = ()) -> Client:
         assert url == URL
+        assert [each.__name__ for each in behaviours] in ([], ["Dash"])
         return Loopback(Game(load_scene(Settings().scene), rules=Company())).join(name)
 
     def counted(self: Client) -> list[Any]:
@@ -79,7 +82,7 @@ def in_this_process(
         assert now[0] < FRAMES_MAX / 30, "the player did not walk"
         return poll(self)
 
-    def wished(self: Client, x: float, y: float, *, jump: bool) -> None:
+    def wished(self: Client, x: float, y: float, *, jump: bool = False, buttons: Names = ()) -> None:
         assert (x, y) == input_
         if jump:
             jumps.append(now[0])
@@ -144,6 +147,7 @@ def on_a_server(url: str) -> None:
 
 def main(name: str, url: str = "") -> None:
     program = compile(programs()[name], name, "exec")
+    exec(programs()["A game"], engines.module("bounce").__dict__)  # bounce.py of the README
     space = {"__name__": "snippet"}
     if url:
         on_a_server(url)

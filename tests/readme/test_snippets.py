@@ -157,6 +157,12 @@ def test_the_smallest_game() -> None:
     scores = [game.get(entity, "score") for entity in game.entities("player")]
     assert len(scores) == 2
     assert scores[0] == scores[1] > 0
+    ann = match.join(lambda core, _: core.input, PRESETS["typical"])
+    match.run(3)
+    x = game.position(ann.core.entity)[0]
+    ann.core.set_input(make_input(1, 0), {"dash": True})
+    match.run(1)
+    assert game.position(ann.core.entity)[0] > x + 6, "4.5 blocks is a walk"
     assert match.game.counters.rules_failed == 0
 
 

@@ -1,5 +1,6 @@
 """Rules of a game: hooks, what they may do, what clients get, and that failing rules stop nobody."""
 
+from dataclasses import replace
 from typing import Any
 
 import msgpack
@@ -442,6 +443,26 @@ def test_a_scene_gets_a_template_more() -> None:
             before.with_template("frozen", like, **changes)
     with pytest.raises(SceneError, match="same name"):
         after.with_template("frozen")
+
+
+def test_a_template_of_a_scene_is_changed() -> None:
+    before = scene().with_template("frozen", walk_speed=0.0)
+    after = before.with_changes("person", friction=12.0)
+    player, frozen = after.templates[after.template("person")], after.templates[after.template("frozen")]
+    assert player == replace(before.templates[before.template("person")], friction=12.0)
+    assert frozen == before.templates[before.template("frozen")]
+    for name, changes, why in (("nobody", {}, "nobody"), ("person", {"speed": 1}, "speed")):
+        with pytest.raises(SceneError, match=why):
+            before.with_changes(name, **changes)
+
+
+def test_a_scene_gets_further_buttons() -> None:
+    after = scene().with_buttons("dash").with_buttons("fire", aim=True)
+    assert after.buttons == (*scene().buttons, "dash", "fire")
+    assert after.with_buttons("duck").aim
+    assert not scene().with_buttons("dash").aim
+    with pytest.raises(SceneError, match="twice"):
+        after.with_buttons("dash")
 
 
 @pytest.mark.parametrize(
