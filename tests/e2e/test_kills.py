@@ -141,10 +141,10 @@ async def editing(address: tuple[str, int], editors: list[Editor]) -> AsyncItera
             task.result()
 
 
-def looked_at(data: Path, scene: Scene, copy: Path) -> tuple[World, tuple[int, str]]:
+def looked_at(data: Path, scene: Scene, copy: Path, game: str = "") -> tuple[World, tuple[int, str]]:
     """Returns the world in a directory, and its tick and hash; a copy is replayed in this process."""
     shutil.copytree(data, copy)
-    store = Store(copy, scene)
+    store = Store(copy, scene, game=game)
     store.close()
     shutil.rmtree(copy)
     return store.world, store.restored
