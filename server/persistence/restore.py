@@ -94,7 +94,7 @@ def load(path: Path, scene: Scene, game: str = "", *, compiled: bool | None = No
 
 
 def _rewritten(former: Scene, scene: Scene) -> str:
-    """Returns the names of the behaviours whose code has changed, if nothing else of the behaviours has; otherwise ""."""
+    """Returns the names of the behaviours whose code has changed; empty if more of them than the code has changed."""
     before, now = ([replace(entry, digest="x") for entry in each.behaviours] for each in (former, scene))
     if before != now:
         return ""

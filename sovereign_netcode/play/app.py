@@ -6,7 +6,6 @@ import os
 import signal
 import sys
 import time
-from collections.abc import Mapping
 
 os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
 
@@ -14,7 +13,7 @@ import pygame
 
 from client_sdk.client import Client
 from client_sdk.transports.connection import ConnectError
-from server.rules import RulesError, load_rules
+from server.rules import Rules, RulesError, load_rules
 from sovereign_netcode.play import own_server
 from sovereign_netcode.play.script import Script
 from sovereign_netcode.play.window import CLOSED, Window, keyboard
@@ -76,7 +75,7 @@ def main(argv: list[str] | None = None) -> int:
             stack.enter_context(own_server.bots(url, count, options.game))
             client = stack.enter_context(Client.connect(url, name=options.name, behaviours=rules.behaviours))
             title = "Sovereign Netcode" if options.url else options.game.rpartition(":")[2]
-            return play(client, options.lag / 1000, script, title, rules.keys)
+            return play(client, options.lag / 1000, script, title, rules)
     except (ConnectError, RuntimeError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 1
@@ -103,10 +102,10 @@ def open_display(*, unseen: bool) -> None:
         raise RuntimeError(f"no display to open a window on ({found}); --script-demo OUT.png needs none")
 
 
-def play(client: Client, lag_s: float, script: Script | None, title: str, keys: Mapping[str, str]) -> int:
+def play(client: Client, lag_s: float, script: Script | None, title: str, rules: Rules) -> int:
     """Plays until the player, the server or the script ends the session. Returns the exit code."""
     pygame.font.init()
-    window = Window(client, script or keyboard, title, keys)
+    window = Window(client, script or keyboard, title, rules.keys, rules.commands)
     window.lag(lag_s)
     clock, started = pygame.time.Clock(), time.monotonic()
     while not window.over:

@@ -50,6 +50,19 @@ class Keys:
         return "    ".join(f"{name[0].upper()}{name[1:]}: {button}" for button, name in self.names.items())
 
 
+def commands_of(wanted: Mapping[str, str], commands: Mapping[str, object]) -> dict[int, str]:
+    """Returns the declared commands that have a key, by the number of the key.
+
+    Args:
+        wanted: names of keys, by button or command, as the rules give them.
+        commands: the commands that the rules declare.
+
+    Raises:
+        RuntimeError: there is no such key.
+    """
+    return {_code(name, wanted[name]): name for name in commands if name in wanted}
+
+
 def _code(button: str, name: str) -> int:
     if name in MOUSE:
         return MOUSE[name]

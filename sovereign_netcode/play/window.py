@@ -11,9 +11,11 @@ from client_sdk.client import Client
 from client_sdk.events import Answered, Disconnected, Diverged, Event, Happened, Left, Resumed
 from client_sdk.netsim.links import Link
 from client_sdk.view import EntityView, View
+from server.declared import Value
 from shared.buttons import JUMP_NAME
 from shared.checks import Cell, Vec
 from shared.scene import Scene
+from sovereign_netcode.play.chat import COMMAND, FIELD, Chat
 from sovereign_netcode.play.figures import INK, OWN, TONES, WHITE, Actor, draw_ghost, label, look_of, screen
 from sovereign_netcode.play.hud import Hud
 from sovereign_netcode.play.iso import (
@@ -28,7 +30,7 @@ from sovereign_netcode.play.iso import (
     top_of,
     unproject,
 )
-from sovereign_netcode.play.keys import Keys
+from sovereign_netcode.play.keys import Keys, commands_of
 from sovereign_netcode.play.panel import Panel
 
 SIZE = 1280, 800
@@ -57,6 +59,10 @@ class Wish(NamedTuple):
     aim: Vec | None = None
 
 
+REST = Wish(0.0, 0.0, False, (), None)
+"""Wish of a player who types a message."""
+
+
 class Pilot(Protocol):
     """The source of a player's inputs: a person at the keyboard, or a script."""
 
@@ -71,10 +77,18 @@ class Window:
         client: a client that is connecting or has joined; the keys [ and ] change its simulated link.
         pilot: decides on the inputs.
         title: text at the top of the window.
-        keys: names of the keys of the game's buttons (`Rules.keys`).
+        keys: names of the keys of the game's buttons, and of its commands without fields (`Rules.keys`).
+        commands: the commands that the rules declare (`Rules.commands`).
     """
 
-    def __init__(self, client: Client, pilot: Pilot, title: str, keys: Mapping[str, str] | None = None) -> None:
+    def __init__(
+        self,
+        client: Client,
+        pilot: Pilot,
+        title: str,
+        keys: Mapping[str, str] | None = None,
+        commands: Mapping[str, Mapping[str, Value]] | None = None,
+    ) -> None:
         self.client, self.core, self.title = client, client.core, title
         self.events: list[Event] = []
         """Events of the latest frame."""
@@ -89,6 +103,8 @@ class Window:
         self.over = ""
         """Reason of the session's end; empty while it lasts."""
         self._pilot, self._wanted = pilot, keys or {}
+        self.chat = Chat(commands or {})
+        self._commands = commands_of(self._wanted, commands or {})
         self._keys: tuple[Scene, Keys] | None = None
         self._screen = pygame.display.set_mode(SIZE, pygame.RESIZABLE)
         self._ground, self._hud = Ground(), Hud(LAG_MAX_S)
@@ -110,7 +126,7 @@ class Window:
         for act in pygame.event.get():
             self._handle(act, view)
         if self.client.playing:
-            x, y, jump, buttons, aim = self._pilot(self, view, now)
+            x, y, jump, buttons, aim = self._pilot(self, view, now) if self.chat.text is None else REST
             self.client.set_input(x, y, jump=jump, buttons=buttons, aim=aim)
         self.client.update(now)
         self._draw(self.client.view(now), now)
@@ -161,6 +177,11 @@ class Window:
 
     def _handle(self, event: pygame.event.Event, view: View) -> None:
         lag_s = self._hud.slider.handle(event)
+        typed, message = self.chat.handle(event)
+        if message and self.client.playing:
+            self.client.command(COMMAND, {FIELD: message})
+        if typed:
+            return
         if lag_s is not None:
             self.lag(lag_s)
         elif event.type == pygame.QUIT or (event.type == pygame.KEYDOWN and event.key == pygame.K_ESCAPE):
@@ -175,6 +196,8 @@ class Window:
                 self.lag(max(self.lag_s - LAG_STEP_S, 0.0))
             elif event.key == pygame.K_RIGHTBRACKET:
                 self.lag(min(self.lag_s + LAG_STEP_S, LAG_MAX_S))
+            elif event.key in self._commands and self.client.playing:
+                self.client.command(self._commands[event.key])
             elif pygame.K_1 <= event.key < pygame.K_1 + len(CHOICE):
                 self.kind = FIRST_KIND + event.key - pygame.K_1
         elif event.type == pygame.MOUSEBUTTONDOWN:
@@ -244,7 +267,7 @@ class Window:
             target,
             now,
             title=f"{self.title}{_points(self.client.shared.get('points'))}",
-            keys=self.keys.text(),
+            keys="    ".join(part for part in (self.keys.text(), "Enter: say" if self.chat.there else "") if part),
             edits=scene.reach > 0,
             left_s=left_s,
             actors=self.actors,
@@ -253,6 +276,7 @@ class Window:
             choice=colour_of(self.kind),
         )
         self.panel.draw(target, self.client)
+        self.chat.draw(target)
         pygame.display.flip()
 
     def _cast(self, view: View) -> list[Actor]:
@@ -338,6 +362,8 @@ def _sentence(name: str, data: Any, view: View) -> str:
         return str(figure.attributes.get("name", f"#{entity}")) if figure else "a player"
 
     match name, data:
+        case "said", {"by": by, "text": text}:
+            return f"{called(by)}: {text}"
         case "tagged", {"by": by, "who": who}:
             return f"{called(by)} tagged {called(who)}"
         case "out", {"by": by, "who": who}:
