@@ -7,9 +7,10 @@
     sovereign-server --game my_game:Tag
 
 The server calls all hooks within a tick, before the step, in this order: `on_start`, the functions given to
-`game.soon`, `on_leave`, `can_join` and `on_join`, `on_fell_out`, `on_command` and `can_edit`, `on_contact`, `on_tick`.
-If a hook raises, the exception is logged and counted, and the game goes on. A hook is a plain function and must not
-wait. Code that waits runs in a task or a thread of its own and hands its result back with `game.soon`.
+`game.soon`, `on_leave`, `can_join` and `on_join`, `on_fell_out`, `on_command` and `can_edit`, `on_contact_end`,
+`on_contact`, `on_block_contact`, `on_exit`, `on_enter`, `on_tick`. If a hook raises, the exception is logged and
+counted, and the game goes on. A hook is a plain function and must not wait. Code that waits runs in a task or a thread
+of its own and hands its result back with `game.soon`.
 
 Hooks read and change the game through `self.game`, a `server.game_api.api.GameApi`. Decisions about the world must use
 nothing else: `self.game.random` gives the same numbers when a game is computed again, but a clock or the order of a set
@@ -124,7 +125,27 @@ class Rules:
         return False
 
     def on_contact(self, a: int, b: int) -> None:
-        """Called when two entities (a < b) have begun to touch: in the latest step, or when the rules placed one."""
+        """Called when two entities (a < b) have begun to touch: in the latest step, or when the rules placed one.
+
+        Called again for entities that still touch if the template of one has changed since, except by this call.
+        """
+
+    def on_contact_end(self, a: int, b: int) -> None:
+        """Called when two entities (a < b) have ceased to touch. One of them may no longer exist."""
+
+    def on_block_contact(self, entity: int, x: int, y: int, z: int) -> None:
+        """Called when a side of an entity has begun to touch solid blocks: it landed, or ran or flew against them.
+
+        Args:
+            entity: the entity. A side that goes on touching blocks is not reported again, whichever blocks these are.
+            x, y, z: the block that is nearest to the middle of the side.
+        """
+
+    def on_enter(self, zone: str, entity: int) -> None:
+        """Called when an entity has entered a zone (`game.add_zone`): their boxes overlap."""
+
+    def on_exit(self, zone: str, entity: int) -> None:
+        """Called when an entity has left a zone. It may no longer exist."""
 
     def on_fell_out(self, entity: int) -> bool | None:
         """Called when an entity is below the floor of the world.
@@ -266,6 +287,11 @@ def checked_result(result: Any, name: str) -> Any:
             result.close()  # otherwise Python would warn that it was never awaited
         raise RulesError(f"{name} returned {type(result).__name__}, which nothing runs: it must be a plain function")
     return result
+
+
+def overrides(rules: Rules, name: str) -> bool:
+    """Returns whether the class of rules has a hook of its own."""
+    return getattr(type(rules), name) is not getattr(Rules, name)
 
 
 def prepared(rules: Rules, scene: Scene) -> Scene:

@@ -10,6 +10,7 @@ from typing import Any
 
 from server.game_api import attributes as attribute_tables
 from server.game_api.attributes import Attributes
+from server.game_api.entries import Entries
 from server.game_api.hooks import Hooks
 from server.game_api.input_api import InputApi
 from server.game_api.outgoing import Outgoing
@@ -17,6 +18,8 @@ from server.game_api.players_api import PlayersApi
 from server.game_api.shared_values import SharedValues
 from server.game_api.turn import Turn
 from server.game_api.turn_results import TurnResults
+from server.game_api.zones import Zones
+from server.game_api.zones_api import ZonesApi
 from server.journal.recorded_world import RecordedWorld
 from server.observability.counters import Counters
 from server.players.persisted_state import LEFT, PersistedState
@@ -30,7 +33,7 @@ from shared.layout import TEMPLATE
 from shared.scene import Scene
 
 
-class GameApi(InputApi, PlayersApi):
+class GameApi(InputApi, PlayersApi, ZonesApi):
     """The game API of one running game. Positions are in blocks, velocities in blocks/s.
 
     A method raises `MissingError` (a `KeyError`) if there is no entity with the given number, and `SceneError`, which
@@ -65,7 +68,8 @@ class GameApi(InputApi, PlayersApi):
         self.log = ChangeLog(world, self.kept.attributes)
         self.shared_values = SharedValues(world, self.kept.shared)
         self.outgoing = Outgoing(counters)
-        self.hooks = Hooks(self, world, rules, counters, goes_on=kept is not None)
+        self._zones = Zones(world, Entries(world, self.kept, "zones"))
+        self.hooks = Hooks(self, world, rules, counters, self._zones, goes_on=kept is not None)
         self._attributes = Attributes(world, self.log, self.kept.attributes)
         self.turn_results = TurnResults(world, self.log, self._attributes, counters)
         self._rewind, self._seed = rewind, seed

@@ -10,13 +10,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from server.declared import RefusedError, checked
-from server.game_api.contacts import Contacts
 from server.game_api.turn import OutOfTurnError
+from server.game_api.watchers import Watchers
+from server.game_api.zones import Zones
 from server.journal.recorded_world import RecordedWorld
 from server.observability.counters import Counters
 from server.observability.errors import FaultReporter
 from server.players.player import Player
-from server.rules import Rules, RulesError, checked_function, checked_result
+from server.rules import Rules, RulesError, checked_function, checked_result, overrides
 from shared import messages
 from shared.edits import Edit
 from shared.fields import REASON_MAX
@@ -44,11 +45,19 @@ class Hooks:
         world: the world of the game.
         rules: the rules of the game.
         counters: where failed hooks are counted.
+        zones: the zones of the game.
         goes_on: whether the game is restored, so that it has started and the present contacts were reported.
     """
 
     def __init__(
-        self, stage: "GameApi", world: RecordedWorld, rules: Rules, counters: Counters, *, goes_on: bool
+        self,
+        stage: "GameApi",
+        world: RecordedWorld,
+        rules: Rules,
+        counters: Counters,
+        zones: Zones,
+        *,
+        goes_on: bool,
     ) -> None:
         self.seen = 0.0
         """View tick of the latest command: server time in ticks at which its sender drew the other entities."""
@@ -56,8 +65,7 @@ class Hooks:
         """Reason that the rules gave for refusing the latest command; empty: none."""
         self._api, self._world, self._rules, self._counters = stage, world, rules, counters
         self._soon: deque[tuple[Callable[..., object], tuple[Any, ...]]] = deque()
-        self._contacts = Contacts(world, goes_on=goes_on)
-        self._reports_contacts = _overrides(rules, "on_contact")
+        self._watchers = Watchers(world, rules, zones, goes_on=goes_on)
         self._started = goes_on
         self.names = rules.names
         self._faults = FaultReporter("the rules have failed")
@@ -93,7 +101,7 @@ class Hooks:
         A `can_join` that raises refuses the client.
         """
         banned = self._api.banned(name, subject)
-        if banned or not _overrides(self._rules, "can_join"):
+        if banned or not overrides(self._rules, "can_join"):
             return banned
         allowed = self._call(self._can_join, name, subject, failed=False)
         if isinstance(allowed, str):
@@ -112,7 +120,7 @@ class Hooks:
         except ProtocolError:
             return messages.INVALID
         self.seen = command.seen
-        if not _overrides(self._rules, "on_command"):
+        if not overrides(self._rules, "on_command"):
             return messages.INVALID
         if self._rules.commands:
             try:
@@ -137,16 +145,13 @@ class Hooks:
         return bool(allowed)
 
     def act(self) -> None:
-        """Calls `on_contact` for new contacts, then `on_tick`."""
-        for a, b in self._contacts.begun() if self._reports_contacts else ():
-            if a in self._world and b in self._world:
-                self._call(self._rules.on_contact, a, b)
+        """Calls the hooks of contacts and zones for what is new, then `on_tick`."""
+        self._watchers.report(self._call)
         self._call(self._rules.on_tick)
 
     def stepped(self) -> None:
-        """Takes note of what the step has changed, for `on_contact`. Call it after the step."""
-        if self._reports_contacts:
-            self._contacts.stepped()
+        """Takes note of what the step has changed, for the hooks of contacts and zones. Call it after the step."""
+        self._watchers.stepped()
 
     # -- called by the game API ------------------------------------------------------------------------------
 
@@ -169,7 +174,7 @@ class Hooks:
 
     def touching(self, entity: int) -> list[int]:
         """Returns the entities that touch an entity now, in ascending order."""
-        return self._contacts.of(entity)
+        return self._watchers.contacts.of(entity)
 
     # -- inside ----------------------------------------------------------------------------------------------
 
@@ -198,7 +203,3 @@ class Hooks:
 def _sendable(reason: str) -> str:
     """Returns a reason as a text that a message can hold: at most `REASON_MAX` characters that UTF-8 can encode."""
     return reason[:REASON_MAX].encode(errors="replace").decode()
-
-
-def _overrides(rules: Rules, name: str) -> bool:
-    return getattr(type(rules), name) is not getattr(Rules, name)
