@@ -28,7 +28,9 @@ import textwrap
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from dataclasses import field as dataclass_field
+from types import CodeType
 from typing import TYPE_CHECKING, Any
+from weakref import WeakKeyDictionary
 
 from shared.checks import SceneError, boolean, items, shown, text, whole
 
@@ -257,7 +259,8 @@ def digest_of(code: type[Behaviour], fields: Iterable[Field]) -> str:
     for owner in code.__mro__:
         if owner not in (Behaviour, object):
             digest.update(_source(owner).encode())
-    digest.update(repr([(each.name, each.bits, each.start, each.signed) for each in fields]).encode())
+    numbers = [(each.name, each.bits, each.start, each.signed) for each in fields]
+    digest.update(repr((numbers, code.always)).encode())
     return digest.hexdigest()
 
 
@@ -291,13 +294,33 @@ def bound(entries: Iterable[BehaviourEntry], classes: Iterable[object]) -> tuple
 
 
 def _source(code: type) -> str:
-    """Returns the source of a class without comments and empty lines; without a file, its compiled functions."""
+    """Returns the source of a class without comments and empty lines; without a file, its compiled functions.
+
+    It is read once, because the file may change while the program runs.
+    """
+    source = _SOURCES.get(code)
+    if source is None:
+        source = _SOURCES[code] = _read_source(code)
+    return source
+
+
+def _read_source(code: type) -> str:
     try:
         lines = textwrap.dedent(inspect.getsource(code)).splitlines()
     except (OSError, TypeError):  # made in an interactive session or by `exec`
         functions = [value for value in vars(code).values() if inspect.isfunction(value)]
-        return repr([(each.__name__, each.__code__.co_code, each.__code__.co_names) for each in functions])
+        return repr([(each.__name__, _compiled(each.__code__)) for each in functions])
     return "\n".join(line.rstrip() for line in lines if line.strip() and not line.lstrip().startswith("#"))
+
+
+def _compiled(code: CodeType) -> tuple[object, ...]:
+    """Returns what a compiled function consists of, without addresses and places in files."""
+    consts = [_compiled(each) if isinstance(each, CodeType) else each for each in code.co_consts]
+    return code.co_code, code.co_names, code.co_varnames, consts
+
+
+_SOURCES: WeakKeyDictionary[type, str] = WeakKeyDictionary()
+"""Sources of classes as they were when first asked for."""
 
 
 def _field_of(value: object) -> Field:

@@ -117,7 +117,7 @@ class Crate(Behaviour):
     turns = field(bits=40, start=7)
 
     def turn(self, me: Body) -> None:
-        me.turns += 1
+        me.turns = (me.turns + 1) & 0xFFFFFFFF
         if me.turns % 2:
             me.become("barrel" if me.template == "crate" else "crate")
         me.wake(me.tick + 5 + me.chance(20))

@@ -127,7 +127,8 @@ class ChangeLog:
         self._packs_left = PACKS_PER_TICK
         self._due: set[Cell] = set()
         """Segments whose checksums are to be sent in this tick."""
-        self._news = TickEncoder(world, in_ticks(CHECK_S, world.scene.tick_rate, 1))
+        self._check_ticks = in_ticks(CHECK_S, world.scene.tick_rate, 1)
+        self._news = TickEncoder(world, self._check_ticks)
         self._latest_fields: dict[Cell, bytes] = {}
         """Records of extra columns of the newest tick, by segment."""
         self._latest: dict[Cell, tuple[bytes, bytes, bytes]] | None = None
@@ -207,6 +208,8 @@ class ChangeLog:
                 row = world.extra_rows[world.row_of(entity)].tolist()
                 records[segment_of].append(extras.record(entity, mask, row))
         self._latest_fields = {segment: b"".join(packed) for segment, packed in records.items()}
+        if world.tick % self._check_ticks == 0:
+            self._due |= now.fields.keys()
 
     def _fields_of(self, entity: int) -> bytes:
         """Returns the record of the extra columns of an entity that is sent whole."""

@@ -15,7 +15,7 @@ from shared.bounds import bounds
 from shared.checks import Cell
 from shared.inputs import Input
 from shared.layout import FALLING, FLAGS, ID
-from shared.messages import VERSION, Hello, Resync, Snapshot, Terrain, Welcome, decode_from_server, encode
+from shared.messages import VERSION, Announce, Hello, Resync, Snapshot, Terrain, Welcome, decode_from_server, encode
 from shared.scene import Scene
 from shared.snapshot import ACTED, KEYFRAME, PLACED, decode_parts
 from shared.units import BLOCK, SEGMENT
@@ -344,7 +344,7 @@ class Model:
             case Terrain(x, y, z, offset, total, chunk):
                 self.terrain((x, y, z), offset, total, chunk)
             case other:
-                assert isinstance(other, Welcome)
+                assert isinstance(other, Welcome | Announce)
 
     def snapshot(self, snapshot: Snapshot) -> None:
         assert snapshot.tick > self.tick
@@ -364,6 +364,8 @@ class Model:
             if entity not in new and (home in anew or (home, entity) in gone):
                 self.world.remove(entity)
         self.world.put(states)
+        for part in parts:
+            assert self.world.write_fields(self.world.extras.decode(part.fields))
         assert self.world.follow(turns, snapshot.tick - self.tick, snapshot.tick)
         for part in parts:
             assert part.ago == KEYFRAME or 0 < part.ago <= HISTORY
@@ -395,10 +397,10 @@ def home_of(state: list[int]) -> Cell:
 class Stalling:
     """A game in which everything changes at random, and one client whose link stalls at random."""
 
-    def __init__(self, seed: int) -> None:
+    def __init__(self, seed: int, scene: Scene | None = None) -> None:
         self.rng = random.Random(seed)
         limits = Limits(terrain_chunk_bytes=16, terrain_bytes_per_tick=64, stalled_s=1e9, silence_s=1e9)
-        self.game = Game(row_of_segments(), limits=limits)
+        self.game = Game(scene or row_of_segments(), limits=limits)
         self.model = Model(self.game.scene)
         self.now = 0.0
         self.session: Session = self.game.open(self.model, 0.0)

@@ -1,6 +1,10 @@
 """Behaviours in a world: the same bits in both kernels, in copies, after rollbacks, and whatever goes wrong."""
 
+import importlib
+import linecache
 import random
+import textwrap
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -318,3 +322,39 @@ def test_classes_that_a_scene_needs_are_refused_by_name() -> None:
     unbound.load_terrain()
     with pytest.raises(SceneError, match="Acrobat, Shot, Crate"):
         unbound.step()
+
+
+def made_by_exec(text: str) -> type[Behaviour]:
+    """Returns a class without a file, as an interactive session makes it."""
+    names: dict[str, Any] = {"Behaviour": Behaviour, "__name__": "nowhere"}
+    exec(textwrap.dedent(text), names)
+    found: type[Behaviour] = names["Made"]
+    return found
+
+
+def test_the_digest_of_a_class_without_a_file_depends_on_its_numbers_and_not_on_places() -> None:
+    text = """
+    class Made(Behaviour):
+        templates = ("player",)
+        def turn(self, me):
+            me.velocity = tuple(part + 1.0 for part in me.velocity)
+    """
+    first, again = (entry_of(made_by_exec(each)).digest for each in (text, "\n\n" + textwrap.dedent(text)))
+    other = entry_of(made_by_exec(text.replace("1.0", "2.0"))).digest
+    inner = entry_of(made_by_exec(text.replace("part +", "part -"))).digest
+    assert first == again
+    assert len({first, other, inner}) == 3
+
+
+def test_the_digest_is_of_the_code_that_runs_and_not_of_a_file_that_changes_later(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file = tmp_path / "changing_game.py"
+    text = "from shared.behaviours import Behaviour\n\nclass Made(Behaviour):\n    templates = ('player',)\n"
+    file.write_text(text + "    def turn(self, me):  # a comment\n        me.wake(1)\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    made = importlib.import_module("changing_game").Made
+    before = entry_of(made).digest
+    file.write_text(text + "    def turn(self, me):\n        me.wake(2)\n")
+    linecache.checkcache()
+    assert entry_of(made).digest == before
