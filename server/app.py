@@ -34,6 +34,7 @@ from server.persistence.store import Store
 from server.rules import Rules, RulesError, load_rules, prepared
 from server.runtime import healthcheck, log, reload
 from server.runtime.event_loop import announce_compiling, freeze, leave, loop_factory, on_signals, rss_mb, signals
+from server.runtime.tasks import Tasks
 from server.runtime.ticker import Ticker, best_alarm
 from server.runtime.warmup import warm_up
 from server.runtime.watchdog import Watchdog
@@ -170,6 +171,8 @@ class Server:
                 self.store.start(self.game.keep)
             self.ticker = Ticker(rate, self.game.tick, self._broken, lambda ring: best_alarm(loop, ring), self.faults)
             self.watchdog = Watchdog(loop)
+            tasks = Tasks(loop, self.settings.limits.load_s)
+            self.game.joining.run = tasks.run
             freeze()
             kind = type(loop).__module__.partition(".")[0]
             scene, auth, form = self.game.scene.name, self.settings.auth, self.game.world.kernel.form
@@ -180,6 +183,7 @@ class Server:
                 print(f"live page at http{secure}://{bracketed(reachable(host))}:{port}/", flush=True)
             reason, code = await self._stop
         self.watchdog.stop()
+        tasks.stop()
         logger.info("stopping", reason=reason, connections=len(self.gateway.connections))
         await self._drain()
         logger.info("stopped", after_s=round(time.monotonic() - self.started))

@@ -94,6 +94,24 @@ class Rules:
         """
         return None
 
+    async def load_player(self, name: str, subject: str) -> Any:
+        """Fetches what the game knows of a player, for example from a database, before a new player joins.
+
+        This is the one method that may wait: the client waits with it, the ticks go on. It must not use `self.game`.
+        Not called when a player reconnects.
+
+        Args:
+            name: the name that the client gave.
+            subject: the subject of the client's token; empty if the server does not ask for tokens.
+
+        Returns:
+            Anything; `on_join` finds it in `player.loaded`.
+
+        Raises:
+            ValueError: the player may not join; the client gets the text as the reason.
+        """
+        return None
+
     def on_start(self) -> None:
         """Called once, when the world exists and no player has joined. Not called when a saved game is restored."""
 
@@ -227,6 +245,8 @@ def check_rules(rules: object) -> None:
             raise RulesError(
                 f"{owner}.{name} is no hook, and nothing calls it{there}; the hooks are {', '.join(HOOKS)}"
             )
+    if not inspect.iscoroutinefunction(rules.load_player):
+        raise RulesError(f"{owner}.load_player: must be async (`async def`), because it may wait")
     for name in HOOKS:
         hook = getattr(rules, name)
         checked_function(hook, f"{owner}.{name}")

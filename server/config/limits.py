@@ -57,6 +57,9 @@ class Limits:
     hello_s: float = setting(
         5.0, Option(float, "seconds in which a new WebSocket must send its hello", "S", 0.1, HOUR_S)
     )
+    load_s: float = setting(
+        10.0, Option(float, "seconds in which a game must load the data of a player who joins", "S", 0.1, HOUR_S)
+    )
     silence_s: float = setting(
         15.0, Option(float, "seconds without a message after which a player's connection is closed", "S", 0.1, HOUR_S)
     )

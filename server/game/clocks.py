@@ -73,7 +73,7 @@ class Clocks:
             if session.closed:
                 continue
             if not session.entity:
-                if session.hello is None and now - session.opened > limits.hello_s:
+                if session.hello is None and not session.loading and now - session.opened > limits.hello_s:
                     kick(session, messages.NO_HELLO, f"no hello within {limits.hello_s:g} s")
             elif now - session.received_at > limits.silence_s:
                 kick(session, messages.TOO_SLOW, f"no message received for {limits.silence_s:g} s")

@@ -119,6 +119,7 @@ class Game:
             self.roster,
             self.commands,
             authenticate,
+            rules or Rules(),
         )
 
     @property
@@ -167,7 +168,7 @@ class Game:
             if session.corrections >= 0:  # the first report of a connection includes those of the connection before
                 self.counters.corrections += max(message.corrections - session.corrections, 0)
             session.corrections = max(message.corrections, session.corrections)
-        elif isinstance(message, Hello) and not session.entity and session.hello is None:
+        elif isinstance(message, Hello) and not session.entity and session.hello is None and not session.loading:
             self.joining.hello(session, message, now)
         elif isinstance(message, Command) and session.entity:
             assert session.player is not None
@@ -216,7 +217,7 @@ class Game:
         with self.api.turn:
             self.api.hooks.start()
             self.roster.leave(now)
-            self.joining.join()
+            self.joining.join(now)
             self.roster.revive()
             self.commands.carry_out()
             self.api.hooks.act()

@@ -1,16 +1,20 @@
 """The handshake of a client: its Hello is checked when it arrives, and answered by a Welcome in a tick."""
 
 from collections.abc import Callable
+from functools import partial
+from typing import Any
 
 from server.auth.identity import checked_subject
 from server.config.limits import Limits
 from server.game.commands import Commands
 from server.game.connections import Connections
+from server.game.loading import Runner, at_once
 from server.game.roster import Roster
 from server.game.session import Session
 from server.journal.recorded_world import RecordedWorld
 from server.observability.counters import Counters
 from server.observability.errors import FaultReporter
+from server.rules import Rules
 from shared import messages
 from shared.messages import Hello, Welcome, encode
 
@@ -27,6 +31,7 @@ class Joining:
         roster: the players.
         commands: says up to which tick the world is durable.
         authenticate: returns the subject of a token, as for `Game`; None: anyone may play.
+        rules: the rules, whose `load_player` is run before a join if they have one.
     """
 
     def __init__(
@@ -39,11 +44,15 @@ class Joining:
         roster: Roster,
         commands: Commands,
         authenticate: Callable[[str], str] | None,
+        rules: Rules,
     ) -> None:
         self._world, self._limits, self._counters, self._faults = world, limits, counters, faults
         self._connections, self._roster, self._commands = connections, roster, commands
         self._rules = world.scene.to_table()
         self.authenticate = authenticate
+        self.run: Runner = at_once
+        """Runner of `load_player`."""
+        self._load = rules.load_player if type(rules).load_player is not Rules.load_player else None
 
     def hello(self, session: Session, hello: Hello, now: float) -> None:
         """Checks a Hello. Its client joins in one of the next ticks, or is refused now."""
@@ -65,13 +74,39 @@ class Joining:
         if not self._authenticated(session, hello.token):
             return
         session.stream.flow.answered(now - session.opened, 0, now)  # a round trip with nothing on the way
-        session.hello = hello._replace(token="")
+        hello = hello._replace(token="")
+        if self._load is None or self._roster.knows(hello.resume, session.subject):
+            session.hello = hello
+            return
+        session.loading = True
+        self.run(self._load(hello.name, session.subject), partial(self._loaded, session, hello))
 
-    def join(self) -> None:
-        """Lets the clients that wait join, at most `Limits.joins_per_tick` of them. Call it before the step."""
+    def _loaded(self, session: Session, hello: Hello, result: Any, error: BaseException | None) -> None:
+        """Lets a client join whose data was loaded, or refuses it."""
+        if session.closed:
+            return
+        session.loading = False
+        if error is None:
+            session.loaded, session.hello = result, hello
+            return
+        if isinstance(error, ValueError):
+            self._connections.refuse(session, messages.NOT_ADMITTED, str(error) or "the game refused the player")
+            return
+        try:
+            raise error
+        except Exception:
+            self._faults.report("load_player")
+        self._connections.refuse(session, messages.INTERNAL, "the game could not load the player's data")
+
+    def join(self, now: float) -> None:
+        """Lets the clients that wait join, at most `Limits.joins_per_tick` of them. Call it before the step.
+
+        Their time limits begin now: a client sends nothing while its player is loaded.
+        """
         sessions = self._connections.sessions
         joining = [session for session in sessions if session.hello is not None and not session.closed]
         for session in joining[: self._limits.joins_per_tick]:
+            session.received_at = session.stream.sent_at = now
             try:
                 self._welcome(session)
             except Exception:
@@ -134,7 +169,7 @@ class Joining:
             if reason:
                 self._connections.refuse(session, messages.NOT_ADMITTED, reason)
                 return
-            player, new = self._roster.enter(session, name), True
+            player, new = self._roster.enter(session, name, session.loaded), True
             if player is None:
                 self._connections.refuse(session, messages.FULL, "no room to spawn")
                 return

@@ -8,6 +8,7 @@ kept.
 import hashlib
 import math
 import secrets
+from typing import Any
 
 from server.config.limits import Limits
 from server.game.names import named
@@ -53,12 +54,13 @@ class Roster:
         """Number of players with a connection, including connections whose loss has not been noticed yet."""
         return sum(player.session is not None for player in self._api.players.values())
 
-    def enter(self, session: Session, name: str) -> Player | None:
+    def enter(self, session: Session, name: str, loaded: Any = None) -> Player | None:
         """Adds a new player at a spawn point. Call it before the step of a tick.
 
         Args:
             session: the connection of the player.
             name: the name of the player.
+            loaded: the result of `Rules.load_player`.
 
         Returns:
             The player, or None if there is no room.
@@ -69,7 +71,7 @@ class Roster:
             return None
         player = self._api.players[entity] = Player(entity, name, session.subject, self._queue())
         player.edits_left = 0.0  # otherwise each leave and new join would give another burst
-        player.announced = False
+        player.announced, player.loaded = False, loaded
         self._counters.joined += 1
         try:
             session.seat(player)
@@ -103,6 +105,12 @@ class Roster:
         if player.session is not None:
             player.session.vacate()
         self._let_go([player])
+
+    def knows(self, token: bytes, subject: str) -> bool:
+        """Returns whether a player has a resume token and a subject; unlike `find`, this changes nothing."""
+        wanted = _digest(token)
+        players = self._api.players.values() if token else ()
+        return any(wanted in player.tokens and player.subject == subject for player in players)
 
     def find(self, token: bytes, subject: str) -> Player | None:
         """Returns the player with a resume token and a subject, or None. The token is used up by this.

@@ -1,6 +1,7 @@
 """A session: one connection of a client, from the handshake to its end."""
 
 import math
+from typing import Any
 
 from server.players.input_queue import InputQueue
 from server.players.player import SETTLED_MAX, Player
@@ -24,6 +25,10 @@ class Session:
         """Number of the player's entity; 0 before the client has joined."""
         self.inputs = InputQueue()
         """Input queue of the player."""
+        self.loading = False
+        """Whether `Rules.load_player` runs for the client."""
+        self.loaded: Any = None
+        """Result of `Rules.load_player`."""
         self.hello: Hello | None = None
         """Hello of a client that waits to join."""
         self.greeting: tuple[int, bytes] | None = None

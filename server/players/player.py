@@ -2,7 +2,7 @@
 
 import math
 from collections import deque
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from server.players.input_queue import InputQueue
 from server.players.outbox import Outbox
@@ -31,6 +31,8 @@ class Player:
         self.subject = subject
         self.announced = True
         """Whether `on_join` has been called for the player."""
+        self.loaded: Any = None
+        """Result of `Rules.load_player`; not saved."""
         self.inputs = inputs or InputQueue()
         self.commands: deque[Command] = deque()
         """Commands that wait for their tick."""

@@ -31,7 +31,7 @@ from tests.readme.run_snippet import LOOPS
 ENGINES = ["pygame-ce", "pyglet", "arcade", "Panda3D", "ursina"]
 ON_A_SERVER = ["asyncio", "A bot"]
 WAITS = "Threads, timers and asyncio"
-GAMES = ["Buttons and aim", "Behaviours", "Declared commands"]
+GAMES = ["Buttons and aim", "Behaviours", "Declared commands", "Before a join"]
 ALONE = ["A game", "Without a socket", "Testing it", "Agents that learn", WAITS, *GAMES]
 A_FILE = "Your own game"
 
@@ -130,6 +130,15 @@ def test_declared_commands() -> None:
     assert [event.data for event in player.events if isinstance(event, Happened)] == [
         {"text": "hello", "by": player.core.entity}
     ]
+
+
+def test_what_is_loaded_before_a_join() -> None:
+    rules = alone("Before a join")["Vault"]()
+    client = Loopback(Game(load_scene(rules.scene), rules=rules)).join("Ann")
+    for frame in range(120):
+        client.poll(frame / 60)
+        client.update(frame / 60)
+    assert rules.game.get(client.entity, "gold") == 12
 
 
 def test_single_player() -> None:
