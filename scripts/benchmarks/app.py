@@ -20,6 +20,10 @@ It also measures the RSS of a server process over sockets: between 200 and 400 c
 
 `entities` measures the CPU time of a tick with 100,000 entities, a tenth of which walk, before, while and after 200
 clients join.
+
+`abilities` plays one game with a dash that clients predict (a behaviour), and with one that waits for the server (a
+command that changes the template), in simulated time. It counts the frames until a player sees its dash, corrections,
+and bytes.
 """
 
 import argparse
@@ -35,7 +39,7 @@ from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
-from scripts.benchmarks import capacity, entities, jitter, memory, physics, rss, step_c, wire
+from scripts.benchmarks import abilities, capacity, entities, jitter, memory, physics, rss, step_c, wire
 from scripts.benchmarks.crowds import Samples
 from scripts.benchmarks.server import RigError
 from shared import kernels
@@ -189,6 +193,24 @@ def run_entities(args: argparse.Namespace, console: Console) -> tuple[Report, in
     return {"rate": entities.RATE, "runs": runs}, 0
 
 
+def run_abilities(args: argparse.Namespace, console: Console) -> tuple[Report, int]:
+    """Runs `abilities`, both ways at each latency."""
+    runs = [
+        abilities.run(commands, rtt, args.players, args.seconds, args.seed)
+        for rtt in abilities.RTTS_MS
+        for commands in (False, True)
+    ]
+    made = Table("RTT ms", "a dash is", title=f"abilities: {args.players} players, {args.seconds:g} s, 60 frames/s")
+    forms = {"dashes": "{}", "frames": "{:g}", "frames_p95": "{:g}", "corrections_per_min": "{:.1f}"}
+    forms |= {"bytes_down_per_s": "{:,.0f}", "bytes_up_per_s": "{:,.0f}"}
+    for name in ("dashes", "frames", "p95", "corr./min", "B/s down", "B/s up"):
+        made.add_column(name, justify="right")
+    for run in runs:
+        made.add_row(f"{run['rtt_ms']}", run["way"], *(form.format(run[name]) for name, form in forms.items()))
+    console.print(made)
+    return {"runs": runs}, 0
+
+
 def table(rows: list[Row]) -> Table:
     made = Table("figure", "unit", title="physics: per entity and tick, per tick, or per call")
     for heading in ("median", "range", "target"):
@@ -253,6 +275,11 @@ def main(argv: list[str] | None = None) -> int:
     )
     command.add_argument("--quick", action="store_true", help="one round of 3 s each, within a minute")
     command.set_defaults(run=jitter.run)
+    command = commands.add_parser("abilities", parents=[each], help="a dash that is predicted, and one that is not")
+    command.add_argument("--players", type=int, default=10, metavar="N", help="players (default: 10)")
+    command.add_argument("--seconds", type=float, default=120.0, metavar="S", help="simulated seconds (default: 120)")
+    command.add_argument("--seed", type=int, default=1, metavar="N", help="seed (default: 1)")
+    command.set_defaults(run=run_abilities)
     args = parser.parse_args(argv)
     for number in (signal.SIGINT, signal.SIGTERM):  # the processes of the benchmark end as well
         signal.signal(number, signal.default_int_handler)

@@ -5,7 +5,7 @@ import tracemalloc
 
 import pytest
 
-from scripts.benchmarks import entities, memory, wire
+from scripts.benchmarks import abilities, entities, memory, wire
 from tests.lengths import long
 
 
@@ -32,3 +32,15 @@ def test_a_large_world_in_small_has_all_its_entities_and_clients() -> None:
     found = entities.run(300, 4, 1)
     assert (found["entities"], found["clients"]) == (304, 4)
     assert found["awake"] >= 34
+
+
+@pytest.mark.parametrize(("rtt_ms", "seconds"), [(150, 1), *long((50, 30), (300, 30))])
+def test_a_predicted_dash_shows_in_the_next_tick_without_corrections_and_a_command_waits(
+    rtt_ms: float, seconds: float
+) -> None:
+    ours, theirs = (abilities.run(commands, rtt_ms, 2, seconds, 902) for commands in (False, True))
+    assert min(ours["dashes"], theirs["dashes"]) >= 2
+    assert ours["frames_p95"] <= 2, "a tick is 1.9 frames"
+    assert ours["causes"] == {}
+    assert theirs["frames"] >= rtt_ms * 60 / 1000
+    assert theirs["causes"].keys() == {"server act"}
