@@ -67,6 +67,11 @@ class BaseClient:
         return self.core.shared
 
     @property
+    def private(self) -> Mapping[str, Any]:
+        """The values that the rules of the game share with this player only, by name."""
+        return self.core.private
+
+    @property
     def stats(self) -> Stats:
         """Counters since the start, and current measurements such as the round trip."""
         return self.core.stats

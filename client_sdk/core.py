@@ -90,6 +90,8 @@ class Core:
         self.controls = Controls()
         self.shared: dict[str, Any] = {}
         """The values that the rules of the game share with all clients, by name."""
+        self.private: dict[str, Any] = {}
+        """The values that the rules of the game share with this player only, by name."""
         self._token = text(token, "token", fields.TOKEN_MAX, shortest=0)
         self._resume = b""
         self._open = False
@@ -304,6 +306,8 @@ class Core:
                 self._commands.refused(message)
             case messages.NextHappened():
                 self._game_events.next(message.number, hold=self._joins)
+            case messages.Private():
+                self.private = message.values
             case messages.Shared():
                 self.shared = message.values
             case messages.Bye():
@@ -340,6 +344,7 @@ class Core:
             for answered in self._commands.give_up():
                 self._events.append(answered)
             self._game_events.restart()
+            self.private = {}
         worlds.filled = world
 
     def _begin(self, world: Replica, now: float) -> None:

@@ -37,3 +37,9 @@ class Refusal(NamedTuple):
 
     number: int
     reason: str
+
+
+class Private(NamedTuple):
+    """All values of the game that only this player gets, by name."""
+
+    values: dict[str, Any]

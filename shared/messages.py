@@ -14,6 +14,7 @@ packed little-endian records in a MessagePack `bin`. docs/protocol.md explains e
                                                            23 NextHappened  number
                                                            24 Announce  tick entity name payload
                                                            25 Refusal   number reason
+                                                           26 Private   values
                                                             4 Bye       code reason wait
 
     Inputs.rows    n * [i8 move_x, i8 move_y, u8 buttons], for the ticks first, first + 1, ...; in a scene with aim
@@ -35,6 +36,7 @@ packed little-endian records in a MessagePack `bin`. docs/protocol.md explains e
                    dropped or lost with a connection. The first event that a player gets has the number 0.
     Announce       an event of an entity's behaviour; its own player does not get it. It counts as a `Happened`.
     Shared         all shared values of the game by name, each time: a score, for example.
+    Private        all values of the game that only this player gets, each time.
     Refusal        a reason for the verdict FORBIDDEN; it comes ahead of the snapshot with that verdict.
     Ping           `corrections`: number of corrections of the client's prediction so far, for the operator.
     Pong.tick      the server time in ticks when it answered: 17.25 is a quarter of a tick after tick 17.
@@ -63,6 +65,7 @@ from shared.fields import (
 from shared.game_messages import Announce as Announce
 from shared.game_messages import Happened as Happened
 from shared.game_messages import NextHappened as NextHappened
+from shared.game_messages import Private as Private
 from shared.game_messages import Refusal as Refusal
 from shared.game_messages import Shared as Shared
 
@@ -227,6 +230,7 @@ Message = (
     | NextHappened
     | Announce
     | Refusal
+    | Private
 )
 KINDS: dict[int, tuple[type[Any], tuple[fields.Check, ...]]] = {
     1: (Hello, (fields.version, fields.digests, fields.name, fields.token, fields.resume)),
@@ -248,12 +252,13 @@ KINDS: dict[int, tuple[type[Any], tuple[fields.Check, ...]]] = {
     23: (NextHappened, (fields.index,)),
     24: (Announce, (fields.tick, fields.entity, fields.name, fields.payload)),
     25: (Refusal, (fields.count, fields.reason)),
+    26: (Private, (fields.names,)),
 }
 """Message class and checks of the fields, by the number of the kind. A snapshot's last field has no check here:
 `shared.snapshot` checks the segments."""
 CLIENT_KINDS = frozenset({1, 2, 3, 4, 5, 6, 7})
 """Kinds of messages that a client may send."""
-SERVER_KINDS = frozenset({4, 17, 18, 19, 20, 21, 22, 23, 24, 25})
+SERVER_KINDS = frozenset({4, 17, 18, 19, 20, 21, 22, 23, 24, 25, 26})
 """Kinds of messages that a server may send."""
 _KIND_OF = {kind: number for number, (kind, _) in KINDS.items()}
 _INPUTS_HEAD = bytes((0x94, _KIND_OF[Inputs]))

@@ -180,4 +180,5 @@ class Joining:
             if new:
                 self._roster.expel(player)
             raise
+        session.stream.private_due = self._roster.private_of(player)
         session.greeting = (self._world.tick + 1, welcome)

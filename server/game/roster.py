@@ -100,6 +100,10 @@ class Roster:
         self._world.note(persisted_state.note_of(player))
         return token
 
+    def private_of(self, player: Player) -> bytes:
+        """Returns the message with the values that only this player gets; empty if there have never been any."""
+        return self._api.private_of(player.entity)
+
     def expel(self, player: Player) -> None:
         """Undoes a join that has failed."""
         if player.session is not None:

@@ -16,8 +16,10 @@ from server.game_api.input_api import InputApi
 from server.game_api.outgoing import Outgoing
 from server.game_api.players_api import PlayersApi
 from server.game_api.shared_values import SharedValues
+from server.game_api.timers import Timers, TimersApi
 from server.game_api.turn import Turn
 from server.game_api.turn_results import TurnResults
+from server.game_api.values_api import ValuesApi
 from server.game_api.zones import Zones
 from server.game_api.zones_api import ZonesApi
 from server.journal.recorded_world import RecordedWorld
@@ -33,7 +35,7 @@ from shared.layout import TEMPLATE
 from shared.scene import Scene
 
 
-class GameApi(InputApi, PlayersApi, ZonesApi):
+class GameApi(InputApi, PlayersApi, TimersApi, ValuesApi, ZonesApi):
     """The game API of one running game. Positions are in blocks, velocities in blocks/s.
 
     A method raises `MissingError` (a `KeyError`) if there is no entity with the given number, and `SceneError`, which
@@ -68,8 +70,10 @@ class GameApi(InputApi, PlayersApi, ZonesApi):
         self.log = ChangeLog(world, self.kept.attributes)
         self.shared_values = SharedValues(world, self.kept.shared)
         self.outgoing = Outgoing(counters)
+        self._rules, self._timers = rules, Timers(Entries(world, self.kept, "timers"))
+        self._private, self._subjects = Entries(world, self.kept, "private"), Entries(world, self.kept, "subjects")
         self._zones = Zones(world, Entries(world, self.kept, "zones"))
-        self.hooks = Hooks(self, world, rules, counters, self._zones, goes_on=kept is not None)
+        self.hooks = Hooks(self, world, rules, counters, self._zones, self._timers, goes_on=kept is not None)
         self._attributes = Attributes(world, self.log, self.kept.attributes)
         self.turn_results = TurnResults(world, self.log, self._attributes, counters)
         self._rewind, self._seed = rewind, seed
@@ -351,5 +355,6 @@ class GameApi(InputApi, PlayersApi, ZonesApi):
         self._world.remove(entity)
         self._world.note([LEFT, entity])
         self._attributes.forget(entity)
+        self._private.forget(entity)
         self.steered.pop(entity, None)
         self.log.note_removal(entity)

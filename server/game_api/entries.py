@@ -25,6 +25,10 @@ class Entries:
         self.table[key] = value
         self._world.note([ENTRY, self._name, key, value])
 
+    def forget(self, key: str | int) -> None:
+        """Removes an entry whose removal another note implies."""
+        self.table.pop(key, None)
+
     def drop(self, key: str | int) -> None:
         """Removes an entry, if it exists."""
         if self.table.pop(key, None) is not None:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from server.declared import RefusedError, checked
+from server.game_api.timers import Timers
 from server.game_api.turn import OutOfTurnError
 from server.game_api.watchers import Watchers
 from server.game_api.zones import Zones
@@ -46,6 +47,7 @@ class Hooks:
         rules: the rules of the game.
         counters: where failed hooks are counted.
         zones: the zones of the game.
+        timers: the timers of the game.
         goes_on: whether the game is restored, so that it has started and the present contacts were reported.
     """
 
@@ -56,6 +58,7 @@ class Hooks:
         rules: Rules,
         counters: Counters,
         zones: Zones,
+        timers: Timers,
         *,
         goes_on: bool,
     ) -> None:
@@ -67,19 +70,22 @@ class Hooks:
         self._soon: deque[tuple[Callable[..., object], tuple[Any, ...]]] = deque()
         self._watchers = Watchers(world, rules, zones, goes_on=goes_on)
         self._started = goes_on
+        self._timers = timers
         self.names = rules.names
         self._faults = FaultReporter("the rules have failed")
 
     # -- in the order of a tick ------------------------------------------------------------------------------
 
     def start(self) -> None:
-        """Calls `on_start` in the first tick of a new game, then the functions that were passed to `soon`."""
+        """Calls `on_start` in the first tick of a new game, the functions of `soon`, and the methods of due timers."""
         if not self._started:
             self._started = True
             self._call(self._rules.on_start)
         for _ in range(len(self._soon)):  # functions that these pass to `soon` wait for the next tick
             act, arguments = self._soon.popleft()
             self._call(act, *arguments)
+        for method, arguments in self._timers.due(self._world.tick + 1):
+            self._call(self._timed, method, arguments)
 
     def left(self, player: Player) -> None:
         """Calls `on_leave`, and removes the player's entity if the rules have not removed it."""
@@ -183,6 +189,11 @@ class Hooks:
         if allowed is None:
             raise RulesError("can_edit returned None: it must return True, False or a reason")
         return checked_result(allowed, "can_edit")
+
+    def _timed(self, method: str, arguments: list[Any]) -> object:
+        """Calls the method of a timer. After a restart, the rules may no longer have it."""
+        act = getattr(self._rules, method)
+        return checked_result(act(*arguments), method)
 
     def _can_join(self, name: str, subject: str) -> object:
         allowed: object = self._rules.can_join(name, subject)

@@ -75,6 +75,7 @@ def restored(notes: Iterable[list[Any]]) -> PersistedState:
             case "left", (entity,):
                 kept.players.pop(entity, None)
                 kept.attributes.pop(entity, None)
+                kept.tables.get("private", {}).pop(entity, None)
             case "said", (entity, attributes):
                 kept.attributes[entity] = attributes
             case "shared", (shared,):

@@ -54,6 +54,8 @@ class ClientStream:
         """Version of the game's shared values that the client has been sent or that waits in `shared_due`."""
         self.shared_due = b""
         """Message with the shared values that follows the next snapshot; empty: there is none."""
+        self.private_due = b""
+        """Message with the values of this player alone that follows the next snapshot; empty: there is none."""
 
     def send(self, message: bytes) -> None:
         """Hands a message to the link."""

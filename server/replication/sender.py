@@ -152,6 +152,9 @@ class Sender:
         if stream.shared_due:
             stream.send(stream.shared_due)
             stream.shared_due = b""
+        if stream.private_due:
+            stream.send(stream.private_due)
+            stream.private_due = b""
         outbox, pacing = player.outbox, stream.flow
         if not outbox.due:
             return
