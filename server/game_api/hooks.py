@@ -84,8 +84,8 @@ class Hooks:
         for _ in range(len(self._soon)):  # functions that these pass to `soon` wait for the next tick
             act, arguments = self._soon.popleft()
             self._call(act, *arguments)
-        for method, arguments in self._timers.due(self._world.tick + 1):
-            self._call(self._timed, method, arguments)
+        for method, values in self._timers.due(self._world.tick + 1):
+            self._call(self._timed, method, values)
 
     def left(self, player: Player) -> None:
         """Calls `on_leave`, and removes the player's entity if the rules have not removed it."""
