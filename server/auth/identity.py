@@ -2,10 +2,8 @@
 
 from typing import Protocol
 
+from server.players.player import SUBJECT_MAX as SUBJECT_MAX
 from shared.checks import text
-
-SUBJECT_MAX = 64
-"""Maximum length of a subject, in characters."""
 
 
 class AuthError(ValueError):

@@ -8,12 +8,11 @@ from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Any
 
-from server.auth.identity import SUBJECT_MAX
 from server.game_api import values
 from server.game_api.entries import Entries
 from server.game_api.turn import Turn
 from server.players.persisted_state import PersistedState
-from server.players.player import Player
+from server.players.player import SUBJECT_MAX, Player
 from shared.checks import SceneError, shown, text
 from shared.fields import NAME_MAX
 from shared.messages import Private, encode

@@ -11,6 +11,8 @@ from shared.messages import Command
 if TYPE_CHECKING:
     from server.game.session import Session
 
+SUBJECT_MAX = 64
+"""Maximum length of the subject of a token, in characters."""
 SETTLED_MAX = 128
 """Maximum number of verdicts kept for one player, in case that its client lost the connection before it got them."""
 
