@@ -57,7 +57,7 @@ def test_no_state_of_behaviours_is_lost_in_kills(tmp_path: Path, kills: int) -> 
             if expected is not None:
                 figures = stats((host, port))
                 assert (figures["restored_tick"], figures["restored_hash"]) == expected, life
-            play(f"ws://{host}:{port}", 1.0, life)
+            play(f"ws://{host}:{port}", 0.6, life)
             server.process.send_signal(signal.SIGKILL)
         finally:
             server.close()

@@ -325,6 +325,21 @@ def test_rules_with_wrong_behaviours_are_refused_by_name(behaviours: object) -> 
         Match(scene(()), 1, rules=rules)
 
 
+def test_agents_play_a_game_with_behaviours_alike_for_one_seed() -> None:
+    agents = pytest.importorskip("server.agents")
+    arena = agents.Arena(scene(()), agents=2, rules=Playground, seconds=3)
+    hashes = []
+    for _ in range(2):
+        arena.reset(seed=5)
+        pressers, rng = [Presser(), Presser()], random.Random(2)
+        while arena.agents:
+            arena.step({agent: presser.next(rng) for agent, presser in zip(arena.agents, pressers, strict=False)})
+        hashes.append(arena.world.state_hash())
+        assert arena.api.field(1, "turns") > 8  # a crate
+        assert sum(arena.world.field(arena.entity(agent), "shots") for agent in arena.possible_agents) > 0
+    assert hashes[0] == hashes[1]
+
+
 def test_others_get_announcements_of_entities_that_they_see() -> None:
     match = Match(scene(()), 2, rules=Playground())
     players = [match.join(policy, Link(0.05, 0.0)) for policy in (Presser(), lambda core, rng: Input())]

@@ -50,7 +50,7 @@ def told(player: Player) -> Counter[str]:
 
 
 @pytest.mark.parametrize(
-    ("preset", "ticks"), [("regional", 350), ("far", 350), *long(*((preset, 20_000) for preset in PRESETS))]
+    ("preset", "ticks"), [("regional", 200), ("far", 200), *long(*((preset, 20_000) for preset in PRESETS))]
 )
 def test_a_lone_player_with_every_ability_is_corrected_for_late_inputs_only(preset: str, ticks: int) -> None:
     match = joined(Playground(), PRESETS[preset], Presser(), seed=11)
@@ -187,7 +187,7 @@ class Crowd(Presser):
         return input_
 
 
-@pytest.mark.parametrize(("players", "seconds", "seed"), [(4, 8, 5), *long((30, 30, 6), (30, 30, 7))])
+@pytest.mark.parametrize(("players", "seconds", "seed"), [(4, 4, 5), *long((30, 30, 6), (30, 30, 7))])
 def test_players_who_dash_into_each_other_are_corrected_for_each_other(players: int, seconds: int, seed: int) -> None:
     counts = {}
     for neighbours in (True, False):
