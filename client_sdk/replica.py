@@ -123,6 +123,7 @@ class Replica:
         """
         self.newest_received = max(self.newest_received, snapshot.newest)
         self.wrong = self.confirmed.apply(snapshot) or self.wrong
+        self.prediction.learn()
         placed = self.confirmed.placed.get(snapshot.tick)
         self.picture.interpolation.push(snapshot.tick, self.confirmed.states, placed or frozenset())
 

@@ -106,7 +106,8 @@ class Prediction:
         self._edits: dict[int, tuple[int, Edit]] = {}  # edits without a verdict, with their ticks, by number
         self._refused = False  # whether an edit that the last replay applied was refused since
         self._compared = -1
-        self._failed = -1  # newest tick whose failed turns the program knows
+        self._failed: set[tuple[int, int]] = set()  # ticks and entities of failed turns that the program knows
+        self._acts_differ = False  # whether the server did other acts since the last replay than predicted
 
     def begin(self, tick: int) -> None:
         """Starts the prediction at `tick`, or starts it again: replays the filed inputs from the confirmed world."""
@@ -116,6 +117,7 @@ class Prediction:
     def adopt(self, old: "Prediction") -> None:
         """Takes over the inputs and the edits without a verdict from an earlier prediction of the same entity."""
         self._inputs, self._edits, self.announcements = old._inputs, old._edits, old.announcements
+        self._failed = old._failed
 
     def rows_since(self, tick: int, to: int) -> bytes:
         """Returns the own inputs after `tick`, up to `to`, packed as `Inputs.rows`.
@@ -148,8 +150,10 @@ class Prediction:
             if self.entity <= event.entity <= self.last_own:
                 self.announcements.add(tick, event)
         failures = turns.take_failures() if turns.failures else ()
-        self.failures += [each for each in failures if each.tick > self._failed]
-        self._failed = max(self._failed, tick)
+        for each in failures:
+            if (each.tick, each.entity) not in self._failed:
+                self._failed.add((each.tick, each.entity))
+                self.failures.append(each)
 
     def _input(self, tick: int) -> Input:
         """Returns the own input of a tick, or the substitute that the server uses if none was sent."""
@@ -201,7 +205,6 @@ class Prediction:
         guess, truth = self._states.get(tick), self._truth()
         changed = known.terrain_changed or self._refused
         if guess is not None and not changed and self._near_equal(guess, truth):
-            self.announcements.confirm(tick)
             return NOTHING
         correction = None
         if guess is not None and (mine := self._difference(guess, truth)):
@@ -294,9 +297,11 @@ class Prediction:
 
     def _replay(self, to: int) -> None:
         tick = self.confirmed.tick
-        guess = self._states.get(tick)
-        final = guess is None or not self.announcements.pending or self._acts(guess) == self._acts(self._truth())
-        self.announcements.begin(tick, final)
+        self.learn()
+        self.announcements.begin(tick, final=not self._acts_differ)
+        self._acts_differ = False
+        if self._failed:
+            self._failed = {failed for failed in self._failed if failed[0] > tick}
         self.predicted.restore(self.confirmed)
         self.known.terrain_changed = self.known.edited_near = self._refused = False
         if not self.neighbours:
@@ -307,6 +312,16 @@ class Prediction:
         while self.predicted.tick < to:
             self.step()
         self.announcements.end()
+
+    def learn(self) -> None:
+        """Learns from a snapshot which announcements are final. Call it after each, also if more are about to come."""
+        if not self.announcements.pending or self._acts_differ:
+            return
+        guess = self._states.get(self.confirmed.tick)
+        if guess is not None and self._acts(guess) != self._acts(self._truth()):
+            self._acts_differ = True
+        else:
+            self.announcements.confirm(self.confirmed.tick)
 
     def _acts(self, states: Int64s) -> list[list[int]]:
         """Returns the counts of the acts of the own entity and of what it has spawned, with their numbers."""

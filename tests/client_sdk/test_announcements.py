@@ -9,14 +9,16 @@ from client_sdk.prediction.announcements import Announcements
 from server.game import Game
 from server.rules import Rules
 from shared.behaviours import Behaviour, field
+from shared.body import Body
 from shared.checks import SceneError
 from shared.inputs import Input
 from shared.messages import Bye, decode_from_client
 from shared.payloads import pack_value
 from shared.turns import Announcement
 from sovereign_netcode.playtest import Link, Match
-from tests.behaving import CLASSES, Acrobat, Crate, Playground, Presser, Shot, scene
+from tests.behaving import BUTTONS, CLASSES, Acrobat, Crate, Playground, Presser, Shot, scene
 
+DASH, FIRE = (1 << BUTTONS.index(name) for name in ("dash", "fire"))
 Given = list[tuple[str, int, object]]
 
 
@@ -120,6 +122,50 @@ def test_all_that_a_program_is_told_over_a_bad_link_adds_up_to_what_the_server_d
     assert len(set(gone)) == len(gone)
     assert set(gone) <= set(numbers)
     assert len(numbers) > 20
+
+
+class Caster(Behaviour):
+    templates = ("player",)
+    mana = field(bits=8, start=1)
+
+    def turn(self, me: Body) -> None:
+        if me.pressed("dash"):
+            me.announce("dash")
+        if me.pressed("fire") and me.mana:
+            me.announce("cast")
+
+
+class Drained(Rules):
+    """Rules that take all mana away at a tick."""
+
+    behaviours = (Caster,)
+    at = 1 << 30
+
+    def on_tick(self) -> None:
+        for entity in self.game.players if self.game.tick == self.at else ():
+            self.game.set_field(entity, "mana", 0)
+
+
+def test_snapshots_that_come_at_once_withdraw_only_what_came_after_the_first_difference() -> None:
+    rules = Drained()
+    match = Match(scene(()), 1, rules=rules)
+    presses: list[int] = []
+    player = match.join(lambda core, rng: Input(0, 0, presses.pop(0) if presses else 0), Link(0.1, 0.0))
+    match.run_until(lambda: player.core.state == "playing", 20)
+    match.run(1)
+    prediction = player.core.prediction
+    assert prediction is not None
+    first = prediction.predicted.tick + 1
+    rules.at = first + 2
+    presses += [DASH, 0, 0, FIRE]
+    match.run_until(lambda: not presses, 5)
+    match.run(1 / 32)
+    player.suspend(0.5)
+    match.run(3)
+    said = [(each.name, each.tick - first) for each in player.events if isinstance(each, Announced)]
+    gone = [each.name for each in player.events if isinstance(each, Withdrawn)]
+    assert [name for name, _ in said] == ["dash", "cast"]
+    assert gone == ["cast"]
 
 
 # -- wrong classes -------------------------------------------------------------------------------------------
