@@ -9,8 +9,8 @@ from shared.scene import Scene
 class Controls:
     """The source of the inputs of the next ticks.
 
-    A button that is pressed between two ticks counts in the next tick's input, even if it is released before that tick.
-    A button that is held counts in every tick.
+    A button that is pressed between two ticks counts in the next tick's input, even if it is released before that tick;
+    the input then has the aim of that press. A button that is held counts in every tick.
     """
 
     def __init__(self) -> None:
@@ -22,6 +22,8 @@ class Controls:
         """Input delay in ticks, 0 to 3: inputs are filed this far ahead of the predicted world."""
         self._pressed = 0
         """Bits of the buttons that were pressed since the latest tick."""
+        self._aimed = NO_AIM
+        """Aim of the latest press; none: it had none."""
         self._unresolved: tuple[str, ...] | None = None
         """Names of held buttons whose bits are not known yet; None: there are none, and the aim is checked."""
 
@@ -42,7 +44,10 @@ class Controls:
             scene.check_aim(input_.aim)
             input_ = input_._replace(buttons=input_.buttons | scene.buttons_bits(named))
         self._unresolved = named if scene is None else None
-        self._pressed |= input_.buttons & ~self.held.buttons
+        pressed = input_.buttons & ~self.held.buttons
+        if pressed:
+            self._pressed |= pressed
+            self._aimed = input_.aim if scene is not None else NO_AIM  # not checked yet
         self.held = input_
 
     def resolve(self, scene: Scene | None) -> None:
@@ -61,7 +66,11 @@ class Controls:
     def take(self) -> Input:
         """Returns the input of the next tick, including buttons that were pressed and released before it."""
         pressed, self._pressed = self._pressed, 0
-        return self.held._replace(buttons=self.held.buttons | pressed) if pressed else self.held
+        if not pressed:
+            return self.held
+        released = pressed & ~self.held.buttons
+        aim = self._aimed if released and self._aimed != NO_AIM else self.held.aim
+        return self.held._replace(buttons=self.held.buttons | pressed, aim=aim)
 
     def forget(self) -> None:
         """Forgets presses, because the tick that they were meant for has no input."""

@@ -20,7 +20,8 @@ class Slider:
 
     def __init__(self, top: float) -> None:
         self._top = top
-        self._held = False
+        self.held = False
+        """Whether the mouse holds the knob."""
         self.track = pygame.Rect(0, 0, 0, 0)
 
     def draw(self, target: pygame.Surface, area: pygame.Rect, value: float) -> None:
@@ -35,10 +36,10 @@ class Slider:
         """Returns the value that the mouse sets with this event; None if the event does not concern the slider."""
         x, y = pygame.mouse.get_pos()
         if event.type == pygame.MOUSEBUTTONDOWN and event.button == 1:
-            self._held = self.track.inflate(24, 24).collidepoint(x, y)
+            self.held = self.track.inflate(24, 24).collidepoint(x, y)
         elif event.type == pygame.MOUSEBUTTONUP:
-            self._held = False
-        if not self._held or event.type not in (pygame.MOUSEBUTTONDOWN, pygame.MOUSEMOTION):
+            self.held = False
+        if not self.held or event.type not in (pygame.MOUSEBUTTONDOWN, pygame.MOUSEMOTION):
             return None
         share = (x - self.track.x) / max(self.track.width, 1)
         return self._top * min(max(share, 0.0), 1.0)

@@ -3,7 +3,7 @@
 import functools
 import math
 from collections.abc import Mapping
-from typing import Any, NamedTuple, Protocol
+from typing import NamedTuple, Protocol
 
 import pygame
 
@@ -32,6 +32,7 @@ from sovereign_netcode.play.iso import (
 )
 from sovereign_netcode.play.keys import Keys, commands_of
 from sovereign_netcode.play.panel import Panel
+from sovereign_netcode.play.texts import points_text, sentence
 
 SIZE = 1280, 800
 SKY = (122, 184, 232), (222, 240, 250)
@@ -147,6 +148,11 @@ class Window:
             self._keys = scene, Keys(scene.buttons, self._wanted)
         return self._keys[1]
 
+    @property
+    def sliding(self) -> bool:
+        """Whether the mouse holds the slider of the latency."""
+        return self._hud.slider.held
+
     def save(self, path: str) -> None:
         """Saves the window's content to an image file."""
         pygame.image.save(self._screen, path)
@@ -163,7 +169,7 @@ class Window:
             case Left(reason=reason):
                 self.over = self.over or reason
             case Happened(name=name, data=data):
-                self._hud.say(_sentence(name, data, view), now)
+                self._hud.say(sentence(name, data, view), now)
             case Answered(done=False, verdict=verdict):
                 self._hud.say(f"rejected: {verdict}", now)
             case Disconnected(reason=reason, wait_s=wait_s):
@@ -266,7 +272,7 @@ class Window:
         self._hud.draw(
             target,
             now,
-            title=f"{self.title}{_points(self.client.shared.get('points'))}",
+            title=f"{self.title}{points_text(self.client.shared.get('points'))}",
             keys="    ".join(part for part in (self.keys.text(), "Enter: say" if self.chat.there else "") if part),
             edits=scene.reach > 0,
             left_s=left_s,
@@ -333,6 +339,8 @@ def keyboard(window: Window, view: View, now: float) -> Wish:
     held, mouse = pygame.key.get_pressed(), pygame.mouse.get_pressed()
 
     def down(code: int) -> bool:
+        if code < 0 and window.sliding:
+            return False
         return code in window.pressed or (held[code] if code > 0 else mouse[-code - 1])
 
     x = sum(way[0] for key, way in KEYS.items() if held[key])
@@ -351,35 +359,3 @@ def _sky(size: tuple[int, int]) -> pygame.Surface:
     strip.set_at((0, 0), SKY[0])
     strip.set_at((0, 1), SKY[1])
     return pygame.transform.smoothscale(strip.convert(), size)
-
-
-def _sentence(name: str, data: Any, view: View) -> str:
-    """Returns an event as a sentence; an event that tag does not have is shown with its name and data."""
-    figures = {figure.entity: figure for figure in view.figures}
-
-    def called(entity: Any) -> str:
-        figure = figures.get(entity)
-        return str(figure.attributes.get("name", f"#{entity}")) if figure else "a player"
-
-    match name, data:
-        case "said", {"by": by, "text": text}:
-            return f"{called(by)}: {text}"
-        case "tagged", {"by": by, "who": who}:
-            return f"{called(by)} tagged {called(who)}"
-        case "out", {"by": by, "who": who}:
-            return f"{called(by)} puts {called(who)} out"
-        case "round", {"winner": str(winner)}:
-            return f"{winner} wins the round"
-        case "round", {"winner": winner}:
-            return f"{called(winner)} wins the round"
-    if isinstance(data, Mapping):
-        named = {key: called(value) if key in ("by", "who") else value for key, value in data.items()}
-        return name + "".join(f"  {key} {value}" for key, value in named.items())
-    return f"{name} {'' if data is None else data}"
-
-
-def _points(points: Any) -> str:
-    """Returns the shared value "points", a table of teams and their points, as a text; empty if there is none."""
-    if not isinstance(points, Mapping):
-        return ""
-    return "".join(f"    {team} {count}" for team, count in points.items())

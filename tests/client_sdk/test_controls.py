@@ -6,6 +6,7 @@ import pytest
 
 from client_sdk.controls import Controls
 from shared.inputs import NEUTRAL, Input, make_input
+from shared.scene import load_scene
 
 JUMP, OTHER = Input(5, 7, 1), Input(0, 0, 2)
 
@@ -45,6 +46,40 @@ def test_a_release_and_a_press_between_two_ticks_are_a_press() -> None:
 def test_each_button_is_one_of_its_own() -> None:
     controls = filled(JUMP, OTHER, NEUTRAL)
     assert [controls.take().buttons for _ in range(2)] == [3, 0]
+
+
+def aimed(*wishes: Input) -> Controls:
+    controls, scene = Controls(), load_scene("flat").with_buttons("fire", "dash", aim=True)
+    for input_ in wishes:
+        controls.set(input_, scene=scene)
+    return controls
+
+
+FIRE = make_input(0, 0, buttons=2, aim=(1, 0, 0))
+
+
+@pytest.mark.parametrize("after", [NEUTRAL, make_input(aim=(0, 1, 0))])
+def test_a_press_that_is_over_keeps_its_aim_for_one_tick(after: Input) -> None:
+    controls = aimed(FIRE, after)
+    assert [controls.take() for _ in range(2)] == [FIRE, after]
+
+
+def test_a_button_that_is_held_has_the_newest_aim() -> None:
+    turned = FIRE._replace(aim=make_input(aim=(0, 1, 0)).aim)
+    assert aimed(FIRE, turned).take() == turned
+
+
+def test_a_press_without_an_aim_has_the_newest_aim() -> None:
+    after = make_input(aim=(0, 1, 0))
+    assert aimed(FIRE._replace(aim=NEUTRAL.aim), after).take() == after._replace(buttons=2)
+
+
+def test_an_aim_does_not_outlive_the_tick_of_its_press() -> None:
+    controls = aimed(FIRE)
+    controls.take()
+    controls.set(make_input(buttons=4), scene=load_scene("flat").with_buttons("fire", "dash", aim=True))
+    controls.set(NEUTRAL)
+    assert controls.take() == make_input(buttons=4)
 
 
 @pytest.mark.parametrize("bit", [1 << place for place in range(8)])
