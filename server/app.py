@@ -100,7 +100,7 @@ def run(settings: Settings) -> int:
     """
     log.set_up(settings.log_level, settings.log_format, sys.stderr)
     authenticate = authenticator(settings)
-    rules = Rules() if settings.game is None else load_rules(settings.game)
+    rules = Rules() if settings.game is None else load_rules(settings.game, settings.options)
     scene = load_scene(settings.scene if "scene" in settings.origins else rules.scene or settings.scene)
     if settings.tick_rate is not None:
         scene = dataclasses.replace(scene, tick_rate=settings.tick_rate)

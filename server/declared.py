@@ -13,7 +13,8 @@ or a missing field, or another name is refused, with a reason that names it.
 """
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
@@ -163,3 +164,54 @@ def check_declaration(commands: object, at: str) -> None:
                     value.check(value.default)
                 except ValueError as error:
                     raise SceneError(f"{where}.{key}: default = {shown(value.default)}: {error}") from None
+
+
+def option(value: Value, given: object) -> Any:
+    """Returns the value of an option of a game after a check.
+
+    Args:
+        value: the declaration.
+        given: a value, or a text from the command line, which is converted.
+
+    Raises:
+        ValueError: it does not match the declaration. The message says what it must be.
+    """
+    for candidate in _readings(given) if isinstance(given, str) else (given,):
+        try:
+            found = value.check(candidate)
+        except ValueError:
+            continue
+        if found == candidate:  # a command's number out of bounds is set to the bound, but an option is an error
+            return found
+    raise ValueError(f"must be: {value.description}")
+
+
+def _readings(given: str) -> Iterator[Any]:
+    """Yields a text, and what else it can mean."""
+    for read in (int, float):
+        with suppress(ValueError):
+            yield read(given)
+    if given in BOOLEANS:
+        yield BOOLEANS[given]
+    yield given
+
+
+def check_options(options: object, owner: type) -> None:
+    """Checks the declaration of options.
+
+    Raises:
+        SceneError: it is not a table of fields with defaults, or a name cannot be an attribute of the rules.
+    """
+    at = f"{owner.__qualname__}.options"
+    if not isinstance(options, Mapping):
+        raise SceneError(f"{at} = {shown(options)}: must be a table of fields")
+    check_declaration({"options": options}, at)
+    for name, value in options.items():
+        if not name.isidentifier() or name.startswith("_") or hasattr(owner, name):
+            raise SceneError(f"{at}[{name!r}]: must be a name that is no other attribute of the class")
+        if value.default is REQUIRED:
+            raise SceneError(f"{at}[{name!r}]: needs a default")
+
+
+BOOLEANS = {"true": True, "yes": True, "false": False, "no": False}
+"""Texts of the command line that can mean a truth value."""

@@ -50,6 +50,8 @@ def described(rules: Rules, scene: Scene) -> Iterator[str]:
     if scene.kinds:
         yield _line("blocks", ", ".join(kind.name + ("" if kind.solid else " (not solid)") for kind in scene.kinds))
     yield _line("hooks", ", ".join(name for name in HOOKS if _overridden(rules, name)) or "none")
+    for name, value in rules.options.items():
+        yield _line("option", _field(name, value))
     for name, fields in rules.commands.items():
         yield _line("command", f"{name}({', '.join(_field(key, value) for key, value in fields.items())})")
     for title, texts in (("event", rules.events), ("attribute", rules.attributes)):

@@ -8,9 +8,9 @@
 
 The server calls all hooks within a tick, before the step, in this order: `on_start`, the functions given to
 `game.soon`, `on_leave`, `can_join` and `on_join`, `on_fell_out`, `on_command` and `can_edit`, `on_contact_end`,
-`on_contact`, `on_block_contact`, `on_exit`, `on_enter`, `on_tick`. If a hook raises, the exception is logged and
-counted, and the game goes on. A hook is a plain function and must not wait. Code that waits runs in a task or a thread
-of its own and hands its result back with `game.soon`.
+`on_contact`, `on_block_contact`, `on_exit`, `on_enter`, `on_tick`; at the end `on_stop`. If a hook raises, the
+exception is logged and counted, and the game goes on. A hook is a plain function and must not wait. Code that waits
+runs in a task or a thread of its own and hands its result back with `game.soon`.
 
 Hooks read and change the game through `self.game`, a `server.game_api.api.GameApi`. Decisions about the world must use
 nothing else: `self.game.random` gives the same numbers when a game is computed again, but a clock or the order of a set
@@ -25,7 +25,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from server.config.options import nearest
-from server.declared import Value, check_declaration
+from server.declared import Value, check_declaration, check_options, option
 from server.players.player import Player
 from shared.behaviours import Behaviour, checked_classes
 from shared.checks import SceneError, shown
@@ -58,6 +58,10 @@ class Rules:
     commands: Mapping[str, Mapping[str, Value]] = {}
     """Declared commands (`server.declared`), whose fields are checked before `on_command`. Empty: any command."""
 
+    options: Mapping[str, Value] = {}
+    """Options of the game, which the operator sets by `--option name=value`: fields with defaults (`server.declared`).
+    The value of each is an attribute of the rules with its name."""
+
     events: Mapping[str, str] = {}
     """Meanings of the game's events by name, for `sovereign-server describe`."""
 
@@ -76,6 +80,8 @@ class Rules:
         def __getattr__(self, name: str) -> Any:
             if name == "game":
                 raise AttributeError("self.game is not available in __init__ and prepare, only from on_start on")
+            if name in type(self).options:
+                return type(self).options[name].default
             raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}", name=name, obj=self)
 
     def prepare(self, scene: Scene) -> Scene:
@@ -114,6 +120,12 @@ class Rules:
 
     def on_start(self) -> None:
         """Called once, when the world exists and no player has joined. Not called when a saved game is restored."""
+
+    def on_stop(self) -> None:
+        """Called once when the server stops in order, ahead of the last save; not after a crash.
+
+        Changes are saved, but clients no longer get them.
+        """
 
     def on_join(self, player: Player) -> None:
         """Called when a new player has an entity. Not called when a player reconnects."""
@@ -193,8 +205,13 @@ class Rules:
         return True
 
 
-def load_rules(name: str) -> Rules:
+def load_rules(name: str, options: Mapping[str, object] | None = None) -> Rules:
     """Loads the class `module:Class` and returns an instance. The working directory is searched for modules, too.
+
+    Args:
+        name: the class.
+        options: values of the game's options by name, which become attributes ahead of `__init__`. A text is converted
+            to the type of the option. None: the defaults.
 
     Raises:
         RulesError: there is no such class, it cannot be instantiated, or it cannot be used as rules.
@@ -206,7 +223,10 @@ def load_rules(name: str) -> Rules:
     if here not in sys.path:
         sys.path.insert(0, here)
     try:
-        rules: Rules = getattr(importlib.import_module(module_name), class_name)()
+        made: Any = getattr(importlib.import_module(module_name), class_name)
+        rules: Rules = with_options(made, options) if options else made()
+    except RulesError as error:
+        raise RulesError(f"game = {name!r}: {error}") from error
     except Exception as error:
         raise RulesError(f"game = {name!r}: cannot be loaded ({type(error).__name__}: {error})") from error
     try:
@@ -214,6 +234,40 @@ def load_rules(name: str) -> Rules:
     except RulesError as error:
         raise RulesError(f"game = {name!r}: {error}") from error
     return rules
+
+
+def with_options(rules: Any, options: Mapping[str, object]) -> Rules:
+    """Returns a new instance of a class of rules with values for its options.
+
+    Raises:
+        RulesError: the rules have no such option, or its value does not match the declaration.
+    """
+    if not isinstance(rules, type) or not issubclass(rules, Rules):
+        raise RulesError(f"{shown(rules)}: is no subclass of server.rules.Rules, and has no options")
+    _checked_options(rules)
+    made: Any = rules.__new__(rules)
+    for name, given in options.items():
+        if name not in rules.options:
+            there = nearest(name, rules.options) or f" (there are {', '.join(rules.options) or 'none'})"
+            raise RulesError(f"option {name} = {shown(given)}: no such option{there}")
+        try:
+            setattr(made, name, option(rules.options[name], given))
+        except ValueError as error:
+            raise RulesError(f"option {name} = {shown(given)}: {error}") from None
+    made.__init__()
+    return made  # type: ignore[no-any-return]
+
+
+def _checked_options(rules: type[Rules]) -> None:
+    """Checks the declared options of rules.
+
+    Raises:
+        RulesError: they cannot be used.
+    """
+    try:
+        check_options(rules.options, rules)
+    except SceneError as error:
+        raise RulesError(str(error)) from None
 
 
 def check_rules(rules: object) -> None:
@@ -236,6 +290,7 @@ def check_rules(rules: object) -> None:
         check_declaration(rules.commands, f"{owner}.commands")
     except SceneError as error:
         raise RulesError(str(error)) from None
+    _checked_options(type(rules))
     plain = {hook.replace("_", ""): hook for hook in HOOKS}
     for name in dir(rules):
         meant = plain.get(name.lower().replace("_", ""), "")

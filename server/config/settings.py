@@ -131,6 +131,8 @@ class Settings:
         60.0, Option(float, "seconds between two checkpoints of the saved world", "S", 0.1, 3600)
     )
     limits: Limits = field(default_factory=Limits)
+    options: Mapping[str, object] = field(default_factory=dict)
+    """Options of the game by name, as the operator gave them; `server.rules` checks them."""
     origins: Mapping[str, str] = field(default_factory=dict, compare=False)
 
     def to_toml(self) -> str:
@@ -144,6 +146,10 @@ class Settings:
                 line = f"# {name} is not set" if value is None else f"{name} = {to_toml(value)}"
                 runs = f"; runs: {kernels.describe(self.kernel)}" if name == "kernel" else ""
                 lines.append(f"{line}  # {self.origins.get(name, 'default')}{runs}")
+        lines += ["", "[options]"] if self.options else []
+        for name, value in self.options.items():
+            shown = to_toml(value) if isinstance(value, str | int | float | bool) else repr(value)
+            lines.append(f"{name} = {shown}  # {self.origins.get(f'option {name}', 'default')}")
         return "\n".join(lines) + "\n"
 
 
@@ -165,13 +171,19 @@ DEFAULTS: dict[str, Any] = {f.name: f.default for owner in (Settings, Limits) fo
 """Default values of all settings by name."""
 
 
-def load(flags: Mapping[str, str], environment: Mapping[str, str], config: str | None = None) -> Settings:
+def load(
+    flags: Mapping[str, str],
+    environment: Mapping[str, str],
+    config: str | None = None,
+    options: Sequence[str] = (),
+) -> Settings:
     """Returns the settings from flags, environment, file and defaults, in this order of precedence.
 
     Args:
         flags: the values from the command line by the name of the setting.
         environment: the environment variables.
         config: path of a TOML file; None: no file.
+        options: options of the game from the command line, each NAME=VALUE.
 
     Raises:
         SettingsError: a value cannot be used, a name is unknown, settings exclude each other, or the file cannot be
@@ -200,8 +212,11 @@ def load(flags: Mapping[str, str], environment: Mapping[str, str], config: str |
         take(name, value, "--" + name.replace("_", "-"))
     if "host" in values:
         values["host"] = values["host"].removeprefix("[").removesuffix("]")  # an IPv6 address as it stands in a URL
+    of_game: dict[str, object] = {}
+    for name, value, origin in _options(options, config):
+        of_game[name], origins[f"option {name}"] = value, origin
     limits = Limits(**{name: values.pop(name) for name in SECTIONS["limits"] if name in values})
-    settings = Settings(**values, limits=limits, origins=origins)
+    settings = Settings(**values, limits=limits, options=of_game, origins=origins)
     _check_together(settings)
     return settings
 
@@ -228,6 +243,11 @@ def _check_together(settings: Settings) -> None:
                 f"allowed_hosts = {name!r} (from {settings.origins['allowed_hosts']}): must be a host name, without "
                 f"scheme and port, or {ANY} for all"
             )
+    if settings.options and settings.game is None:
+        name = next(iter(settings.options))
+        raise SettingsError(
+            f"option {name} (from {settings.origins[f'option {name}']}): is of a game; give --game, too"
+        )
     if why := kernels.missing(settings.kernel):
         raise SettingsError(f"kernel = {settings.kernel!r} (from {settings.origins['kernel']}): {why}")
     if (settings.tls_cert is None) != (settings.tls_key is None):
@@ -242,6 +262,7 @@ def _entries(config: str) -> Iterator[tuple[str, object]]:
         SettingsError: the file cannot be read, or has an unknown name or a name in the wrong table.
     """
     tables = {"": _read(config)}
+    tables[""].pop("options", None)
     tables |= {name: tables[""].pop(name) for name in SECTIONS if isinstance(tables[""].get(name), dict)}
     for section, table in tables.items():
         known, place = SECTIONS[section], f"[{section}] in " if section else ""
@@ -250,6 +271,24 @@ def _entries(config: str) -> Iterator[tuple[str, object]]:
                 hint = nearest(name, known) or f" (there are {', '.join(known)})"
                 raise SettingsError(f"{name} (from {place}file {config}): no such setting{hint}")
             yield name, value
+
+
+def _options(given: Sequence[str], config: str | None) -> Iterator[tuple[str, object, str]]:
+    """Yields the options of the game: name, value and origin; those of the command line last.
+
+    Raises:
+        SettingsError: an option has no name, or `options` in the file is not a table.
+    """
+    table = {} if config is None else _read(config).get("options", {})
+    if not isinstance(table, dict):
+        raise SettingsError(f"options = {table!r} (from file {config}): must be a table")
+    for name, value in table.items():
+        yield name, value, f"file {config}"
+    for text in given:
+        name, equals, value = text.partition("=")
+        if not name or not equals:
+            raise SettingsError(f"option = {text!r} (from --option): must be NAME=VALUE, like round_s=90")
+        yield name, value, "--option"
 
 
 def _read(path: str) -> dict[str, Any]:
@@ -292,16 +331,25 @@ def parse(arguments: Sequence[str], environment: Mapping[str, str] = os.environ)
                 help=kind.help + ("" if default in (None, ()) else f" (default: {str(default).lower()})"),
                 default=argparse.SUPPRESS,
             )
+    parser.add_argument(
+        "--option",
+        action="append",
+        default=[],
+        metavar="NAME=VALUE",
+        help="option of the game, like round_s=90; may be given several times (`describe --game ...` lists them)",
+    )
     parser.add_argument("--config", metavar="FILE", help=f"TOML file with settings (or {CONFIG_VARIABLE})")
     parser.add_argument("--list-scenes", action="store_true", help="print the built-in scenes and exit")
     parser.add_argument(
         "--print-config", action="store_true", help="print all settings as a TOML file, with their origins, and exit"
     )
     flags = parser.flags(arguments)
-    config, listing, printing = (flags.pop(name) for name in ("config", "list_scenes", "print_config"))
+    config, listing, printing, options = (
+        flags.pop(name) for name in ("config", "list_scenes", "print_config", "option")
+    )
     if listing:
         return list_scenes()
-    settings = load(flags, environment, config or environment.get(CONFIG_VARIABLE))
+    settings = load(flags, environment, config or environment.get(CONFIG_VARIABLE), options)
     return settings.to_toml() if printing else settings
 
 

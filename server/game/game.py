@@ -191,12 +191,14 @@ class Game:
         self.connections.lost(session, now)
 
     def shut_down(self, reason: str, wait: float) -> None:
-        """Closes all connections.
+        """Lets the rules finish (`on_stop`), and closes all connections.
 
         Args:
             reason: the reason, sent to the clients.
             wait: seconds after which the clients should reconnect.
         """
+        with self.api.turn:
+            self.api.hooks.stop()
         self.connections.shut_down(reason, wait)
 
     def keep(self) -> list[list[Any]]:

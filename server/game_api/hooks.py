@@ -69,7 +69,7 @@ class Hooks:
         self._api, self._world, self._rules, self._counters = stage, world, rules, counters
         self._soon: deque[tuple[Callable[..., object], tuple[Any, ...]]] = deque()
         self._watchers = Watchers(world, rules, zones, goes_on=goes_on)
-        self._started = goes_on
+        self._started, self._stopped = goes_on, False
         self._timers = timers
         self.names = rules.names
         self._faults = FaultReporter("the rules have failed")
@@ -86,6 +86,12 @@ class Hooks:
             self._call(act, *arguments)
         for method, values in self._timers.due(self._world.tick + 1):
             self._call(self._timed, method, values)
+
+    def stop(self) -> None:
+        """Calls `on_stop`, once, if the game has started."""
+        if self._started and not self._stopped:
+            self._stopped = True
+            self._call(self._rules.on_stop)
 
     def left(self, player: Player) -> None:
         """Calls `on_leave`, and removes the player's entity if the rules have not removed it."""
