@@ -4,7 +4,7 @@ from collections.abc import Iterator, Sequence
 
 from server.config.options import Parser
 from server.declared import REQUIRED, Value
-from server.rules import HOOKS, Rules, load_rules, prepared
+from server.rules import HOOKS, Rules, load_rules, overrides, prepared
 from shared.behaviours import BehaviourEntry
 from shared.scene import Scene, load_scene
 
@@ -49,7 +49,7 @@ def described(rules: Rules, scene: Scene) -> Iterator[str]:
         yield _line("aim", "each input has a direction in space")
     if scene.kinds:
         yield _line("blocks", ", ".join(kind.name + ("" if kind.solid else " (not solid)") for kind in scene.kinds))
-    yield _line("hooks", ", ".join(name for name in HOOKS if _overridden(rules, name)) or "none")
+    yield _line("hooks", ", ".join(name for name in HOOKS if overrides(rules, name)) or "none")
     for name, value in rules.options.items():
         yield _line("option", _field(name, value))
     for name, fields in rules.commands.items():
@@ -69,10 +69,6 @@ def _field(name: str, value: Value) -> str:
 def _behaviour(entry: BehaviourEntry) -> str:
     fields = [f"{each.name} {each.low} to {each.high}, from {each.start}" for each in entry.fields]
     return f"{entry.name} of {', '.join(entry.templates)}" + (f": {'; '.join(fields)}" if fields else "")
-
-
-def _overridden(rules: Rules, name: str) -> bool:
-    return getattr(type(rules), name) is not getattr(Rules, name)
 
 
 def _line(name: str, text: str) -> str:

@@ -26,6 +26,9 @@ from typing import TYPE_CHECKING, Any
 
 from server.config.options import nearest
 from server.declared import Value, check_declaration, check_options, option
+from server.functions import RulesError as RulesError
+from server.functions import checked_function as checked_function
+from server.functions import checked_result as checked_result
 from server.players.player import Player
 from shared.behaviours import Behaviour, checked_classes
 from shared.checks import SceneError, shown
@@ -33,10 +36,6 @@ from shared.scene import Scene
 
 if TYPE_CHECKING:
     from server.game_api.api import GameApi
-
-
-class RulesError(ValueError):
-    """Rules that cannot be used. The message says why."""
 
 
 class Rules:
@@ -326,44 +325,6 @@ def _check_parameters(hook: Callable[..., object], name: str, owner: str) -> Non
         raise RulesError(f"{owner}.{name}{takes}: is called with ({', '.join(wanted)}): {error}") from None
 
 
-def checked_function(act: object, at: str) -> None:
-    """Checks that something is a plain function, which can be called within a tick.
-
-    Args:
-        act: the function to check.
-        at: its name, for the error.
-
-    Raises:
-        RulesError: `act` cannot be called, or calling it would do nothing because it is async or a generator.
-    """
-    if not callable(act):
-        raise RulesError(f"{at} = {shown(act)}: must be a function")
-    if any(test(part) for test in ASYNC for part in (act, type(act).__call__)):
-        raise RulesError(f"{at}: must not be async: it is called within a tick, which cannot wait")
-    if inspect.isgeneratorfunction(act):
-        raise RulesError(f"{at}: must not contain `yield`: a call of it would do nothing")
-
-
-def checked_result(result: Any, name: str) -> Any:
-    """Returns the result of a hook after a check.
-
-    Args:
-        result: the result.
-        name: name of the hook, for the error.
-
-    Raises:
-        RulesError: the result is a coroutine or a generator, for example because a decorator hid that the hook is
-            async. Nothing would run it.
-    """
-    if result is None or result is True or result is False:
-        return result
-    if inspect.isawaitable(result) or inspect.isgenerator(result) or inspect.isasyncgen(result):
-        if inspect.iscoroutine(result):
-            result.close()  # otherwise Python would warn that it was never awaited
-        raise RulesError(f"{name} returned {type(result).__name__}, which nothing runs: it must be a plain function")
-    return result
-
-
 def overrides(rules: Rules, name: str) -> bool:
     """Returns whether the class of rules has a hook of its own."""
     return getattr(type(rules), name) is not getattr(Rules, name)
@@ -404,7 +365,5 @@ def equipped(scene: Scene, rules: Rules) -> Scene:
 
 NAMES = ("any", "clean", "unique")
 """Choices of `Rules.names`."""
-ASYNC = (inspect.iscoroutinefunction, inspect.isasyncgenfunction)
-"""Tests that recognise an async function."""
 HOOKS = ("prepare", *(name for name in vars(Rules) if name.startswith(("on_", "can_"))))
 """Names of the methods of rules that the server calls."""

@@ -172,9 +172,11 @@ def test_a_hook_that_returns_a_coroutine_or_generator_has_failed(method: Any, ca
 
 
 @pytest.mark.parametrize(
-    ("answer", "allowed"), [(None, False), (0, False), (False, False), (True, True), ("yes", True)]
+    ("answer", "allowed"), [(None, False), (0, False), (False, False), (True, True), (1, True), ("no", False)]
 )
-def test_an_edit_is_allowed_by_any_true_value(answer: Any, allowed: bool, caplog: pytest.LogCaptureFixture) -> None:
+def test_an_edit_is_allowed_by_any_true_value_but_a_text(
+    answer: Any, allowed: bool, caplog: pytest.LogCaptureFixture
+) -> None:
     table = Table(rules=made(can_edit=lambda self, *_: answer))
     link = table.join()
     table.tick(64)
@@ -182,7 +184,7 @@ def test_an_edit_is_allowed_by_any_true_value(answer: Any, allowed: bool, caplog
     table.tick()
     assert (table.game.world.blocks.get(18, 16, 1) == 5) is allowed
     assert table.game.counters.rules_failed == (answer is None)
-    assert ("can_edit returned None: it must return True or False" in caplog.text) is (answer is None)
+    assert ("can_edit returned None: it must return True, False or a reason" in caplog.text) is (answer is None)
 
 
 # -- who may change a game, and when ---------------------------------------------------------------------------
