@@ -1,12 +1,14 @@
 """Reloading while a game is developed: a changed file restarts the server, and its players come back by themselves.
 
-`sovereign-server --reload` runs the server as a child process. If a source or a scene file beside the game changes, the
-child gets SIGTERM, tells its clients to reconnect at once, and another child starts on the same port. With `--data` the
-world goes on; without it, it is a new world. A game that cannot be loaded is shown with its error; the next change
-starts it again.
+`sovereign-server --reload` runs the server as a child process. If a source or a scene file beside the game changes,
+the child gets SIGTERM and tells its clients to reconnect at once. Another child, which stands by, starts on the same
+port. With `--data` the world goes on; without it, it is a new world. A game that cannot be loaded is shown with its
+error; the next change starts it again.
 """
 
+import contextlib
 import importlib.util
+import json
 import subprocess
 import sys
 import threading
@@ -21,12 +23,14 @@ LOOK_S = 0.2
 """Seconds between two looks at the files."""
 END_S = 5.0
 """Seconds that a child has to end. Then it is killed."""
-RESTART_S = 0.9
+RESTART_S = 0.5
 """Seconds after which clients reconnect."""
 FILES_MAX = 2000
 """Maximum number of files that are watched."""
 SUFFIXES = (".py", ".toml")
 """Suffixes of the files that are watched."""
+STANDBY = "import json, sys; from sovereign_netcode.server.app import main; sys.exit(main(json.load(sys.stdin)))"
+"""Program of a child: most of a server's start is the import, which is done before the server is needed."""
 LISTENING = "listening on "
 """Beginning of the line by which a server says that it is ready."""
 
@@ -54,20 +58,23 @@ def stamps(folder: Path) -> Stamps:
 
 
 class Child:
-    """A server in a process of its own.
+    """A server in a process of its own. It imports the server at once, and begins when it gets its command line."""
 
-    Args:
-        arguments: its command line.
-    """
-
-    def __init__(self, arguments: Sequence[str]) -> None:
+    def __init__(self) -> None:
         self.port: str | None = None
         """Port on which it listens; None: it does not yet."""
         self.process = subprocess.Popen(
-            [sys.executable, "-m", "sovereign_netcode.server", *arguments], stdout=subprocess.PIPE, text=True
+            [sys.executable, "-c", STANDBY], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
         )
         assert self.process.stdout is not None
         threading.Thread(target=self._read, args=(self.process.stdout,), daemon=True).start()
+
+    def begin(self, arguments: Sequence[str]) -> None:
+        """Starts the server with a command line."""
+        assert self.process.stdin is not None
+        with contextlib.suppress(BrokenPipeError):  # it has ended already; its exit code says so
+            self.process.stdin.write(json.dumps(list(arguments)))
+            self.process.stdin.close()
 
     def end(self) -> int:
         """Ends the process, and returns its exit code."""
@@ -95,10 +102,11 @@ def serve(settings: Settings, arguments: Sequence[str]) -> int:
     """
     folder = folder_of(settings.game)
     own = [*arguments, "--reload", "false", "--restart-s", str(RESTART_S)]
-    child = Child(own)
+    child, standby = Child(), None
     try:
+        child.begin(own)
         known = stamps(folder)
-        print(f"watching {folder} for changes", flush=True)
+        print(f"watching {folder} for changes", file=sys.stderr, flush=True)
         failed = False
         while True:
             time.sleep(LOOK_S)
@@ -108,13 +116,18 @@ def serve(settings: Settings, arguments: Sequence[str]) -> int:
             if code is not None and not failed:
                 failed = True
                 print("the server has ended; it starts again when a file changes", file=sys.stderr, flush=True)
+            if standby is None and (child.port or failed):
+                standby = Child()
             found = stamps(folder)
             if found == known:
                 continue
             known, failed, port = found, False, child.port
-            print("a file has changed: restarting", flush=True)
+            print("a file has changed: restarting", file=sys.stderr, flush=True)
             child.end()
-            child = Child([*own, *(["--port", port] if port else [])])
+            child, standby = standby or Child(), None
+            child.begin([*own, *(["--port", port] if port else [])])
             child.port = port
     finally:
-        child.end()
+        for each in (child, standby):
+            if each is not None:
+                each.end()

@@ -2,10 +2,12 @@
 
 import argparse
 import contextlib
+import importlib
 import os
 import signal
 import sys
 import time
+from pathlib import Path
 
 os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
 
@@ -14,12 +16,18 @@ import pygame
 from client_sdk.client import Client
 from client_sdk.transports.connection import ConnectError
 from server.rules import Rules, RulesError, load_rules
+from server.runtime.reload import folder_of
+from shared.messages import WRONG_SCENE
 from sovereign_netcode.play import own_server
 from sovereign_netcode.play.script import Script
 from sovereign_netcode.play.window import CLOSED, Window, keyboard
 
 GAME = "sovereign_netcode.examples.tag:Tag"
 FRAMES_PER_S = 60
+OTHER_CODE = 3
+"""Exit code if the server plays a game with another scene or other behaviours."""
+AGAIN_S = 0.5
+"""Seconds between two attempts to import a changed game."""
 SCRIPT_S = 120.0
 """Longest time of a scripted session, in seconds. A session that takes longer has failed."""
 UNSEEN = ("dummy", "offscreen")
@@ -43,6 +51,9 @@ def arguments(argv: list[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--name", default="You", help="player's name (default: %(default)s)")
     parser.add_argument(
         "--lag", type=float, default=0, metavar="MS", help="latency to add at the start; the keys [ and ] change it"
+    )
+    parser.add_argument(
+        "--reload", action="store_true", help="restart the server and the game when a file beside the game changes"
     )
     parser.add_argument(
         "--script-demo", metavar="OUT.png", help="run a scripted session, save a picture, and exit; needs no display"
@@ -70,17 +81,39 @@ def main(argv: list[str] | None = None) -> int:
             url = options.url
             if url is None:
                 print("starting a server (the first start on a machine takes longer) ...", flush=True)
-                url = stack.enter_context(own_server.server(options.game, options.scene))
+                url = stack.enter_context(own_server.server(options.game, options.scene, reload=options.reload))
             count = options.bots if options.bots is not None else 0 if options.url else 4
             stack.enter_context(own_server.bots(url, count, options.game))
-            client = stack.enter_context(Client.connect(url, name=options.name, behaviours=rules.behaviours))
             title = "Sovereign Netcode" if options.url else options.game.rpartition(":")[2]
-            return play(client, options.lag / 1000, script, title, rules)
+            while True:
+                with Client.connect(url, name=options.name, behaviours=rules.behaviours) as client:
+                    code = play(client, options.lag / 1000, script, title, rules)
+                if not (options.reload and code == OTHER_CODE):
+                    return code
+                rules = reloaded(options.game)
     except (ConnectError, RuntimeError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 1
     except KeyboardInterrupt:
         return 0
+
+
+def reloaded(game: str) -> Rules:
+    """Imports the modules beside a game again, as soon as that works, and returns its rules."""
+    folder, shown = folder_of(game), ""
+    while True:
+        for name, module in list(sys.modules.items()):
+            path = getattr(module, "__file__", None)
+            if path and Path(path).parent == folder:
+                del sys.modules[name]
+        importlib.invalidate_caches()
+        try:
+            return load_rules(game)
+        except RulesError as error:
+            if str(error) != shown:
+                shown = str(error)
+                print(f"error: {shown}", file=sys.stderr, flush=True)
+            time.sleep(AGAIN_S)
 
 
 def open_display(*, unseen: bool) -> None:
@@ -114,6 +147,9 @@ def play(client: Client, lag_s: float, script: Script | None, title: str, rules:
         clock.tick(FRAMES_PER_S)
         if script and now - started > SCRIPT_S:
             window.over = "the script took too long"
+    if window.code == WRONG_SCENE:
+        print(window.over)
+        return OTHER_CODE
     pygame.quit()
     advice = "; start the window with --game MODULE:CLASS" if window.over.startswith("behaviours: ") else ""
     print(window.over + advice)

@@ -75,13 +75,19 @@ def end(running: subprocess.Popen[str]) -> None:
 
 
 @contextlib.contextmanager
-def server(game: str, scene: str | None) -> Iterator[str]:
+def server(game: str, scene: str | None, *, reload: bool = False) -> Iterator[str]:
     """Runs a server on a free port of this machine. Yields its URL.
+
+    Args:
+        game: the game.
+        scene: the scene; None: the game's.
+        reload: whether it restarts when a file beside the game changes.
 
     Raises:
         RuntimeError: the server did not start. The message says why.
     """
-    options = ["--port", "0", "--game", game, "--log-level", "warning", *(["--scene", scene] if scene else [])]
+    options = ["--port", "0", "--game", game, "--log-level", "warning"]
+    options += [*(["--scene", scene] if scene else []), *(["--reload", "true"] if reload else [])]
     with process("-m", "sovereign_netcode.server", *options) as (running, errors):
         lines: queue.Queue[str] = queue.Queue()
         assert running.stdout is not None

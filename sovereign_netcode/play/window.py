@@ -103,6 +103,8 @@ class Window:
         self.kind = FIRST_KIND
         self.over = ""
         """Reason of the session's end; empty while it lasts."""
+        self.code = 0
+        """Close code of the session's end."""
         self._pilot, self._wanted = pilot, keys or {}
         self.chat = Chat(commands or {})
         self._commands = commands_of(self._wanted, commands or {})
@@ -166,8 +168,8 @@ class Window:
 
     def _take(self, event: Event, view: View, now: float) -> None:
         match event:
-            case Left(reason=reason):
-                self.over = self.over or reason
+            case Left(reason=reason, code=code):
+                self.over, self.code = self.over or reason, code
             case Happened(name=name, data=data):
                 self._hud.say(sentence(name, data, view), now)
             case Answered(done=False, verdict=verdict):
