@@ -9,6 +9,8 @@ from server.game.session import Session
 from server.players.player import Player
 from server.rules import Rules
 from shared import edits, fields, messages
+from shared.behaviours import Behaviour, field
+from shared.body import Body
 from shared.bounds import bounds
 from shared.fields import COMMAND_MAX
 from shared.inputs import clamp
@@ -38,6 +40,59 @@ class _Shooting(Rules):
         self.game.set(player.entity, "last", name)
         self.game.send("heard", [name, self.game.tick])
         return None
+
+
+class Juggler(Behaviour):
+    """Does everything that a turn can do when buttons are pressed."""
+
+    templates = ("person", "tall")
+    spawns = 2
+    n = field(bits=12, signed=True)
+    last = field(bits=32)
+
+    def turn(self, me: Body) -> None:
+        x, y, z = me.position
+        me.n = -me.n if me.n > 2000 else me.n + me.chance(9)
+        if me.pressed("jump"):
+            me.last = me.spawn("ball", (x, y, z + 1.0), (me.move[0] / 16, me.move[1] / 16, 4.0)) or 0
+            me.announce("thrown", me.last)
+        if me.released("jump"):
+            me.become("tall" if me.template == "person" else "person")
+            me.edit(int(x) + me.chance(5) - 2, int(y) + 1, int(z), 3)
+
+
+class Ball(Behaviour):
+    """Vanishes when it lies still, or after a while."""
+
+    templates = ("ball",)
+    age = field(bits=8)
+
+    def turn(self, me: Body) -> None:
+        me.age += 1
+        me.wake(me.tick + 1)
+        if me.age > 90 or me.velocity == (0.0, 0.0, 0.0):
+            me.remove()
+
+
+def fuzzed_scene(*, aim: bool, behaviours: bool) -> Scene:
+    """Returns the scene of the fuzzed games."""
+    person = Template("person", (-0.3, -0.3, 0), (0.6, 0.6, 1.8), walk_speed=5, jump_speed=8)
+    scene = Scene(
+        name="fuzz",
+        templates=(person,),
+        player="person",
+        tick_rate=32,
+        gravity=16.0,
+        origin=(-1, -1, -1),
+        size=(2, 2, 2),
+        spawns=((0.5, 0.5, 1.0),),
+        terrain={"generator": "boxes", "fill": [[-32, -32, 0, 32, 32, 1, 1]]},
+        aim=aim,
+    )
+    if not behaviours:
+        return scene
+    scene = scene.with_template("tall", box_size=(0.6, 0.6, 2.4)).with_template("ball", box_size=(0.2, 0.2, 0.2))
+    return scene.with_behaviours([Juggler, Ball])
 
 
 class _Deaf:
@@ -73,19 +128,8 @@ class FuzzedGame:
         self._begin()
 
     def _begin(self) -> None:
-        template = Template("person", (-0.3, -0.3, 0), (0.6, 0.6, 1.8), walk_speed=5, jump_speed=8)
-        scene = Scene(
-            name="fuzz",
-            templates=(template,),
-            player="person",
-            tick_rate=32,
-            gravity=16.0,
-            origin=(-1, -1, -1),
-            size=(2, 2, 2),
-            spawns=((0.5, 0.5, 1.0),),
-            terrain={"generator": "boxes", "fill": [[-32, -32, 0, 32, 32, 1, 1]]},
-            aim=self.made // self.LIFE % 2 == 1,
-        )
+        life = self.made // self.LIFE
+        scene = fuzzed_scene(aim=life % 2 == 1, behaviours=life % 4 in (0, 1))
         limits = Limits(resume_s=1.0, silence_s=4.0, stalled_s=2.0, hello_s=1.0, edits_per_s=200.0)
         self.rng = random.Random(self.made)
         self.now = 0.0

@@ -12,7 +12,7 @@ import tempfile
 from collections.abc import Callable
 from pathlib import Path
 
-from scripts.fuzzing.fuzzed_game import FuzzedGame
+from scripts.fuzzing.fuzzed_game import FuzzedGame, fuzzed_scene
 from server.config.options import SettingsError
 from server.config.settings import KINDS, Settings, parse
 from shared import edits
@@ -54,9 +54,11 @@ from shared.snapshot import STATE_HIGH, STATE_LOW, decode_parts
 Target = Callable[[bytes], str]
 WORDS = re.compile(r"[A-Za-z_.]* ?[A-Za-z]*")
 TEMPLATES = 3
+EXTRAS = fuzzed_scene(aim=True, behaviours=True).extras
 
 HEADS = b"\2\0\0\0" + bytes([TOLD | STOP_X])
 PART = [0, -1, 2, 1, HEADS, bytes(7), b"\1" + bytes(32), bytes(4), 0, bytes(3), [1, {"name": "Ann"}]]
+FIELDS = EXTRAS.record(2, 0b10100111, [each.high for each in EXTRAS.columns])
 FROM_CLIENT: tuple[Message, ...] = (
     Hello(VERSION, {}, "Ann"),
     Hello(VERSION, {"gravity": bytes(8)}, "", "token", bytes(16)),
@@ -73,6 +75,7 @@ FROM_SERVER: tuple[Message, ...] = (
     Welcome(VERSION, 7, 1, {"name": "flat"}, bytes(16)),
     Snapshot(9, 8, bytes(4), 7, bytes(2), bytes(5), bytes(12), (PART, PART)),
     Snapshot(9, -1, b"", 0, b"", b"", b"", ()),
+    Snapshot(9, 8, b"", 0, b"", b"", b"", ([0, 0, 0, 1, b"", b"", b"", b"", 0, b"", [], FIELDS * 2],)),
     Terrain(0, -1, 2, 0, 4, b"\1\2\3\4"),
     Pong(1.5, 17.25),
     Happened(3, "goal", b"\xc0"),
@@ -115,6 +118,7 @@ def server(data: bytes) -> str:
         if not isinstance(message, Snapshot):
             return type(message).__name__
         parts, states, turns = decode_parts(message.segments, TEMPLATES)
+        records = [record for part in parts for record in EXTRAS.decode(part.fields)]
     except ProtocolError as error:
         return said(error)
     assert sum(part.entities for part in parts) == len(states)
@@ -124,7 +128,9 @@ def server(data: bytes) -> str:
         assert all(STATE_LOW[6:] <= state[6:])
         assert all(state[6:] <= STATE_HIGH[6:])
     assert all(0 <= events < WHOLE for events in turns[:, 1].tolist())
-    return f"parts {min(len(parts), 3)} {min(len(states), 3)} {min(len(turns), 3)}"
+    for _, values in records:
+        assert all(EXTRAS.columns[k].low <= value <= EXTRAS.columns[k].high for k, value in values)
+    return f"parts {min(len(parts), 3)} {min(len(states), 3)} {min(len(turns), 3)} {min(len(records), 3)}"
 
 
 def value(data: bytes) -> str:
