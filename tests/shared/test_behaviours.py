@@ -17,6 +17,7 @@ from shared.scene import Scene
 from shared.world import World
 from tests.behaving import BUTTONS, Acrobat, Crate, Presser, Shot, populated, scene
 from tests.lengths import long
+from tests.piling import piled, shuffled
 
 FIRE = 1 << BUTTONS.index("fire")
 
@@ -358,3 +359,19 @@ def test_the_digest_is_of_the_code_that_runs_and_not_of_a_file_that_changes_late
     file.write_text(text + "    def turn(self, me):\n        me.wake(2)\n")
     linecache.checkcache()
     assert entry_of(made).digest == before
+
+
+@pytest.mark.parametrize(("seed", "ticks"), [(1, 120), *long(*((seed, 3_000) for seed in range(2, 8)))])
+def test_boxes_and_blocks_put_into_each_other_have_one_result_in_any_order_of_the_inputs(seed: int, ticks: int) -> None:
+    (fast, ids), (plain, _), (other, _) = (piled(6, compiled=compiled) for compiled in (True, False, True))
+    rng, pressers = random.Random(seed), [Presser(5) for _ in range(6)]
+    for tick in range(ticks):
+        inputs = {entity: presser.next(rng) for entity, presser in zip(ids, pressers, strict=True)}
+        if tick % 7 == 0:
+            other.restore(fast)
+        fast.step(inputs)
+        plain.step({entity: inputs[entity] for entity in shuffled(rng, ids)})
+        other.step({entity: inputs[entity] for entity in shuffled(rng, ids)})
+        assert fast.state_hash() == plain.state_hash() == other.state_hash(), tick
+        assert failures(fast) == []
+    assert len(fast) > 6

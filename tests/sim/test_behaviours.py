@@ -19,6 +19,7 @@ from shared.units import BLOCK
 from sovereign_netcode.playtest import Link, Match, Player
 from tests.behaving import BUTTONS, CLASSES, Playground, Presser, scene
 from tests.lengths import long
+from tests.piling import Piles
 
 DASH, FIRE = (1 << BUTTONS.index(name) for name in ("dash", "fire"))
 
@@ -201,3 +202,12 @@ def test_players_who_dash_into_each_other_are_corrected_for_each_other(players: 
         assert found["other entity"] > 0
         counts[neighbours] = found.total()
     assert counts[True] < counts[False]
+
+
+@pytest.mark.parametrize(("players", "seconds", "seed"), [(3, 4, 1), *long(*((6, 60, seed) for seed in range(2, 8)))])
+def test_boxes_and_blocks_put_into_each_other_make_nobody_diverge(players: int, seconds: int, seed: int) -> None:
+    match = joined(Piles(), PRESETS["regional"], *(Presser(6) for _ in range(players)), seed=seed)
+    match.run(seconds)
+    assert set(causes(match.players)) <= {"other entity", "late input", "unknown edit"}
+    assert all(each.core.stats.divergences == 0 for each in match.players)
+    assert match.game.counters.rules_failed == 0
