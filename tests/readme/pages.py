@@ -13,9 +13,14 @@ _HEADING_OR_FENCE = re.compile(r"^#+ ([^\n]+)$|^```(\w*)[^\n]*\n(.*?)^```$", re.
 
 
 def programs(language: str = "python") -> dict[str, str]:
-    """Returns all blocks of a language in the pages, in order, by their heading; each heading has one at most."""
+    """Returns all blocks of a language in the pages, in order, by their heading; each heading has one at most.
+
+    The tutorial's are not among them (`tests.readme.tutorial`).
+    """
     found: dict[str, str] = {}
     for page in PAGES:
+        if page.name == "tutorial.md":
+            continue
         heading = ""
         for title, kind, text in _HEADING_OR_FENCE.findall(page.read_text("utf-8")):
             heading = title or heading
