@@ -201,7 +201,8 @@ def test_a_game_is_begun_tested_and_served(installed: Installed) -> None:
     assert "3 passed" in installed.run("-m", "pytest", "-q", "test_king_of_the_hill.py")
     with installed.served("--game", "king_of_the_hill:KingOfTheHill", "--record", "session"):
         pass
-    assert "ticks as recorded" in installed.command("sovereign-replay", "session")
+    game = "king_of_the_hill:KingOfTheHill"
+    assert "ticks as recorded" in installed.command("sovereign-replay", "session", "--game", game)
 
 
 @pytest.mark.slow
