@@ -2,7 +2,7 @@
 
 import functools
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import pygame
 
@@ -111,16 +111,27 @@ class Actor:
 
     Args:
         figure: the entity in the view.
-        template: its template, which decides on its shape: a small one that does not walk is a ball, a low one a car.
+        template: its template, which decides on its shape: a small one that does not walk is a ball, another one that
+            does not a box of its size, a low one that walks a car.
         tone: its colour.
         heading: direction (east, north) in which it last moved.
         it: whether it is "it" in tag.
         own: whether it is the player's own.
         safe: whether it cannot be tagged.
+        person: whether it has the box of a player, and so is drawn as one even if it does not walk.
     """
 
     def __init__(
-        self, figure: EntityView, template: Template, tone: Colour, heading: Point, *, it: bool, own: bool, safe: bool
+        self,
+        figure: EntityView,
+        template: Template,
+        tone: Colour,
+        heading: Point,
+        *,
+        it: bool,
+        own: bool,
+        safe: bool,
+        person: bool,
     ) -> None:
         self.figure, self.it, self.own, self.safe = figure, it, own, safe
         self.tone, self.heading = IT if it else tone, heading
@@ -128,6 +139,10 @@ class Actor:
         walks = template.walk_speed > 0
         self.ball = not walks and max(self.size) < SMALL
         self.car = walks and self.size[2] < LOW
+        self.box = not walks and not self.ball and not person
+        self.low = [
+            min(offset, offset + side) for offset, side in zip(template.box_offset, template.box_size, strict=True)
+        ]
         self.alpha = 255 if walks else 110
 
     @property
@@ -142,6 +157,10 @@ class Actor:
         below = ground_below(solid, (x, y, z))
         if self.ball:
             draw_ball(target, camera, (x, y, z), below, self.size[0], self.tone)
+            return
+        if self.box:
+            low = [part + offset for part, offset in zip((x, y, z), self.low, strict=True)]
+            draw_box(target, camera, low, [part + side for part, side in zip(low, self.size, strict=True)], self.tone)
             return
         rings = [disc(40 - min(int(2 * (z - below)), 16), (20, 40, 20), 110)]
         rings += [disc(66, IT, 235, 4), disc(50, IT, 90)] if self.it else []
@@ -191,6 +210,20 @@ def draw_ball(target: pygame.Surface, camera: Point, at: Vec, below: float, size
     pygame.draw.circle(target, tone, screen(at, camera), radius)
 
 
+def draw_box(target: pygame.Surface, camera: Point, low: Sequence[float], high: Sequence[float], tone: Colour) -> None:
+    """Draws the three visible faces of a box between two corners."""
+    (x0, y0, z0), (x1, y1, z1) = low, high
+    faces = (
+        (1.0, ((x0, y0, z1), (x1, y0, z1), (x1, y1, z1), (x0, y1, z1))),
+        (0.8, ((x1, y0, z0), (x1, y1, z0), (x1, y1, z1), (x1, y0, z1))),
+        (0.6, ((x0, y0, z0), (x1, y0, z0), (x1, y0, z1), (x0, y0, z1))),
+    )
+    for light, corners in faces:
+        points = [screen(corner, camera) for corner in corners]
+        pygame.draw.polygon(target, mixed(tone, light), points)
+        pygame.draw.polygon(target, mixed(tone, 0.4), points, 1)
+
+
 def draw_car(target: pygame.Surface, camera: Point, at: Vec, heading: Point, tone: Colour) -> None:
     """Draws a car: two slabs and a window."""
     length = math.hypot(*heading)
@@ -208,6 +241,17 @@ def draw_car(target: pygame.Surface, camera: Point, at: Vec, heading: Point, ton
     for k in range(4):
         pygame.draw.polygon(target, INK, slab(-0.45, 0.25, 0.3, 0.45 + 0.06 * k))
     pygame.draw.polygon(target, mixed(tone, 0.75, WHITE), slab(-0.42, 0.15, 0.28, 0.68))
+
+
+def colour_named(value: object) -> Colour | None:
+    """Returns the colour that an attribute names, like "#ff8800"; None if it names none."""
+    if not isinstance(value, str) or len(value) != 7 or value[0] != "#":
+        return None
+    try:
+        red, green, blue = bytes.fromhex(value[1:])
+    except ValueError:
+        return None
+    return red, green, blue
 
 
 def look_of(heading: Point) -> int:

@@ -16,7 +16,18 @@ from shared.buttons import JUMP_NAME
 from shared.checks import Cell, Vec
 from shared.scene import Scene
 from sovereign_netcode.play.chat import COMMAND, FIELD, Chat
-from sovereign_netcode.play.figures import INK, OWN, TONES, WHITE, Actor, draw_ghost, label, look_of, screen
+from sovereign_netcode.play.figures import (
+    INK,
+    OWN,
+    TONES,
+    WHITE,
+    Actor,
+    colour_named,
+    draw_ghost,
+    label,
+    look_of,
+    screen,
+)
 from sovereign_netcode.play.hud import Hud
 from sovereign_netcode.play.iso import (
     CHOICE,
@@ -297,11 +308,14 @@ class Window:
             safe = figure.attributes.get("safe", 0)
             safe = isinstance(safe, int) and safe > view.tick
             team = figure.attributes.get("team", figure.fields.get("team"))
-            tone = TONES[team % len(TONES)] if isinstance(team, int) else OWN if own else self._tone(figure.entity)
+            tone = colour_named(figure.attributes.get("colour"))
+            if tone is None:
+                tone = TONES[team % len(TONES)] if isinstance(team, int) else OWN if own else self._tone(figure.entity)
             template = scene.templates[scene.index_of[figure.template]]
+            person = template.box_size == scene.templates[scene.index_of[scene.player]].box_size
             heading = self._heading(figure)
             it = figure.template == "it"
-            found.append(Actor(figure, template, tone, heading, it=it, own=own, safe=safe))
+            found.append(Actor(figure, template, tone, heading, it=it, own=own, safe=safe, person=person))
         seen = {actor.figure.entity for actor in found}
         self._tones = {entity: tone for entity, tone in self._tones.items() if entity in seen}
         self._headings = {entity: way for entity, way in self._headings.items() if entity in seen}

@@ -8,6 +8,7 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -18,7 +19,7 @@ from server.rules import Rules
 from shared import kernels
 from shared.blocks import Blocks
 from shared.inputs import NEUTRAL, Input
-from shared.scene import SCENES, load_scene
+from shared.scene import SCENES, Scene, load_scene
 from shared.world import World
 from sovereign_netcode.playtest import Link as Line
 from sovereign_netcode.playtest import Match, Player
@@ -38,7 +39,7 @@ from sovereign_netcode.examples.freeze import Freeze  # noqa: E402
 from sovereign_netcode.examples.race import Race  # noqa: E402
 from sovereign_netcode.examples.tag import Tag  # noqa: E402
 from sovereign_netcode.examples.tag_brain import TagPlayer  # noqa: E402
-from sovereign_netcode.play import app, iso, own_server  # noqa: E402
+from sovereign_netcode.play import app, figures, iso, own_server  # noqa: E402
 from sovereign_netcode.play.keys import Keys  # noqa: E402
 from sovereign_netcode.play.window import SIZE, Window, keyboard  # noqa: E402
 
@@ -333,3 +334,33 @@ def test_a_scripted_session_walks_jumps_builds_and_sees_a_hand_over(tmp_path: Pa
     assert seen["placed"] >= 3
     assert seen["tagged"] >= 1
     assert pygame.image.load(out).get_size() == SIZE
+
+
+class Boxes(Rules):
+    """Rules with a crate in a colour of its own beside each player."""
+
+    scene = "flat"
+
+    def prepare(self, scene: Scene) -> Scene:
+        return scene.with_template("crate", walk_speed=0, box_size=(1.5, 1.5, 1.0), box_offset=(-0.75, -0.75, 0))
+
+    def on_join(self, player: Any) -> None:
+        x, y, z = self.game.position(player.entity)
+        self.game.spawn("crate", (x + 3, y, z), colour="#10e0f0")
+
+
+def test_a_crate_is_a_box_of_its_size_in_the_colour_of_its_attribute() -> None:
+    session = Session(scene="flat", rules=Boxes())
+    (crate,) = (actor for actor in session.window.actors if actor.figure.template == "crate")
+    assert (crate.box, crate.size, crate.tone) == (True, [1.5, 1.5, 1.0], (0x10, 0xE0, 0xF0))
+    surface = pygame.display.get_surface()
+    assert surface is not None
+    pixels = pygame.surfarray.array3d(surface).reshape(-1, 3)
+    width, depth = 2 * 1.5 * iso.HALF, 2 * 1.5 * iso.QUARTER
+    top = (pixels == np.array([0x10, 0xE0, 0xF0])).all(axis=1).sum()
+    assert top == pytest.approx(width * depth / 2, rel=0.15), "the top face has this many pixels"
+
+
+@pytest.mark.parametrize("name", ["red", "#12345", "#gggggg", 7, None])
+def test_a_colour_that_is_none_is_ignored(name: object) -> None:
+    assert figures.colour_named(name) is None
