@@ -259,15 +259,22 @@ class UncheckedWorld(WorldState):
         self._entities[row, ID] = 0
         (self._limbo if self._entities[row, FLAGS] & layout.AWAKE else self._free).append(row)
 
-    def _disown(self, entity: int) -> None:
-        """Notes that an entity is about to be removed, in the entity that has spawned it, if there is one."""
+    def owner(self, entity: int) -> int | None:
+        """Returns the entity whose behaviour has spawned an entity; None if there is none, or it is gone."""
         extras = self.extras
         for owner in range(entity - extras.spawns, entity) if extras.spawns else ():
             row = self._row_of.get(owner)
-            bit = 1 << entity - owner - 1
-            if row is not None and int(self._extra[row, extras.alive]) & bit:
-                self._extra[row, extras.alive] &= ~bit
-                self.note_fields(owner, 1 << extras.alive)
+            if row is not None and int(self._extra[row, extras.alive]) & 1 << entity - owner - 1:
+                return owner
+        return None
+
+    def _disown(self, entity: int) -> None:
+        """Notes that an entity is about to be removed, in the entity that has spawned it, if there is one."""
+        owner = self.owner(entity)
+        if owner is not None:
+            alive = self.extras.alive
+            self._extra[self._row_of[owner], alive] &= ~(1 << entity - owner - 1)
+            self.note_fields(owner, 1 << alive)
 
     def note_fields(self, entity: int, mask: int) -> None:
         """Notes that extra columns of an entity were set in its row in memory."""

@@ -173,10 +173,16 @@ class Roster:
         self._counters.fell_out += len(self._fallen)
 
     def revive(self) -> None:
-        """Puts the entities that fell out in the last tick at spawn points, unless the rules deal with them."""
+        """Puts the entities that fell out in the last tick at spawn points, unless the rules deal with them.
+
+        What a behaviour has spawned is removed instead.
+        """
         for entity in self._fallen:
             if entity in self._world and not self._api.hooks.fell_out(entity):
-                self._spawns.put_back(entity)
+                if self._world.owner(entity) is None:
+                    self._spawns.put_back(entity)
+                else:
+                    self._api.discard(entity)
         self._fallen.clear()
 
     def _make_room(self) -> None:

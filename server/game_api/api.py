@@ -75,7 +75,7 @@ class GameApi(InputApi, PlayersApi, TimersApi, ValuesApi, ZonesApi):
         self._zones = Zones(world, Entries(world, self.kept, "zones"))
         self.hooks = Hooks(self, world, rules, counters, self._zones, self._timers, goes_on=kept is not None)
         self._attributes = Attributes(world, self.log, self.kept.attributes)
-        self.turn_results = TurnResults(world, self.log, self._attributes, counters)
+        self.turn_results = TurnResults(world, self.log, self._forget, counters)
         self._rewind, self._seed = rewind, seed
         self._random = (-1, Random())
         rules.game = self
@@ -350,11 +350,15 @@ class GameApi(InputApi, PlayersApi, TimersApi, ValuesApi, ZonesApi):
 
     # -- called by the game ------------------------------------------------------------------------------------
 
+    def _forget(self, entity: int) -> None:
+        """Forgets the values that an entity has beside the world."""
+        self._attributes.forget(entity)
+        self._private.forget(entity)
+        self.steered.pop(entity, None)
+
     def discard(self, entity: int) -> None:
         """Removes an existing entity, which may be a player's."""
         self._world.remove(entity)
         self._world.note([LEFT, entity])
-        self._attributes.forget(entity)
-        self._private.forget(entity)
-        self.steered.pop(entity, None)
+        self._forget(entity)
         self.log.note_removal(entity)

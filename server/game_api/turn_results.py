@@ -4,9 +4,8 @@ The world takes the turns (`shared.turns`) at the start of its step. After the s
 did beside the world.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 
-from server.game_api.attributes import Attributes
 from server.journal.recorded_world import RecordedWorld
 from server.observability.counters import Counters
 from server.observability.errors import FaultReporter
@@ -23,12 +22,12 @@ class TurnResults:
     Args:
         world: the world of the game.
         log: the change log, which is notified of removed entities.
-        attributes: the attributes, which removed entities lose.
+        forget: called with each removed entity; it forgets the values that the rules gave to the entity.
         counters: where failed turns and dropped events are counted.
     """
 
-    def __init__(self, world: RecordedWorld, log: ChangeLog, attributes: Attributes, counters: Counters) -> None:
-        self._world, self._log, self._attributes, self._counters = world, log, attributes, counters
+    def __init__(self, world: RecordedWorld, log: ChangeLog, forget: Callable[[int], None], counters: Counters) -> None:
+        self._world, self._log, self._forget, self._counters = world, log, forget, counters
         self._faults = FaultReporter("the rules have failed")
 
     def removals(self) -> list[int]:
@@ -40,8 +39,8 @@ class TurnResults:
         turns = self._world.turns
         vanished = turns.vanished if turns is not None else []
         for entity in vanished:
-            self._attributes.forget(entity)
             self._world.note([LEFT, entity])
+            self._forget(entity)
             self._log.note_removal(entity)
         return vanished
 

@@ -325,6 +325,32 @@ def test_rules_with_wrong_behaviours_are_refused_by_name(behaviours: object) -> 
         Match(scene(()), 1, rules=rules)
 
 
+class Dropper(Behaviour):
+    templates = ("player",)
+    spawns = 2
+
+    def turn(self, me: Body) -> None:
+        if me.pressed("fire"):
+            me.spawn("crate", (20.5, 20.5, 3.0))
+
+
+def test_what_a_behaviour_has_spawned_is_removed_where_it_falls_out_and_others_are_put_back() -> None:
+    match = Match(scene(()), 1, rules=game(Dropper))
+    world = match.game.world
+    presses = [FIRE]
+    player = match.join(lambda core, rng: Input(0, 0, presses.pop() if presses else 0), Link())
+    match.run_until(lambda: player.core.state == "playing", 20)
+    world.fill((15, 15, 0), (26, 26, 2), 0)
+    match.run_until(lambda: len(world) == 2, 5)
+    with match.game.api.turn:
+        other = match.game.api.spawn("crate", (23.0, 23.0, 3.0))
+    match.run(4)
+    assert match.game.counters.fell_out == 2
+    assert sorted(world.states()[:, 0].tolist()) == [player.core.entity, other]
+    assert world.position(other)[2] > 1
+    assert int(world.states_of([player.core.entity])[0, 12 + world.extras.alive]) == 1 << 32
+
+
 def test_agents_play_a_game_with_behaviours_alike_for_one_seed() -> None:
     agents = pytest.importorskip("server.agents")
     arena = agents.Arena(scene(()), agents=2, rules=Playground, seconds=3)
