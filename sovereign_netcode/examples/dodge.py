@@ -13,6 +13,7 @@ from typing import Any
 
 from sovereign_netcode.examples.dodge_behaviours import BEHAVIOURS
 from sovereign_netcode.examples.dodge_brain import DodgePlayer, wish
+from sovereign_netcode.examples.fillers import fill_up
 from sovereign_netcode.server import Player, Rules
 from sovereign_netcode.shared.checks import Vec
 from sovereign_netcode.shared.scene import Scene, Template
@@ -23,7 +24,6 @@ THINK_TICKS = 4
 TEAMS = ("blue", "yellow")
 PLAYERS = ("player", "dashing", "out")
 """Templates of those who play."""
-NAMES = ("Ada", "Bo", "Cleo", "Dag", "Elif", "Finn", "Gus", "Hana", "Ivo", "Juno")
 BALL = Template("ball", (-0.2, -0.2, -0.2), (0.4, 0.4, 0.4), solid=False, shown="predicted", gravity=4.0)
 
 
@@ -60,7 +60,7 @@ class Dodge(Rules):
 
     def on_tick(self) -> None:
         game = self.game
-        self._fill_up()
+        fill_up(game, self._everybody(), self.players_min, self._add)
         for entity in self._everybody():
             self._count_hits(entity)
         for entity in game.entities("out"):
@@ -125,17 +125,8 @@ class Dodge(Rules):
         game.set(entity, "team", team)
         game.set(entity, "score", 0)
 
-    def _fill_up(self) -> None:
-        """Adds or removes the server's own players, so that at least `players_min` entities play."""
-        game = self.game
-        own = [entity for entity in self._everybody() if entity not in game.players]
-        for entity in own[max(self.players_min - len(game.players), 0) :]:
-            game.remove(entity)
-        for _ in range(self.players_min - len(game.players) - len(own)):
-            free = [name for name in NAMES if name not in [game.get(entity, "name") for entity in self._everybody()]]
-            with contextlib.suppress(OverlapError):  # the spawn is occupied: try again in the next tick
-                place = game.random.choice(game.scene.spawns)
-                self._enlist(game.spawn("player", place, name=game.random.choice(free or NAMES)))
+    def _add(self, place: Vec, name: str) -> None:
+        self._enlist(self.game.spawn("player", place, name=name))
 
     def _steer(self) -> None:
         game = self.game

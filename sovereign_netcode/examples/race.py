@@ -10,17 +10,17 @@ import contextlib
 from dataclasses import replace
 from typing import Any
 
+from sovereign_netcode.examples.fillers import fill_up
 from sovereign_netcode.examples.race_behaviours import BEHAVIOURS
 from sovereign_netcode.examples.race_brain import GATES, PADS, RacePlayer, drive, passes
 from sovereign_netcode.server import Player, Rules
-from sovereign_netcode.shared.checks import SceneError
+from sovereign_netcode.shared.checks import SceneError, Vec
 from sovereign_netcode.shared.scene import Scene
 from sovereign_netcode.shared.world import OverlapError
 
 THINK_TICKS = 4
 GRID = tuple((14.0 + 4 * (k // 2), 4.0 + 4 * (k % 2), 1.0) for k in range(12))
 """Places at the start."""
-NAMES = ("Ada", "Bo", "Cleo", "Dag", "Elif", "Finn", "Gus", "Hana", "Ivo", "Juno")
 
 
 class Race(Rules):
@@ -58,7 +58,7 @@ class Race(Rules):
 
     def on_tick(self) -> None:
         game = self.game
-        self._fill_up()
+        fill_up(game, game.entities(), self.players_min, self._add)
         for car in game.entities():
             if passes(game.position(car), game.get(car, "gate")):
                 self._passed(car)
@@ -91,13 +91,5 @@ class Race(Rules):
         self.game.set(car, "gate", 0)
         self.game.set(car, "score", 0)
 
-    def _fill_up(self) -> None:
-        """Adds or removes the server's own cars, so that at least `players_min` cars race."""
-        game = self.game
-        own = [car for car in game.entities() if car not in game.players]
-        for car in own[max(self.players_min - len(game.players), 0) :]:
-            game.remove(car)
-        for _ in range(self.players_min - len(game.players) - len(own)):
-            free = [name for name in NAMES if name not in [game.get(car, "name") for car in game.entities()]]
-            with contextlib.suppress(OverlapError):  # the place is occupied: try again in the next tick
-                self._line_up(game.spawn("player", game.random.choice(GRID), name=game.random.choice(free or NAMES)))
+    def _add(self, place: Vec, name: str) -> None:
+        self._line_up(self.game.spawn("player", place, name=name))

@@ -6,18 +6,17 @@ The rules keep no state in Python variables, so a saved game continues where it 
 template (clients predict its speed), scores are attributes, and the end of the round is a shared value.
 """
 
-import contextlib
 from typing import Any
 
+from sovereign_netcode.examples.fillers import fill_up
 from sovereign_netcode.examples.tag_brain import TagPlayer, wish
 from sovereign_netcode.server import Player, Rules
+from sovereign_netcode.shared.checks import Vec
 from sovereign_netcode.shared.scene import Scene
 from sovereign_netcode.shared.units import SEGMENT
-from sovereign_netcode.shared.world import OverlapError
 
 THINK_TICKS = 4
 TRUNK, LEAVES = 5, 6
-NAMES = ("Ada", "Bo", "Cleo", "Dag", "Elif", "Finn", "Gus", "Hana", "Ivo", "Juno")
 
 
 class Tag(Rules):
@@ -47,7 +46,7 @@ class Tag(Rules):
 
     def on_tick(self) -> None:
         game = self.game
-        self._fill_up()
+        fill_up(game, game.entities(), self.players_min, self._add)
         everybody = game.entities()
         if everybody and not game.entities("it"):
             game.change(game.random.choice(everybody), "it")
@@ -79,17 +78,8 @@ class Tag(Rules):
         for entity in everybody:
             game.set(entity, "score", 0)
 
-    def _fill_up(self) -> None:
-        """Adds or removes the server's own runners, so that at least `players_min` entities play."""
-        game = self.game
-        runners = [entity for entity in game.entities() if entity not in game.players]
-        for entity in runners[max(self.players_min - len(game.players), 0) :]:
-            game.remove(entity)
-        for _ in range(self.players_min - len(game.players) - len(runners)):
-            place = game.random.choice(game.scene.spawns)
-            free = [name for name in NAMES if name not in [game.get(entity, "name") for entity in game.entities()]]
-            with contextlib.suppress(OverlapError):  # the spawn is occupied: try again in the next tick
-                game.spawn("player", place, name=game.random.choice(free or NAMES), score=0)
+    def _add(self, place: Vec, name: str) -> None:
+        self.game.spawn("player", place, name=name, score=0)
 
     def _steer(self) -> None:
         game = self.game

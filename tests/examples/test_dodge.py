@@ -10,7 +10,7 @@ from sovereign_netcode.client_sdk.events import Announced, Happened
 from sovereign_netcode.examples.dodge import PLAYERS, Dodge
 from sovereign_netcode.examples.dodge_behaviours import BEHAVIOURS
 from sovereign_netcode.examples.dodge_brain import DodgePlayer, wish
-from sovereign_netcode.playtest import PRESETS, Link, Match, Player
+from sovereign_netcode.playtest import PRESETS, Link, Match, Player, check_behaviours
 from sovereign_netcode.shared.inputs import NEUTRAL, Input, make_input
 from sovereign_netcode.shared.scene import load_scene
 from tests.examples.played import check, played
@@ -37,6 +37,11 @@ def test_bots_play(link: str, seconds: float, seed: int) -> None:
     assert sum(scores) == sum(hits) >= (seconds > 9)
     announced = {event.name for player in match.players for event in player.events if isinstance(event, Announced)}
     assert announced >= ({"throw"} if seconds < 9 else {"throw", "hit", "dash", "double jump"})
+
+
+@pytest.mark.parametrize(("ticks", "processes"), [(40, 0), *long((600, 1))])
+def test_turns_compute_the_same_again(ticks: int, processes: int) -> None:
+    check_behaviours(Small(), ticks=ticks, processes=processes, players=2, seed=902)
 
 
 class Hand:

@@ -9,7 +9,7 @@ from sovereign_netcode.client_sdk.events import Announced, Happened
 from sovereign_netcode.examples.race import GRID, Race
 from sovereign_netcode.examples.race_behaviours import BEHAVIOURS
 from sovereign_netcode.examples.race_brain import GATES, PADS, RacePlayer, drive
-from sovereign_netcode.playtest import PRESETS, Link, Match, Player
+from sovereign_netcode.playtest import PRESETS, Link, Match, Player, check_behaviours
 from sovereign_netcode.shared.checks import SceneError
 from sovereign_netcode.shared.inputs import NEUTRAL, Input, make_input
 from sovereign_netcode.shared.scene import load_scene
@@ -36,6 +36,11 @@ def test_bots_race(link: str, seconds: float, seed: int) -> None:
     assert min(passed) >= seconds // 8
     announced = {event.name for player in match.players for event in player.events if isinstance(event, Announced)}
     assert announced == {"boost", "refuel"}
+
+
+@pytest.mark.parametrize(("ticks", "processes"), [(40, 0), *long((600, 1))])
+def test_turns_compute_the_same_again(ticks: int, processes: int) -> None:
+    check_behaviours(Small(), ticks=ticks, processes=processes, players=2, seed=902)
 
 
 class Hand:
