@@ -56,6 +56,9 @@ def arguments(argv: list[str] | None = None) -> argparse.Namespace:
         "--reload", action="store_true", help="restart the server and the game when a file beside the game changes"
     )
     parser.add_argument(
+        "--option", action="append", default=[], metavar="NAME=VALUE", help="option of the game on the server started"
+    )
+    parser.add_argument(
         "--script-demo", metavar="OUT.png", help="run a scripted session, save a picture, and exit; needs no display"
     )
     return parser.parse_args(argv)
@@ -81,7 +84,9 @@ def main(argv: list[str] | None = None) -> int:
             url = options.url
             if url is None:
                 print("starting a server (the first start on a machine takes longer) ...", flush=True)
-                url = stack.enter_context(own_server.server(options.game, options.scene, reload=options.reload))
+                url = stack.enter_context(
+                    own_server.server(options.game, options.scene, options.option, reload=options.reload)
+                )
             count = options.bots if options.bots is not None else 0 if options.url else 4
             stack.enter_context(own_server.bots(url, count, options.game))
             title = "Sovereign Netcode" if options.url else options.game.rpartition(":")[2]

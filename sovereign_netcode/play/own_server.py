@@ -8,7 +8,7 @@ import signal
 import subprocess
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 from client_sdk.async_client import AsyncClient
 from client_sdk.bots import Bot, Wander
@@ -75,20 +75,21 @@ def end(running: subprocess.Popen[str]) -> None:
 
 
 @contextlib.contextmanager
-def server(game: str, scene: str | None, *, reload: bool = False) -> Iterator[str]:
+def server(game: str, scene: str | None, options: Sequence[str] = (), *, reload: bool = False) -> Iterator[str]:
     """Runs a server on a free port of this machine. Yields its URL.
 
     Args:
         game: the game.
         scene: the scene; None: the game's.
+        options: options of the game, each NAME=VALUE.
         reload: whether it restarts when a file beside the game changes.
 
     Raises:
         RuntimeError: the server did not start. The message says why.
     """
-    options = ["--port", "0", "--game", game, "--log-level", "warning"]
-    options += [*(["--scene", scene] if scene else []), *(["--reload", "true"] if reload else [])]
-    with process("-m", "sovereign_netcode.server", *options) as (running, errors):
+    flags = ["--port", "0", "--game", game, "--log-level", "warning", *(f"--option={option}" for option in options)]
+    flags += [*(["--scene", scene] if scene else []), *(["--reload", "true"] if reload else [])]
+    with process("-m", "sovereign_netcode.server", *flags) as (running, errors):
         lines: queue.Queue[str] = queue.Queue()
         assert running.stdout is not None
         threading.Thread(target=lambda out: lines.put(out.readline()), args=(running.stdout,), daemon=True).start()

@@ -20,6 +20,7 @@ from client_sdk.core import Core
 from client_sdk.events import Announced, Answered, BehaviourFailed, Corrected, Happened, Withdrawn
 from client_sdk.netsim.links import PRESETS
 from server.game import Game
+from server.rules import with_options
 from shared.inputs import make_input
 from shared.scene import Scene, Template, load_scene
 from sovereign_netcode.playtest import Match, bot, wander
@@ -31,7 +32,7 @@ from tests.readme.run_snippet import LOOPS
 ENGINES = ["pygame-ce", "pyglet", "arcade", "Panda3D", "ursina"]
 ON_A_SERVER = ["asyncio", "A bot"]
 WAITS = "Threads, timers and asyncio"
-GAMES = ["Buttons and aim", "Behaviours", "Declared commands", "Before a join"]
+GAMES = ["Buttons and aim", "Behaviours", "Declared commands", "Before a join", "Options"]
 ALONE = ["A game", "Without a socket", "Testing it", "Agents that learn", WAITS, *GAMES]
 A_FILE = "Your own game"
 
@@ -130,6 +131,12 @@ def test_declared_commands() -> None:
     assert [event.data for event in player.events if isinstance(event, Happened)] == [
         {"text": "hello", "by": player.core.entity}
     ]
+
+
+def test_options() -> None:
+    match = Match(load_scene("flat"), seed=1, rules=with_options(alone("Options")["Rounds"], {"round_s": "90"}))
+    match.run(0.5)
+    assert match.game.api.shared["ends"] == 1 + 90 * match.game.scene.tick_rate
 
 
 def test_what_is_loaded_before_a_join() -> None:
