@@ -8,6 +8,7 @@ import pytest
 
 from sovereign_netcode import new_game
 from sovereign_netcode.client_sdk.bots import Follow, RunAndJump
+from sovereign_netcode.examples.dodge import Dodge
 from sovereign_netcode.examples.freeze import Freeze
 from sovereign_netcode.examples.tag import LEAVES, TRUNK, Tag
 from sovereign_netcode.playtest import Match, bot
@@ -25,7 +26,7 @@ def skeleton() -> Rules:
 
 
 SHORT = [(Rules, "arena"), (Tag, "flat"), (Freeze, "hills"), (skeleton, "topdown")]
-EVERY = product([Rules, Tag, Freeze, skeleton], sorted(path.stem for path in SCENES.glob("*.toml")))
+EVERY = product([Rules, Tag, Dodge, Freeze, skeleton], sorted(path.stem for path in SCENES.glob("*.toml")))
 
 
 @pytest.mark.parametrize(("make", "scene"), long_but(SHORT, EVERY))
