@@ -23,6 +23,7 @@ from rich.console import Console
 from rich.table import Table
 
 from client_sdk.bots import POLICIES
+from server.rules import RulesError, load_rules
 from sovereign_netcode.loadtest.figures import bottleneck, failures, figures, rows, verdict
 from sovereign_netcode.loadtest.glance import Look, Stage
 from sovereign_netcode.loadtest.glance import rows as glance
@@ -62,9 +63,14 @@ def arguments(argv: list[str] | None = None) -> argparse.Namespace:
     )
     parser.add_argument("--url", help="URL of a running server, like ws://localhost:8765 (default: starts one)")
     parser.add_argument(
-        "--policy", choices=sorted(POLICIES), default="wander", help="behaviour of the bots (default: %(default)s)"
+        "--game",
+        metavar="MODULE:CLASS",
+        help="game of the server that is started, or that is played at --url: its behaviours and bots are used",
     )
-    parser.add_argument("--scene", default="hills", help="scene of the server that is started (default: %(default)s)")
+    parser.add_argument(
+        "--policy", choices=sorted(POLICIES), help="behaviour of the bots (default: the game's, else wander)"
+    )
+    parser.add_argument("--scene", help="scene of the server that is started (default: the game's, else hills)")
     parser.add_argument(
         "--tick-rate",
         type=_positive,
@@ -79,7 +85,10 @@ def arguments(argv: list[str] | None = None) -> argparse.Namespace:
     parser.add_argument(
         "--verdict", action="store_true", help="print in words which figures are good and which are bad"
     )
-    return parser.parse_args(argv)
+    args = parser.parse_args(argv)
+    if args.game is None:
+        args.policy, args.scene = args.policy or "wander", args.scene or "hills"
+    return args
 
 
 async def test(args: argparse.Namespace, console: Console) -> int:
@@ -99,7 +108,8 @@ async def test(args: argparse.Namespace, console: Console) -> int:
             "the server": [server] if server else [],
         }
         measured = await measure(args, url, workers, lambda: check(watched), console)
-    measured |= {"policy": args.policy, "scene": args.scene, "seed": args.seed, "processes": len(workers)}
+    asked = {name: getattr(args, name) for name in ("game", "policy", "scene", "seed")}
+    measured |= {**asked, "processes": len(workers)}
     failed = failures(measured)
     if server is not None:
         measured["server_exit_code"] = server.returncode
@@ -192,15 +202,16 @@ def orders(args: argparse.Namespace, url: str) -> list[tuple[str, ...]]:
     first = 0
     for i in range(processes):
         clients = (args.clients - first) // (processes - i)
-        order = {"url": url, "first": first, "clients": clients, "seed": args.seed, "policy": args.policy}
-        order["joins_per_s"] = JOINS_PER_S / processes
+        order = {"url": url, "first": first, "clients": clients, "joins_per_s": JOINS_PER_S / processes}
+        order |= {"seed": args.seed, "game": args.game, "policy": args.policy}
         found.append(("-m", "sovereign_netcode.loadtest.swarm", json.dumps(order)))
         first += clients
     return found
 
 
 def show(measured: Figures, args: argparse.Namespace, console: Console) -> None:
-    table = Table(title=f"{args.policy} in {args.scene}" if args.url is None else f"{args.policy} on {args.url}")
+    where = f"on {args.url}" if args.url else f"in {args.scene}" if args.scene else ""
+    table = Table(title=" ".join(filter(None, (args.game, args.policy, where))))
     table.add_column("figure")
     table.add_column("measured")
     for row in rows(measured):
@@ -251,6 +262,12 @@ async def until_signal(args: argparse.Namespace, console: Console) -> int:
 
 def main(argv: list[str] | None = None) -> int:
     args = arguments(argv)
+    try:
+        if args.game is not None:
+            load_rules(args.game)  # an error is reported before anything is started
+    except RulesError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
     try:
         return asyncio.run(until_signal(args, Console()))
     except (KeyboardInterrupt, asyncio.CancelledError):

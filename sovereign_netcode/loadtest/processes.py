@@ -130,7 +130,8 @@ async def own_server(args: argparse.Namespace) -> AsyncIterator[tuple[Process, s
     Raises:
         CannotStartError: the server did not start. The message says why.
     """
-    rate = ("--tick-rate", str(args.tick_rate)) if args.tick_rate else ()
+    given = {"--game": args.game, "--scene": args.scene, "--tick-rate": args.tick_rate}
+    flags = [text for flag, value in given.items() if value for text in (flag, str(value))]
     command = (
         "-m",
         "sovereign_netcode.server",
@@ -138,12 +139,10 @@ async def own_server(args: argparse.Namespace) -> AsyncIterator[tuple[Process, s
         "127.0.0.1",
         "--port",
         "0",
-        "--scene",
-        args.scene,
         "--log-level",
         "warning",
     )
-    async with child(*command, *rate) as server:
+    async with child(*command, *flags) as server:
         assert server.stdout is not None
         line = ""
         with contextlib.suppress(TimeoutError):

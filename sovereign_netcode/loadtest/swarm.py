@@ -1,6 +1,6 @@
 """A process of bots. The load test starts it and controls it over its pipes.
 
-argument  {"url", "first", "clients", "seed", "policy", "joins_per_s"}, as JSON
+argument  {"url", "first", "clients", "seed", "game", "policy", "joins_per_s"}, as JSON
 stdin     a command per line: "settle": all have joined, collect garbage; "measure": the window begins; "stop": the
           window ends, report and disconnect. The end of the pipe: disconnect without a report
 stdout    a JSON object per line: {"playing", "ended"} while joining, and from "measure" on also {"at", "cpu_s",
@@ -17,16 +17,19 @@ import random
 import sys
 import threading
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 from client_sdk.async_client import AsyncClient
-from client_sdk.bots import POLICIES, Bot
+from client_sdk.bots import POLICIES, Bot, Policy
 from client_sdk.events import Left
 from client_sdk.stats import Stats
 from client_sdk.transports.connection import ConnectError
 from server.observability.histogram import Histogram
+from server.rules import Rules, load_rules
 from shared import kernels
+from shared.behaviours import Behaviour
 
 REPORT_S = 0.2
 LAG_S = 0.02
@@ -52,10 +55,12 @@ class Player:
     def playing(self) -> bool:
         return self.client is not None and self.client.core.state == "playing"
 
-    async def play(self, url: str, bot: Bot) -> None:
+    async def play(self, url: str, bot: Bot, behaviours: Sequence[type[Behaviour]]) -> None:
         """Connects, and plays until the connection ends for good."""
         try:
-            self.client = await AsyncClient.connect(url, name=self.name, before_update=bot, timeout=20.0)
+            self.client = await AsyncClient.connect(
+                url, name=self.name, before_update=bot, timeout=20.0, behaviours=behaviours
+            )
         except ConnectError as error:
             self.left = {"code": 0, "reason": str(error)}
             return
@@ -110,9 +115,9 @@ async def swarm(order: dict[str, Any]) -> int:
     """Runs the bots until "stop" or the end of stdin. Returns the exit code."""
     commands = listen()
     players = [Player(f"bot {order['first'] + i}") for i in range(order["clients"])]
-    make = POLICIES[order["policy"]]
+    rules = Rules() if order["game"] is None else load_rules(order["game"])
     lives: list[asyncio.Task[None]] = []
-    joining = asyncio.create_task(join(order, players, make, lives))
+    joining = asyncio.create_task(join(order, players, rules, lives))
     lags = Histogram()
     measuring = asyncio.create_task(lag(lags))
     cpu_s: float | None = None
@@ -156,12 +161,19 @@ def so_far(players: list[Player], lags: Histogram) -> dict[str, Any]:
     }
 
 
-async def join(order: dict[str, Any], players: list[Player], make: Any, lives: list[asyncio.Task[None]]) -> None:
+def policy_of(name: str | None, rules: Rules, chance: random.Random) -> Policy:
+    """Returns the policy of a bot: the one with that name, else that of the game, else one that wanders."""
+    found = rules.bot_policy(chance) if name is None else None
+    made: Policy = found if found is not None else POLICIES[name or "wander"](chance)
+    return made
+
+
+async def join(order: dict[str, Any], players: list[Player], rules: Rules, lives: list[asyncio.Task[None]]) -> None:
     """Starts the bots one by one, `joins_per_s` of them per second."""
     begun = time.monotonic()
     for i, player in enumerate(players):
-        bot = Bot(make(random.Random(f"{order['seed']} {player.name}")))
-        lives.append(asyncio.create_task(player.play(order["url"], bot)))
+        bot = Bot(policy_of(order["policy"], rules, random.Random(f"{order['seed']} {player.name}")))
+        lives.append(asyncio.create_task(player.play(order["url"], bot, rules.behaviours)))
         await asyncio.sleep(max(0.0, begun + (i + 1) / order["joins_per_s"] - time.monotonic()))
 
 

@@ -2,6 +2,7 @@
 
 import json
 import os
+import random
 import signal
 import subprocess
 import sys
@@ -11,6 +12,11 @@ from pathlib import Path
 
 import pytest
 
+from client_sdk.bots import Stand, Wander
+from server.rules import Rules
+from sovereign_netcode.examples.dodge import Dodge
+from sovereign_netcode.examples.dodge_brain import DodgePlayer
+from sovereign_netcode.loadtest.swarm import policy_of
 from tests.client_sdk.servers import real_server
 from tests.e2e.processes import inheriting
 from tests.lengths import long
@@ -60,6 +66,32 @@ def test_it_takes_a_server_that_runs_already(tmp_path: Path) -> None:
     figures = json.loads(out.read_text())
     assert figures["tick_rate"] == 20
     assert figures["resyncs"] == 0
+
+
+def test_a_game_is_played_with_its_behaviours_and_its_bots(tmp_path: Path) -> None:
+    out = tmp_path / "out.json"
+    game = "sovereign_netcode.examples.dodge:Dodge"
+    done = loadtest("--game", game, "--clients", "2", "--seconds", "1", "--json", str(out))
+    assert done.returncode == 0, done.stdout + done.stderr
+    figures = json.loads(out.read_text())
+    assert (figures["game"], figures["policy"], figures["scene"]) == (game, None, None)
+    assert figures["disconnects"] == figures["malformed"] == 0
+    assert figures["inputs_sent"] > 32
+
+
+def test_a_game_that_does_not_exist_is_named() -> None:
+    done = loadtest("--game", "sovereign_netcode.examples.dodge:Dodgeball")
+    assert done.returncode == 2
+    assert done.stderr.startswith("error: game = 'sovereign_netcode.examples.dodge:Dodgeball': cannot be loaded")
+
+
+@pytest.mark.parametrize(
+    ("name", "rules", "made"),
+    [(None, Rules(), Wander), (None, Dodge(), DodgePlayer), ("stand", Dodge(), Stand)],
+    ids=["none", "the game's", "named"],
+)
+def test_policies_of_bots(name: str | None, rules: Rules, made: type) -> None:
+    assert type(policy_of(name, rules, random.Random(1))) is made
 
 
 @pytest.mark.slow
