@@ -32,7 +32,7 @@ class Dodge(Rules):
 
     Attributes: "name", "team" (0 or 1), "score" (hits), "hits" (hits taken, as far as they are counted). Shared: "ends"
     (the tick at which the round ends), "points" (opponents that each team has put out, by its name). Events: "out" with
-    {"by", "who"}, "round" with {"winner"}.
+    {"by", "who"}, "round" with {"winner"}: the name of a team, or "nobody".
     """
 
     scene = "meadow"
@@ -60,7 +60,9 @@ class Dodge(Rules):
 
     def on_tick(self) -> None:
         game = self.game
-        fill_up(game, self._everybody(), self.players_min, self._add)
+        larger = 1 - self._smaller(self._everybody())
+        playing = sorted(self._everybody(), key=lambda entity: game.field(entity, "team") == larger)
+        fill_up(game, playing, self.players_min, self._add)  # the last ones leave first
         for entity in self._everybody():
             self._count_hits(entity)
         for entity in game.entities("out"):
@@ -68,7 +70,8 @@ class Dodge(Rules):
                 self._bring_back(entity)
         if game.tick >= game.shared["ends"]:
             points = game.shared["points"]
-            game.send("round", {"winner": max(TEAMS, key=lambda team: points[team])})
+            best = [team for team in TEAMS if points[team] == max(points.values())]
+            game.send("round", {"winner": best[0] if len(best) == 1 else "nobody"})
             self._next_round()
         if game.tick % THINK_TICKS == 0:
             self._steer()
@@ -119,11 +122,15 @@ class Dodge(Rules):
     def _enlist(self, entity: int) -> None:
         """Puts a new entity into the smaller team."""
         game = self.game
-        teams = [game.field(other, "team") for other in self._everybody() if other != entity]
-        team = int(2 * sum(teams) < len(teams))
+        team = self._smaller([other for other in self._everybody() if other != entity])
         game.set_field(entity, "team", team)
         game.set(entity, "team", team)
         game.set(entity, "score", 0)
+
+    def _smaller(self, entities: list[int]) -> int:
+        """Returns the team that fewer of the entities are in."""
+        teams = [self.game.field(entity, "team") for entity in entities]
+        return int(2 * sum(teams) < len(teams))
 
     def _add(self, place: Vec, name: str) -> None:
         self._enlist(self.game.spawn("player", place, name=name))

@@ -12,7 +12,8 @@ from sovereign_netcode.shared.body import Body
 class Dodger(Behaviour):
     """A player: it dashes, jumps twice, throws balls, and is knocked back by those of the other team.
 
-    Its template is "player", "dashing" for a moment after a dash, or "out" until the rules bring it back.
+    Its template is "player", "dashing" for a moment after a dash, or "out" until the rules bring it back. Balls pass
+    through a player who dashes.
     """
 
     templates = ("player", "dashing", "out")

@@ -15,7 +15,7 @@ def fill_up(game: GameApi, playing: Sequence[int], least: int, add: Callable[[Ve
 
     Args:
         game: the game.
-        playing: the entities that play.
+        playing: the entities that play; the last ones of the server's own leave first.
         least: least number of them.
         add: spawns a player of the server's own at a position, with a name.
     """

@@ -160,6 +160,7 @@ def test_teams_are_even_and_a_round_ends() -> None:
         round_s = 2.0
 
     match = Match(load_scene(Dodge.scene), 4, rules=Short())
+    ann = match.join(lambda core, rng: NEUTRAL)
     match.run(1.5)
     game = match.game.api
     everybody = game.entities("player")
@@ -169,6 +170,10 @@ def test_teams_are_even_and_a_round_ends() -> None:
     match.run(1)
     assert set(game.shared["points"].values()) == {0}
     assert game.shared["ends"] == 1 + 2 * game.ticks(Short.round_s)
+    match.run_until(lambda: game.shared["ends"] > 1 + 2 * game.ticks(Short.round_s), 3)
+    match.run(0.2)
+    said = [event.data["winner"] for event in ann.events if isinstance(event, Happened) and event.name == "round"]
+    assert said == ["yellow", "nobody"]
     check(match)
 
 
