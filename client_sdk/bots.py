@@ -59,6 +59,8 @@ class Bot:
 
     def __init__(self, policy: Policy) -> None:
         self._policy = policy
+        self._learner = policy if isinstance(policy, Learner) else None
+        self._builder = policy if isinstance(policy, Builder) else None
         self._tick = -1
 
     def __call__(self, core: Core) -> None:
@@ -68,11 +70,11 @@ class Bot:
         world = core.prediction.predicted
         if world.tick != self._tick and core.entity in world:
             self._tick = world.tick
-            if isinstance(self._policy, Learner):
-                self._policy.learn(core.prediction.attributes)
+            if self._learner is not None:
+                self._learner.learn(core.prediction.attributes)
             core.set_input(self._policy(world, core.entity))
-            if isinstance(self._policy, Builder) and core.state == "playing":
-                edit = self._policy.edit(world, core.entity)
+            if self._builder is not None and core.state == "playing":
+                edit = self._builder.edit(world, core.entity)
                 if edit is not None:
                     core.edit(*edit)
 
