@@ -96,7 +96,7 @@ TEST = '''\
 
 from {name} import {title}
 from sovereign_netcode.client_sdk.events import Announced, Happened
-from sovereign_netcode.playtest import Link, Match, bot
+from sovereign_netcode.playtest import Link, Match, bot, check_behaviours
 from sovereign_netcode.shared.inputs import NEUTRAL, Input, make_input
 from sovereign_netcode.shared.scene import load_scene
 from sovereign_netcode.shared.world import World
@@ -136,6 +136,10 @@ def test_ten_points_make_fast_and_are_announced() -> None:
     match.run(1)
     assert game.template(entity) == "runner"
     assert [event.data for event in ann.events if isinstance(event, Happened)] == [{{"entity": entity}}]
+
+
+def test_turns_compute_the_same_everywhere() -> None:
+    check_behaviours({title}(), ticks=100, players=2, processes=1)  # finds turns that read a clock, for example
 
 
 def test_a_dash_is_predicted() -> None:

@@ -198,7 +198,7 @@ def test_a_command_says_what_it_lacks(wheel: Path, tmp_path: Path) -> None:
 def test_a_game_is_begun_tested_and_served(installed: Installed) -> None:
     said = installed.command("sovereign-new-game", "king_of_the_hill")
     assert "sovereign_netcode.server --game king_of_the_hill:KingOfTheHill" in said
-    assert "3 passed" in installed.run("-m", "pytest", "-q", "test_king_of_the_hill.py")
+    assert "4 passed" in installed.run("-m", "pytest", "-q", "test_king_of_the_hill.py")
     with installed.served("--game", "king_of_the_hill:KingOfTheHill", "--record", "session"):
         pass
     game = "king_of_the_hill:KingOfTheHill"

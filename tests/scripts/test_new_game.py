@@ -34,7 +34,7 @@ def test_its_tests_pass_and_the_server_plays_it(monkeypatch: pytest.MonkeyPatch,
         check=False,
     )
     assert tests.returncode == 0, tests.stdout
-    assert "3 passed" in tests.stdout
+    assert "4 passed" in tests.stdout
     with running("--port", "0", "--game", "my_first_game:MyFirstGame", PYTHONPATH=str(tmp_path)) as server:
         server.address()
     for tool in (("ruff", "check", "--ignore", "I001"), ("ruff", "format", "--check")):

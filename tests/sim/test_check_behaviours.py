@@ -13,6 +13,8 @@ from shared.behaviours import Behaviour, field
 from shared.body import Body
 from shared.checks import SceneError
 from shared.scene import Scene, load_scene
+from sovereign_netcode.examples.dodge import Dodge
+from sovereign_netcode.examples.race import Race
 from sovereign_netcode.playtest import BehaviourCheckError, check_behaviours
 from tests.behaving import Playground
 from tests.behaving import scene as playground
@@ -105,7 +107,12 @@ def test_an_offender_is_found_with_tick_entity_field_and_behaviour(code: type[Be
     [
         (lambda: game(Honest), None, 30, 1),
         (Playground, lambda: playground(()), 30, 0),
-        *long((Playground, lambda: playground(()), 2_000, 3), (Rules, lambda: load_scene("hills"), 100, 3)),
+        *long(
+            (Playground, lambda: playground(()), 2_000, 3),
+            (Rules, lambda: load_scene("hills"), 100, 3),
+            (Dodge, None, 600, 3),
+            (Race, None, 600, 3),
+        ),
     ],
 )
 def test_honest_behaviours_pass(
