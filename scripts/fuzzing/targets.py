@@ -37,7 +37,9 @@ from shared.messages import (
     Message,
     Ping,
     Pong,
+    Private,
     ProtocolError,
+    Refusal,
     Resync,
     Shared,
     Snapshot,
@@ -80,6 +82,8 @@ FROM_SERVER: tuple[Message, ...] = (
     Pong(1.5, 17.25),
     Happened(3, "goal", b"\xc0"),
     Announce(3, 7, "dash", b"\xc0"),
+    Refusal(1, "not here"),
+    Private({"role": "spy"}),
     Shared({"score": [1, None, {"x": 3.0}]}),
 )
 

@@ -9,8 +9,9 @@ from itertools import product
 
 import numpy as np
 
+from server.game_api.boxes import Boxes
 from shared.checks import Cell
-from shared.layout import ID, TEMPLATE, Int64s, X
+from shared.layout import ID, Int64s
 from shared.units import BLOCK, BLOCK_SHIFT
 from shared.world import World
 
@@ -25,8 +26,7 @@ class BlockContacts:
 
     def __init__(self, world: World, *, goes_on: bool = False) -> None:
         self._world = world
-        boxes = np.array([template.row()[:6] for template in world.scene.templates], np.int64)
-        self._low, self._high = boxes[:, :3], boxes[:, :3] + boxes[:, 3:]
+        self._boxes = Boxes(world.scene)
         self._sides: dict[int, set[int]] = {}
         """Sides that touch blocks, by entity: 0 to 5 for west, east, south, north, below, above."""
         if goes_on:
@@ -46,44 +46,51 @@ class BlockContacts:
             self._sides = {entity: sides for entity, sides in self._sides.items() if entity in self._world}
         states = self._world.states()
         states = states[np.isin(states[:, ID], changed)]
-        low = states[:, X : X + 3] + self._low[states[:, TEMPLATE]]
-        high = states[:, X : X + 3] + self._high[states[:, TEMPLATE]]
+        low, high = self._boxes.corners(states)
         on_boundary = (np.stack((low, high), axis=2).reshape(-1, 6) & (BLOCK - 1)) == 0
         begun: list[tuple[int, Cell]] = []
         for entity, flags, below, above in zip(
             states[:, ID].tolist(), on_boundary.tolist(), low.tolist(), high.tolist(), strict=True
         ):
             before, sides = self._sides.pop(entity, set()), set[int]()
-            for side in range(6) if any(flags) else ():
-                block = self._block_at(side, below, above) if flags[side] else None
-                if block is not None:
+            for side in range(6) if True in flags else ():
+                if not flags[side]:
+                    continue
+                touched = self._solid(side, below, above)
+                if side in before:
+                    if next(touched, None) is not None:
+                        sides.add(side)
+                elif blocks := list(touched):
                     sides.add(side)
-                    if side not in before:
-                        begun.append((entity, block))
+                    begun.append((entity, _nearest(blocks, side // 2, below, above)))
             if sides:
                 self._sides[entity] = sides
         return begun
 
-    def _block_at(self, side: int, low: list[int], high: list[int]) -> Cell | None:
-        """Returns the solid block nearest to the middle of a side of a box; None: the side touches no block."""
+    def _solid(self, side: int, low: list[int], high: list[int]) -> Iterator[Cell]:
+        """Yields the solid blocks that a side of a box touches."""
+        spans = [range(a >> BLOCK_SHIFT, (b - 1 >> BLOCK_SHIFT) + 1) for a, b in zip(low, high, strict=True)]
         axis = side // 2
         layer = high[axis] >> BLOCK_SHIFT if side % 2 else (low[axis] >> BLOCK_SHIFT) - 1
-        spans = [range(a >> BLOCK_SHIFT, (b - 1 >> BLOCK_SHIFT) + 1) for a, b in zip(low, high, strict=True)]
         spans[axis] = range(layer, layer + 1)
-        middle = [(a + b) // 2 for a, b in zip(low, high, strict=True)]
-
-        def distance(block: Cell) -> int:
-            return sum(
-                max(abs(2 * part * BLOCK + BLOCK - 2 * at) - BLOCK, 0)
-                for k, (part, at) in enumerate(zip(block, middle, strict=True))
-                if k != axis
-            )
-
-        return min(self._solid(spans), key=lambda block: (distance(block), block), default=None)
-
-    def _solid(self, spans: list[range]) -> Iterator[Cell]:
-        blocks = self._world.blocks
+        get, stops = self._world.blocks.get, self._world.blocks.stops
         for x, y, z in product(*spans):
-            kind = blocks.get(x, y, z)
-            if kind is not None and blocks.stops[kind]:
+            kind = get(x, y, z)
+            if kind is not None and stops[kind]:
                 yield x, y, z
+
+
+def _nearest(blocks: list[Cell], axis: int, low: list[int], high: list[int]) -> Cell:
+    """Returns the block that is nearest to the middle of a side of a box; of several, the first by its place.
+
+    Args:
+        blocks: the blocks that the side touches.
+        axis: the axis across the side.
+        low, high: corners of the box, in grid steps.
+    """
+
+    def distance(block: Cell) -> int:
+        twice = (abs((2 * block[k] + 1) * BLOCK - low[k] - high[k]) - BLOCK for k in range(3) if k != axis)
+        return sum(max(part, 0) for part in twice)
+
+    return min(blocks, key=lambda block: (distance(block), block))

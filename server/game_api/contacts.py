@@ -11,7 +11,8 @@ A change that the rules make while they are called for this very contact does no
 
 import numpy as np
 
-from shared.layout import ID, TEMPLATE, Int64s, X
+from server.game_api.boxes import Boxes
+from shared.layout import ID, TEMPLATE, Int64s
 from shared.world import World
 
 Pair = tuple[int, int]
@@ -29,9 +30,7 @@ class Contacts:
 
     def __init__(self, world: World, *, goes_on: bool = False) -> None:
         self._world = world
-        boxes = np.array([template.row()[:6] for template in world.scene.templates], np.int64)
-        self._low, self._high = boxes[:, :3], boxes[:, :3] + boxes[:, 3:]
-        self._widest = int(boxes[:, 3].max())
+        self._boxes = Boxes(world.scene)
         states = world.states()
         self._touching: dict[Pair, Kinds] = self._touched(states, states[:, ID]) if goes_on else {}
 
@@ -72,12 +71,11 @@ class Contacts:
         return sorted(b if a == entity else a for a, b in pairs)
 
     def _touched(self, states: Int64s, changed: Int64s) -> dict[Pair, Kinds]:
-        low = states[:, X : X + 3] + self._low[states[:, TEMPLATE]]
-        high = states[:, X : X + 3] + self._high[states[:, TEMPLATE]]
+        low, high = self._boxes.corners(states)
         order = np.argsort(low[:, 0], kind="stable")
         states, low, high = states[order], low[order], high[order]
         mine = np.flatnonzero(np.isin(states[:, ID], changed))
-        first = np.searchsorted(low[:, 0], low[mine, 0] - self._widest)
+        first = np.searchsorted(low[:, 0], low[mine, 0] - self._boxes.widest)
         count = np.searchsorted(low[:, 0], high[mine, 0], "right") - first
         i = np.repeat(mine, count)
         j = np.arange(len(i)) - np.repeat(np.cumsum(count) - count, count) + np.repeat(first, count)

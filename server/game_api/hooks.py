@@ -85,7 +85,8 @@ class Hooks:
             act, arguments = self._soon.popleft()
             self._call(act, *arguments)
         for method, values in self._timers.due(self._world.tick + 1):
-            self._call(self._timed, method, values)
+            found = getattr(self._rules, method, None)
+            self._call(*((self._lacks, method) if found is None else (found, *values)))
 
     def stop(self) -> None:
         """Calls `on_stop`, once, if the game has started."""
@@ -196,10 +197,13 @@ class Hooks:
             raise RulesError("can_edit returned None: it must return True, False or a reason")
         return checked_result(allowed, "can_edit")
 
-    def _timed(self, method: str, arguments: list[Any]) -> object:
-        """Calls the method of a timer. After a restart, the rules may no longer have it."""
-        act = getattr(self._rules, method)
-        return checked_result(act(*arguments), method)
+    def _lacks(self, method: str) -> None:
+        """Reports the timer of a saved game whose method the rules no longer have.
+
+        Raises:
+            RulesError: always.
+        """
+        raise RulesError(f"{type(self._rules).__qualname__}.{method}: a timer calls it, but there is no such method")
 
     def _can_join(self, name: str, subject: str) -> object:
         allowed: object = self._rules.can_join(name, subject)

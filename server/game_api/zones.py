@@ -8,9 +8,10 @@ from typing import Any
 
 import numpy as np
 
+from server.game_api.boxes import Boxes
 from server.game_api.entries import Entries
 from shared.checks import SceneError, shown, vector
-from shared.layout import ID, TEMPLATE, Int64s, X
+from shared.layout import ID, Int64s
 from shared.units import to_position
 from shared.world import World
 
@@ -31,8 +32,7 @@ class Zones:
 
     def __init__(self, world: World, entries: Entries) -> None:
         self._world, self._entries = world, entries
-        boxes = np.array([template.row()[:6] for template in world.scene.templates], np.int64)
-        self._low, self._high = boxes[:, :3], boxes[:, :3] + boxes[:, 3:]
+        self._boxes = Boxes(world.scene)
         self._visits: set[Visit] = set()
         self._new: list[str] = []
         """Zones that were added or moved since the last update."""
@@ -115,8 +115,7 @@ class Zones:
         if not names or not len(states):
             return []
         corners = np.array([self._entries.table[name] for name in names], np.int64)
-        low = states[:, X : X + 3] + self._low[states[:, TEMPLATE]]
-        high = states[:, X : X + 3] + self._high[states[:, TEMPLATE]]
+        low, high = self._boxes.corners(states)
         inside = ((low[:, None] < corners[None, :, 1]) & (high[:, None] > corners[None, :, 0])).all(axis=2)
         rows, zones = np.nonzero(inside)
         ids = states[:, ID]

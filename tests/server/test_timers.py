@@ -78,7 +78,7 @@ def test_a_cancelled_timer_is_not_called() -> None:
     assert not game.cancel(two)
 
 
-def test_a_timer_that_raises_is_counted_and_over() -> None:
+def test_a_timer_that_raises_is_counted_and_over(caplog: pytest.LogCaptureFixture) -> None:
     rules = Alarm()
     table = Table(rules=rules)
     table.tick()
@@ -86,6 +86,7 @@ def test_a_timer_that_raises_is_counted_and_over() -> None:
     table.game.api.after(0, "ring", "next")
     table.tick(5)
     assert (table.game.counters.rules_failed, [name for _, name in rules.calls]) == (1, ["next"])
+    assert "Alarm.fail" in caplog.text
 
 
 def test_timers_survive_restarts(tmp_path: Path) -> None:
@@ -118,7 +119,7 @@ def test_timers_survive_restarts(tmp_path: Path) -> None:
         second.stop()
 
 
-def test_a_method_that_the_restarted_rules_lack_is_counted(tmp_path: Path) -> None:
+def test_a_method_that_the_restarted_rules_lack_is_counted(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     first = Stored(tmp_path, Alarm())
     first.game.api.after(0.1, "ring", 1)
     first.tick()
@@ -126,6 +127,7 @@ def test_a_method_that_the_restarted_rules_lack_is_counted(tmp_path: Path) -> No
     second = Stored(tmp_path, Rules())
     second.tick(10)
     assert second.game.counters.rules_failed == 1
+    assert "Rules.ring: a timer calls it, but there is no such method" in caplog.text
     second.stop()
 
 

@@ -27,7 +27,9 @@ from shared.messages import (
     NextHappened,
     Ping,
     Pong,
+    Private,
     ProtocolError,
+    Refusal,
     Restart,
     Resync,
     Shared,
@@ -79,6 +81,8 @@ FROM_SERVER: list[Message] = [
     Announce(TICK_MAX, (1 << 31) - 1, "n" * 32, bytes(1024)),
     Shared({"score": [1, None, "two", {"three": 3.0}]}),
     NextHappened(TICK_MAX),
+    Refusal((1 << 32) - 1, "é" * 500),
+    Private({"role": "spy"}),
 ]
 
 
@@ -150,6 +154,9 @@ OUT_OF_BOUNDS: list[tuple[Message, str, list[Any]]] = [
     (Announce(0, 1, "", b""), "entity", [0, 1 << 31, None]),
     (Announce(0, 1, "", b""), "name", ["n" * 33, None]),
     (Announce(0, 1, "", b""), "payload", [bytes(1025), "text"]),
+    (Refusal(0, ""), "number", [-1, 1 << 32, 1.0, None]),
+    (Refusal(0, ""), "reason", ["r" * 501, None, b""]),
+    (Private({}), "values", [[], {1: 2}, None]),
     (NextHappened(0), "number", [-1, TICK_MAX + 1, 1.0, None]),
     (Shared({}), "values", [[], None, {b"name": 1}, {str(i): 0 for i in range(65)}]),
     (BLANK, "tick", [-2, TICK_MAX + 1, None]),
