@@ -36,7 +36,7 @@ class PlayersApi:
             reason: text of at most 500 characters for the client.
             for_s: seconds of the game's time for which the player may not join again; `math.inf`: for good; None: the
                 player may join again at once. The player is recognised by the subject of the token, or by the name if
-                the server does not ask for tokens. This survives a restart.
+                the server does not ask for tokens; without either it is not recognised. This survives a restart.
 
         Raises:
             SceneError: `player` is not a player of this game, or a value is wrong.
@@ -77,6 +77,8 @@ class PlayersApi:
         return kicked if until == TICK_MAX else f"{kicked}; come back in {left / self._world.scene.tick_rate:.0f} s"
 
     def _ban(self, key: str, until: int, reason: str) -> None:
+        if not key:
+            return
         for old in [old for old, (end, _) in self._bans.table.items() if end <= self._world.tick]:
             self._bans.drop(old)
         if len(self._bans.table) >= BANS_MAX and key not in self._bans.table:
@@ -85,5 +87,5 @@ class PlayersApi:
 
 
 def _identity(name: str, subject: str) -> str:
-    """Returns the key by which a player is recognised."""
-    return f"subject {subject}" if subject else f"name {name.casefold()}"
+    """Returns the key by which a player is recognised; empty if it has neither a subject nor a name."""
+    return f"subject {subject}" if subject else f"name {name.casefold()}" if name else ""

@@ -27,7 +27,7 @@ class Chat(Rules):
     """The rules of a chat.
 
     Commands: see `COMMANDS`; each is refused with a reason. Events: "said" to all and "whispered" to two players, with
-    {"by", "text"}; "came" and "went", with {"who"}.
+    {"by": entity, "text"}; "came" and "went", with {"who"}.
     """
 
     scene = "flat"
@@ -61,7 +61,7 @@ class Chat(Rules):
             others = {player, other}
         if not self._may_speak(player.entity):
             return f"at most {LINES} messages in {WINDOW_S:.0f} s"
-        self.game.send("said" if others is None else "whispered", {"by": player.name, "text": message}, others)
+        self.game.send("said" if others is None else "whispered", {"by": player.entity, "text": message}, others)
         return True
 
     def _kick(self, player: Player, name: str) -> bool | str:

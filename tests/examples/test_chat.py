@@ -48,7 +48,10 @@ def test_messages_reach_all_and_whispers_two() -> None:
     assert answer(match, cleo, "say", {"text": " \u200b "}) == "there is nothing to say"
     assert answer(match, cleo, "say", {"txt": "hello"}).startswith("say.'txt': no such field")
     assert answer(match, cleo, "say", {"text": "x" * 500}) == "done"
-    said = [{"by": "Ann", "text": "hello all"}, {"by": "Cleo", "text": "x" * LINE_MAX}]
+    said = [
+        {"by": ann.core.entity, "text": "hello all"},
+        {"by": cleo.core.entity, "text": "x" * LINE_MAX},
+    ]
     assert [happened(player, "said") for player in (ann, bob, cleo)] == [said] * 3
     assert [len(happened(player, "whispered")) for player in (ann, bob, cleo)] == [1, 1, 0]
     assert match.game.counters.rules_failed == 0

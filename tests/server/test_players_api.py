@@ -159,6 +159,15 @@ def test_a_kick_counts_for_the_subject_of_the_token() -> None:
     assert not table.game.api.pardon("bob@x")
 
 
+def test_a_kick_of_a_player_without_a_name_keeps_no_others_out() -> None:
+    table = Table(rules=Club())
+    comes(table, "")
+    kick(table, only(table), "spam", math.inf)
+    table.tick()
+    assert table.game.players == {}
+    assert comes(table, "").session.entity
+
+
 def test_a_kick_survives_a_restart(tmp_path: Path) -> None:
     first = Stored(tmp_path)
     comes(first, "Ann")
