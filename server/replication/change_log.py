@@ -113,6 +113,8 @@ class ChangeLog:
         self._world = world
         self._attributes = {} if attributes is None else attributes
         self._said: set[int] = set()
+        self._named: set[int] = set()
+        """Entities that have had attributes, in scenes where numbers are used again: a client may still know them."""
         self.history = bounds(world.scene.tick_rate).history
         """Number of ticks for which changes are kept."""
         self._ticks: Ring[_Tick] = Ring(self.history)
@@ -182,10 +184,12 @@ class ChangeLog:
                     if home is not None:
                         now.gone[home].append(entity)
                     homes[entity] = segment
-                    if entity in self._attributes:
+                    if entity in self._attributes or (home is None and entity in self._named):
                         now.said[segment].add(entity)
         for entity in self._said & homes.keys():
             now.said[homes[entity]].add(entity)
+            if self._world.extras.spawns:
+                self._named.add(entity)
         self._said.clear()
         if self._world.extras.count:
             self._record_fields(now, shares)
@@ -303,7 +307,11 @@ class ChangeLog:
 
     def _of(self, entities: list[int]) -> list[Any]:
         """Returns the attributes of entities as on the wire. Those beyond `SAID_BYTES` wait for the next tick."""
-        said = [(entity, self._attributes[entity]) for entity in entities if entity in self._attributes]
+        said = [
+            (entity, self._attributes.get(entity, {}))
+            for entity in entities
+            if entity in self._attributes or entity in self._named
+        ]
         if len(said) > SAID_FEW:
             ends = accumulate(len(msgpack.packb(values)) + SAID_ID_BYTES for _, values in said)
             fits = max(sum(end <= SAID_BYTES for end in ends), 1)

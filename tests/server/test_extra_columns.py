@@ -3,11 +3,13 @@
 import random
 import time
 
+import msgpack
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from client_sdk.events import Diverged
+from server.game import Game
 from server.rules import Rules
 from shared.behaviours import Behaviour, field
 from shared.body import Body
@@ -16,12 +18,14 @@ from shared.fields import ENTITY_MAX
 from shared.inputs import Input
 from shared.layout import CELL
 from shared.messages import ProtocolError, Resync, encode
+from shared.snapshot import decode_parts
 from shared.world import OverlapError
 from sovereign_netcode.playtest import Link, Match
-from tests.behaving import Playground, Presser, scene
+from tests.behaving import BUTTONS, Playground, Presser, scene
 from tests.lengths import examples, long_but
 from tests.server.test_replication import Stalling
 
+FIRE = 1 << BUTTONS.index("fire")
 ROW = scene(
     origin=(-3, 0, 0), size=(7, 1, 1), spawns=((16.0, 16.0, 3.0),),
     terrain={"generator": "boxes", "fill": [[-96, 0, 0, 128, 32, 2, 1]]},
@@ -189,3 +193,39 @@ def test_a_million_records_are_refused_or_read_in_linear_time() -> None:
 def test_rules_without_behaviours_have_no_extra_columns() -> None:
     assert scene(aim=False).extras.count == scene().extras.count - 3
     assert Match(scene((), aim=False), 1, rules=Rules()).game.world.extras.count == 0
+
+
+class Reuses(Behaviour):
+    templates = ("player",)
+    spawns = 1
+
+    def turn(self, me: Body) -> None:
+        if me.pressed("fire"):
+            x, y, z = me.position
+            me.spawn("crate", (x, y, z + 4.0))
+
+
+def test_an_entity_of_a_reused_number_has_no_attributes_of_the_one_before() -> None:
+    game = Game(scene((Reuses,)))
+    with game.api.turn:
+        player = game.api.spawn("player", (30.0, 30.0, 2.0))
+    shot = player + 1
+
+    def tick(buttons: int) -> None:
+        game.api.steered[player] = Input(0, 0, buttons)
+        game.tick(0.0, 0.0)
+
+    tick(FIRE)
+    with game.api.turn:
+        game.api.set(shot, "name", "old")
+    tick(0)
+    since, segment = game.world.tick, game.log.segment(shot)
+    with game.api.turn:
+        game.api.remove(shot)
+    tick(FIRE)
+    assert shot in game.world
+    tick(0)
+    part = msgpack.unpackb(game.log.since(since)[segment], strict_map_key=False)
+    (decoded,), _, _ = decode_parts([part], len(game.scene.templates))
+    assert decoded.attributes == [(shot, {})]
+    assert decoded.gone == []
