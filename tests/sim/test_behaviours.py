@@ -16,7 +16,7 @@ from shared.behaviours import Behaviour, field
 from shared.body import Body
 from shared.inputs import Input
 from shared.units import BLOCK
-from sovereign_netcode.playtest import Link, Match, Player
+from sovereign_netcode.playtest import Link, Match, Player, wander
 from tests.behaving import BUTTONS, CLASSES, Playground, Presser, scene
 from tests.lengths import long
 from tests.piling import Piles
@@ -211,3 +211,26 @@ def test_boxes_and_blocks_put_into_each_other_make_nobody_diverge(players: int, 
     assert set(causes(match.players)) <= {"other entity", "late input", "unknown edit"}
     assert all(each.core.stats.divergences == 0 for each in match.players)
     assert match.game.counters.rules_failed == 0
+
+
+class Idle(Behaviour):
+    templates = ("player",)
+    spawns = 4
+    stamina = field(bits=8, start=100)
+
+    def turn(self, me: Body) -> None:
+        if me.pressed("fire"):
+            me.stamina -= 1
+
+
+def test_an_ability_that_nobody_uses_costs_no_bytes_while_players_walk() -> None:
+    counts = []
+    for behaviours in ((), (Idle,)):
+        rules = type("Game", (Rules,), {"behaviours": behaviours})()
+        match = joined(rules, PRESETS["regional"], *[wander] * 3, seed=4)
+        match.run(2)
+        before = match.game.counters.snapshot_bytes
+        match.run(8)
+        counts.append(match.game.counters.snapshot_bytes - before)
+    assert counts[0] > 1000
+    assert counts[1] == counts[0]
