@@ -6,6 +6,7 @@ display; its keys are events that the test posts.
 
 import importlib
 import re
+import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -26,6 +27,7 @@ from sovereign_netcode.playtest import Link, Match, Player, bot
 from tests.client_sdk.servers import real_server
 from tests.lengths import long
 from tests.readme import tutorial
+from tests.readme.pages import ROOT
 
 FILES = ("abilities", "bots", "brain", "dodge", "test_dodge", "window")
 FRAMES_PER_S = 60
@@ -335,6 +337,15 @@ def test_the_window_shows_the_network(step: Step, monkeypatch: pytest.MonkeyPatc
     played = watch(step, monkeypatch, script, 130)
     assert {*played.overlay().splitlines()} & {*shown}
     assert any(re.fullmatch(r"blue 0   yellow 0   1\d\d s", text) for text in shown)
+
+
+@pytest.mark.slow
+def test_the_script_makes_the_pictures(tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "tests.readme.tutorial_pictures", str(tmp_path)]
+    subprocess.run(command, cwd=ROOT, check=True, timeout=120)
+    for name, size in (("tutorial.png", (640, 640)), ("tutorial_play.png", (640, 400))):
+        assert pygame.image.load(tmp_path / name).get_size() == size
+        assert f"({name})" in tutorial.PAGE.read_text("utf-8")
 
 
 def test_there_are_nine_steps_and_no_other_files() -> None:

@@ -117,6 +117,7 @@ def _written(parts: list[Part], depth: int = 0) -> str:
 
 def write(step: int, folder: Path) -> None:
     """Writes the files after a step to a folder."""
+    folder.mkdir(parents=True, exist_ok=True)
     for name, text in steps()[step].items():
         (folder / name).write_text(text, "utf-8")
 

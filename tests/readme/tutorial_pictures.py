@@ -1,4 +1,4 @@
-"""Makes the pictures of docs/tutorial.md: `python -m tests.readme.tutorial_pictures`. It needs no display.
+"""Makes the pictures of docs/tutorial.md: `python -m tests.readme.tutorial_pictures [FOLDER]`. It needs no display.
 
 The game of the last step is played within this process, in simulated time, by bots; one of them has a window.
 """
@@ -112,17 +112,18 @@ def window_of_play(path: Path) -> None:
     played(done)
 
 
-def main() -> None:
+def main(out: Path) -> None:
+    """Saves both pictures to a folder."""
     with tempfile.TemporaryDirectory() as folder:
         tutorial.write(max(tutorial.steps()), Path(folder))
         sys.path.insert(0, folder)
         os.chdir(folder)
         pygame.display.init()
         pygame.font.init()
-        own_window(ROOT / "docs" / "tutorial.png")
-        window_of_play(ROOT / "docs" / "tutorial_play.png")
+        own_window(out / "tutorial.png")
+        window_of_play(out / "tutorial_play.png")
         os.chdir(ROOT)
 
 
 if __name__ == "__main__":
-    main()
+    main(Path(sys.argv[1]).resolve() if len(sys.argv) > 1 else ROOT / "docs")
