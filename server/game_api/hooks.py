@@ -100,6 +100,7 @@ class Hooks:
             self._call(self._rules.on_leave, player)
         if player.entity in self._world:
             self._api.discard(player.entity)
+        self._api.forget_private(player.entity)  # a behaviour may have removed the entity
 
     def joined(self, player: Player) -> None:
         """Sets the name of a new player as an attribute, and calls `on_join`."""

@@ -58,6 +58,10 @@ class ValuesApi:
         known = self._private.table.get(entity)
         return b"" if known is None else encode(Private(known))
 
+    def forget_private(self, entity: int) -> None:
+        """Forgets the values that only a player got who has left."""
+        self._private.drop(entity)
+
     def shared_with(self, player: Player) -> Mapping[str, Any]:
         """Returns the values that only the client of a player gets, by name, as a copy."""
         known = self._private.table.get(self._member(player).entity, {})

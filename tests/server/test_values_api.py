@@ -85,6 +85,11 @@ def test_values_end_with_their_player() -> None:
     table.lose(link)
     table.tick(2)
     assert table.game.api.kept.tables["private"] == {}
+    other = joined(table, "Bob")
+    table.game.world.remove(other.session.entity)  # as a behaviour does
+    table.lose(other)
+    table.tick(2)
+    assert (table.game.players, table.game.api.kept.tables["private"]) == ({}, {})
 
 
 def test_values_survive_a_restart(tmp_path: Path) -> None:
