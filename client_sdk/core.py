@@ -300,8 +300,10 @@ class Core:
                     self._events.append(SegmentLoaded(segment))
             case messages.Welcome():
                 self._welcome(message, now)
-            case messages.Happened() | messages.Announce():
+            case messages.Happened():
                 self._game_events.happened(message, hold=self._joins)
+            case messages.Announce():
+                self._game_events.happened(message, hold=self._joins, known=self._worlds.announced(message))
             case messages.Refusal():
                 self._commands.refused(message)
             case messages.NextHappened():

@@ -99,8 +99,8 @@ class Announced:
     """An event that the behaviour of an entity has announced at `tick` (`Body.announce`).
 
     For the own entity, and for what it has spawned, it comes with the prediction, in the frame of the own input, and
-    `number` is positive: a later `Withdrawn` of that number takes it back. Without one, it is true. For other entities
-    it comes from the server, and `number` is 0.
+    `number` is positive: a later `Withdrawn` of that number takes it back. Without one, it is true. An event that was
+    not predicted, and one of another entity, comes from the server, and `number` is 0.
     """
 
     tick: int

@@ -17,7 +17,8 @@ from client_sdk.stats import Stats
 from client_sdk.timing.server_clock import ServerClock
 from shared import kernels
 from shared.behaviours import Behaviour
-from shared.messages import Message, Pong, ProtocolError, Snapshot, Welcome
+from shared.messages import Announce, Message, Pong, ProtocolError, Snapshot, Welcome
+from shared.turns import Announcement
 
 
 class Worlds:
@@ -151,6 +152,16 @@ class Worlds:
             self._events.append(answered)
         world.apply(snapshot)
         self._stepped(world.clock.seen(snapshot.tick, now), now)
+
+    def announced(self, message: Announce) -> bool:
+        """Takes an announcement. Returns whether the program has got it ahead of the server."""
+        if self.play is None:
+            return False
+        prediction = self.play.world.prediction
+        if not prediction.entity <= message.entity <= prediction.last_own:
+            return False
+        event = Announcement(message.entity, message.name, message.payload)
+        return prediction.announcements.arrived(message.tick, event)
 
     def begin(self, world: Replica, now: float) -> tuple[InputLoop, bool]:
         """Starts the input loop in a complete replica, for the first time or after a reconnect.

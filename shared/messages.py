@@ -34,7 +34,7 @@ packed little-endian records in a MessagePack `bin`. docs/protocol.md explains e
     Happened       a game event, sent once. The payload is MessagePack, as in a command.
     NextHappened   the number of the next `Happened`, sent if the client may expect another number, because events were
                    dropped or lost with a connection. The first event that a player gets has the number 0.
-    Announce       an event of an entity's behaviour; its own player does not get it. It counts as a `Happened`.
+    Announce       an event of an entity's behaviour. It counts as a `Happened` for `NextHappened`.
     Shared         all shared values of the game by name, each time: a score, for example.
     Private        all values of the game that only this player gets, each time.
     Refusal        a reason for the verdict FORBIDDEN; it comes ahead of the snapshot with that verdict.

@@ -64,14 +64,18 @@ class TurnResults:
                 self._faults.report(f"{failure.behaviour}.turn of entity {failure.entity}")
 
     def _announce(self, turns: Turns, players: Mapping[int, Player], most: int) -> None:
-        """Queues announcements for all players who see the entity, except for its own, whose client predicts them."""
+        """Queues announcements for all players who see the entity, and for its own player.
+
+        The client of its own player predicts most of them, and drops these.
+        """
         reserved, tick = self._world.extras.spawns, self._world.tick
         for entity, name, payload in turns.announced:
             segment = self._log.segment_at(entity)
             message = encode(Announce(tick, entity, name, payload))
             for player in players.values():
                 session = player.session
-                if session is None or player.entity <= entity <= player.entity + reserved:
+                if session is None:
                     continue
-                if segment is None or segment in session.stream.view.sees:
+                own = player.entity <= entity <= player.entity + reserved
+                if own or segment is None or segment in session.stream.view.sees:
                     self._counters.events_dropped += player.outbox.add(tick, message, most)

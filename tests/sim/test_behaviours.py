@@ -234,3 +234,43 @@ def test_an_ability_that_nobody_uses_costs_no_bytes_while_players_walk() -> None
         counts.append(match.game.counters.snapshot_bytes - before)
     assert counts[0] > 1000
     assert counts[1] == counts[0]
+
+
+@pytest.mark.parametrize(
+    ("preset", "seed"), [("far", 5), ("thin", 5), *long(*((preset, seed) for preset in PRESETS for seed in (6, 7, 8)))]
+)
+def test_each_announcement_reaches_its_own_player_once(preset: str, seed: int) -> None:
+    """Holds also where an input is late, so that the client predicts the announcement for another tick or not at all.
+
+    Those of the last seconds are left out of the count: they may be on their way.
+    """
+    match = joined(Playground(), PRESETS[preset], *(Presser() for _ in range(4)), seed=seed)
+    announced: list[tuple[int, int, str]] = []
+
+    def note() -> None:
+        turns = match.game.world.turns
+        assert turns is not None
+        announced.extend((match.game.world.tick, event.entity, event.name) for event in turns.announced)
+
+    match.on_tick.append(note)
+    first = match.game.world.tick
+    match.run(20)
+    last = match.game.world.tick
+    match.run(8)
+    for player in match.players:
+        prediction = player.core.prediction
+        assert prediction is not None
+        own = range(player.core.entity, prediction.last_own + 1)
+        made = Counter((entity, name) for tick, entity, name in announced if tick <= last and entity in own)
+        withdrawn = {event.number for event in player.events if isinstance(event, Withdrawn)}
+        got = [
+            (event.entity, event.name, event.tick)
+            for event in player.events
+            if isinstance(event, Announced) and event.entity in own and event.number not in withdrawn
+        ]
+        later = Counter((entity, name) for entity, name, tick in got if tick > last)
+        late = Counter((entity, name) for tick, entity, name in announced if tick > last and entity in own)
+        found = Counter((entity, name) for entity, name, tick in got if first < tick <= last)
+        assert len(made) > 1
+        missing, extra = made - found - later, found - made - late
+        assert (missing, extra) == (Counter(), Counter())
