@@ -78,11 +78,13 @@ class TurnWorld(UncheckedWorld):
             but: row that is left out.
             kind: number of their template; None: any.
         """
-        end = self.kernel.gather(self.bound, but, False, *box)
-        rows = self.candidates[: end // layout.CANDIDATE, 6]
-        found = self._entities[rows][:, (ID, TEMPLATE)].tolist()
-        ordered = sorted(zip(found, rows.tolist(), strict=True))
-        return [row for (_, template), row in ordered if kind is None or template == kind]
+        n = self.kernel.gather(self.bound, but, False, *box) // layout.CANDIDATE
+        if n == 0:
+            return []
+        entities = self._entities
+        found = [(entities.item(row, ID), row) for row in self.candidates[:n, 6].tolist()]
+        found.sort()
+        return [row for _, row in found if kind is None or entities.item(row, TEMPLATE) == kind]
 
     def seen(self, row: int) -> Seen:
         """Returns what the turn of another entity sees of the entity in a row."""
