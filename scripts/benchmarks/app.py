@@ -223,7 +223,8 @@ def table(rows: list[Row]) -> Table:
     return made
 
 
-def main(argv: list[str] | None = None) -> int:
+def parser() -> argparse.ArgumentParser:
+    """Returns the parser of the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     commands = parser.add_subparsers(dest="command", required=True)
     each = argparse.ArgumentParser(add_help=False)
@@ -280,7 +281,11 @@ def main(argv: list[str] | None = None) -> int:
     command.add_argument("--seconds", type=float, default=120.0, metavar="S", help="simulated seconds (default: 120)")
     command.add_argument("--seed", type=int, default=1, metavar="N", help="seed (default: 1)")
     command.set_defaults(run=run_abilities)
-    args = parser.parse_args(argv)
+    return parser
+
+
+def main(argv: list[str] | None = None) -> int:
+    args = parser().parse_args(argv)
     for number in (signal.SIGINT, signal.SIGTERM):  # the processes of the benchmark end as well
         signal.signal(number, signal.default_int_handler)
     try:

@@ -20,6 +20,7 @@ from client_sdk import Client, Loopback
 from client_sdk.bots import Bot
 from client_sdk.view import View
 from server.game import Game
+from server.rules import load_rules
 from shared.inputs import MOVE_MAX
 from shared.scene import load_scene
 from sovereign_netcode.play.window import REST, Window, Wish
@@ -116,8 +117,8 @@ def main(out: Path) -> None:
     """Saves both pictures to a folder."""
     with tempfile.TemporaryDirectory() as folder:
         tutorial.write(max(tutorial.steps()), Path(folder))
-        sys.path.insert(0, folder)
         os.chdir(folder)
+        load_rules("dodge:Dodge")  # from here on, modules are looked for in this folder, too
         pygame.display.init()
         pygame.font.init()
         own_window(out / "tutorial.png")
