@@ -45,7 +45,7 @@ def play(url: str, seconds: float, seed: int) -> None:
         assert len(joined) == len(clients)
 
 
-@pytest.mark.parametrize("kills", [2, *long(12)])
+@pytest.mark.parametrize("kills", [1, *long(12)])
 def test_no_state_of_behaviours_is_lost_in_kills(tmp_path: Path, kills: int) -> None:
     data, expected = tmp_path / "data", None
     for life in range(kills):
@@ -67,6 +67,7 @@ def test_no_state_of_behaviours_is_lost_in_kills(tmp_path: Path, kills: int) -> 
         assert hashes[expected[0]] == expected[1]
 
 
+@pytest.mark.slow
 def test_a_client_without_the_classes_is_refused_and_leaves_no_player() -> None:
     with running(*GAME) as server:
         host, port = server.address()
