@@ -81,7 +81,8 @@ def command(name: str) -> Callable[[Sequence[str]], int]:
         SettingsError: there is no such command.
     """
     if name not in COMMANDS:
-        there = " and ".join(COMMANDS)
+        *others, last = COMMANDS
+        there = f"{', '.join(others)} and {last}"
         raise SettingsError(
             f"{name!r}: no such command{nearest(name, COMMANDS)}; the commands are {there}; "
             "to start a server, give only flags (--help)"

@@ -65,7 +65,7 @@ def test_one_that_still_runs_is_not_waited_for() -> None:
 
 
 async def test_a_load_test_names_why_there_is_no_server() -> None:
-    args = argparse.Namespace(scene="nowhere", tick_rate=None)
+    args = argparse.Namespace(game=None, scene="nowhere", tick_rate=None)
     with pytest.raises(CannotStartError, match=r"^the server did not start: scene 'nowhere': cannot be read"):
         async with own_server(args):
             pass
