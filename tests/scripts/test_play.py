@@ -250,7 +250,7 @@ class Quiet(Dodge):
 
 
 def test_balls_cars_and_health_are_drawn_and_the_mouse_throws(monkeypatch: pytest.MonkeyPatch) -> None:
-    session = Session(rules=Quiet())
+    session = Session(scene="flat", rules=Quiet())
     window, game, me = session.window, session.match.game.api, session.core.entity
     assert window.keys.names == {"jump": "space", "dash": "left shift", "fire": "left mouse"}
     assert "Left shift: dash    Left mouse: fire" in window.keys.text()
