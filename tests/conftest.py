@@ -10,7 +10,7 @@ import pytest
 from hypothesis import HealthCheck, settings
 
 from shared import kernels
-from tests.lengths import EXAMPLES
+from tests.lengths import EXAMPLES, sampled
 
 SAME = settings(derandomize=True, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.register_profile("short", SAME, max_examples=EXAMPLES // 5)
@@ -32,3 +32,17 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
 def compiled(request: pytest.FixtureRequest) -> bool:
     """Whether the world of this test runs the compiled kernel."""
     return bool(request.param)
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Makes long ones of most variants of a test that has many."""
+    variants: dict[str, list[pytest.Item]] = {}
+    for item in items:
+        if item.get_closest_marker("slow") is None:
+            variants.setdefault(item.nodeid.partition("[")[0], []).append(item)
+    for found in variants.values():
+        kept = sampled(len(found))
+        for place, item in enumerate(found):
+            if place not in kept:
+                item.add_marker("slow")

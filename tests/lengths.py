@@ -6,6 +6,8 @@ from typing import Any
 import pytest
 from hypothesis import settings
 
+VARIANTS = 4
+"""Number of variants of one test in a short run, besides those that are long ones by themselves. A long run has all."""
 EXAMPLES = 100
 """Number of examples of a property test in a long run, unless the test has a number of its own (`examples`)."""
 
@@ -26,3 +28,10 @@ def long_but(short: Collection[Any], every: Iterable[Any]) -> list[Any]:
 def examples(most: int) -> int:
     """Returns the number of examples of a property test: `most` in a long run, a fifth of it in a short one."""
     return most * settings().max_examples // EXAMPLES
+
+
+def sampled(count: int) -> set[int]:
+    """Returns the places of the variants of a test that a short run has: at most `VARIANTS`, evenly spread."""
+    if count <= VARIANTS:
+        return set(range(count))
+    return {round(k * (count - 1) / (VARIANTS - 1)) for k in range(VARIANTS)}

@@ -5,7 +5,6 @@ import os
 import ssl
 from typing import Any
 
-from server.auth import tokens
 from server.auth.identity import Authenticator
 from server.config.options import SettingsError
 from server.config.settings import Settings
@@ -21,6 +20,8 @@ def authenticator(settings: Settings) -> Authenticator | None:
     if settings.auth == "none":
         return None
     if settings.auth == "token":
+        from server.auth import tokens  # its library takes a tenth of a server's start
+
         return tokens.Tokens(tokens.read_key(settings.auth_key_file, os.environ))
     module, _, name = settings.auth.partition(":")
     try:

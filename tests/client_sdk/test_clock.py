@@ -298,6 +298,7 @@ def test_a_change_of_the_path_for_good_is_the_path_after_a_while() -> None:
     assert len(loop.late) <= 12
 
 
+@pytest.mark.slow
 def test_a_long_way_at_a_high_rate_is_learnt_like_any() -> None:
     """The round trip is two seconds at 240 ticks a second, so a stall may take 1,020 inputs."""
     clock = ServerClock()

@@ -196,6 +196,7 @@ async def one_life(
         server.process.send_signal(end)
 
 
+@pytest.mark.slow
 def test_a_clean_stop_leaves_a_checkpoint_and_no_log(tmp_path: Path) -> None:
     data, record, cells, scene = tmp_path / "data", tmp_path / "record", Cells(), load_scene("flat")
     editors = [Editor(cells, scene) for _ in range(BOTS)]
@@ -222,6 +223,7 @@ def test_a_clean_stop_leaves_a_checkpoint_and_no_log(tmp_path: Path) -> None:
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="limits another process's files")
+@pytest.mark.slow
 def test_a_full_disk_refuses_edits_players_move_on_and_saving_resumes(tmp_path: Path) -> None:
     cells, data = Cells(), tmp_path / "data"
     with running("--port", "0", "--scene", "flat", "--data", str(data)) as server:

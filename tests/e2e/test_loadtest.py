@@ -57,6 +57,7 @@ def test_all_clients_play_and_the_figures_are_there(tmp_path: Path) -> None:
     assert "10 of 10 clients got at least 95 % of their snapshots" in done.stdout
 
 
+@pytest.mark.slow
 def test_it_takes_a_server_that_runs_already(tmp_path: Path) -> None:
     out = tmp_path / "out.json"
     with real_server("--scene", "topdown", "--tick-rate", "20") as url:
@@ -68,6 +69,7 @@ def test_it_takes_a_server_that_runs_already(tmp_path: Path) -> None:
     assert figures["resyncs"] == 0
 
 
+@pytest.mark.slow
 def test_a_game_is_played_with_its_behaviours_and_its_bots(tmp_path: Path) -> None:
     out = tmp_path / "out.json"
     game = "sovereign_netcode.examples.dodge:Dodge"

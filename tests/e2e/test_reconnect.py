@@ -45,6 +45,7 @@ def happened(player: Strider, wanted: type[Event]) -> bool:
     return any(isinstance(event, wanted) for event in player.events)
 
 
+@pytest.mark.slow
 def test_a_client_in_a_games_loop_survives_its_server(tmp_path: Path) -> None:
     with server(tmp_path) as (process, url):
         client = Client.connect(url, name="Ann")
@@ -67,6 +68,7 @@ def test_a_client_in_a_games_loop_survives_its_server(tmp_path: Path) -> None:
         client.close()
 
 
+@pytest.mark.slow
 def test_a_client_gives_up_after_its_patience(tmp_path: Path) -> None:
     with server(tmp_path) as (_, url):
         client = Client.connect(url, patience_s=1.0)

@@ -38,6 +38,7 @@ def test_the_folder_of_a_game_is_that_of_its_module(tmp_path: Path, monkeypatch:
 
 
 @pytest.mark.e2e
+@pytest.mark.slow
 def test_a_changed_game_restarts_with_its_players(tmp_path: Path) -> None:
     """A broken version is reported, and the next one starts; the client needs no call besides its loop."""
     game = tmp_path / "mine.py"

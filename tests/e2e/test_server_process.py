@@ -102,6 +102,7 @@ def mute(address: tuple[str, int]) -> Iterator[socket.socket]:
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, *long(signal.SIGINT)])
+@pytest.mark.slow
 def test_a_client_that_does_not_answer_does_not_delay_the_end(number: signal.Signals) -> None:
     with running("--port", "0", "--scene", "flat") as server:
         address = server.address()
@@ -233,6 +234,7 @@ def test_a_signal_that_was_inherited_as_ignored_ends_it(number: signal.Signals) 
 
 
 @pytest.mark.skipif(os.name == "nt", reason="there is no such signal")
+@pytest.mark.slow
 def test_a_terminal_that_closes_ends_it_in_order_and_nohup_keeps_it() -> None:
     with inheriting(signal.SIG_DFL, signal.SIGHUP), running("--port", "0", "--scene", "flat") as server:
         address = server.address()

@@ -130,6 +130,7 @@ def test_the_metadata_says_what_it_is(wheel: Path) -> None:
     assert all(f"sovereign-{name} = sovereign_netcode.commands:" in commands for name in COMMANDS)
 
 
+@pytest.mark.slow
 def test_the_source_distribution_has_what_git_has_and_makes_the_same_wheel(
     built: Path, wheel: Path, tmp_path: Path
 ) -> None:
@@ -233,6 +234,7 @@ def test_the_other_programs(installed: Installed) -> None:
     assert len(programs()) == len([*LOOPS, A_FILE, *ENGINES, *ON_A_SERVER, *ALONE])
 
 
+@pytest.mark.slow
 def test_five_bots(installed: Installed) -> None:
     said = installed.command("sovereign-loadtest", "--clients", "5", "--seconds", "3", "--scene", "flat", "--verdict")
     assert "failed:" not in said

@@ -18,6 +18,7 @@ def test_a_hundred_that_move_are_few_bytes_and_every_tick_of_them_is_exact(motio
 
 
 @pytest.mark.parametrize("rounds", [3, *long(5)])
+@pytest.mark.slow
 def test_nothing_stays_of_clients_entities_and_segments_that_are_gone(rounds: int) -> None:
     tracemalloc.start()
     try:
@@ -28,6 +29,7 @@ def test_nothing_stays_of_clients_entities_and_segments_that_are_gone(rounds: in
     assert all(b - a < 20_000 for a, b in itertools.pairwise(after[1:])), after
 
 
+@pytest.mark.slow
 def test_a_large_world_in_small_has_all_its_entities_and_clients() -> None:
     found = entities.run(300, 4, 1)
     assert (found["entities"], found["clients"]) == (304, 4)

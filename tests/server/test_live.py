@@ -110,6 +110,7 @@ def test_one_answer_serves_all_viewers_for_an_eighth_of_a_second() -> None:
     assert json.loads(answer().body)["figures"]["tick"] == table.tick_number
 
 
+@pytest.mark.slow
 def test_a_crowd_shows_all_players_and_a_sample_of_the_other_entities() -> None:
     table = Table(size=(10, 10, 1), fill=WIDE)
     table.join()

@@ -222,6 +222,7 @@ def test_a_crash_in_the_middle_of_making_up_finds_the_world_before_or_after(
     assert found == hashes[tick]
 
 
+@pytest.mark.slow
 def test_a_file_at_its_limit_finds_room_in_the_old_log(disk: Disk, tmp_path: Path) -> None:
     disk.pages = 24
     store = Store(tmp_path / "data", SCENE)

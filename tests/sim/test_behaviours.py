@@ -236,7 +236,7 @@ def test_an_ability_that_nobody_uses_costs_no_bytes_while_players_walk() -> None
 
 
 @pytest.mark.parametrize(
-    ("preset", "seed"), [("far", 5), ("thin", 5), *long(*((preset, seed) for preset in PRESETS for seed in (6, 7, 8)))]
+    ("preset", "seed"), [("thin", 5), *long(*((preset, seed) for preset in PRESETS for seed in (5, 6, 7, 8)))]
 )
 def test_each_announcement_reaches_its_own_player_once(preset: str, seed: int) -> None:
     """Holds also where an input is late, so that the client predicts the announcement for another tick or not at all.
