@@ -24,6 +24,7 @@ from sovereign_netcode.play.figures import (
     Actor,
     colour_named,
     draw_ghost,
+    font,
     label,
     look_of,
     screen,
@@ -120,6 +121,7 @@ class Window:
         self.chat = Chat(commands or {})
         self._commands = commands_of(self._wanted, commands or {})
         self._keys: tuple[Scene, Keys] | None = None
+        font.cache_clear()  # those of a window before this one, if pygame was ended meanwhile
         self._screen = pygame.display.set_mode(SIZE, pygame.RESIZABLE)
         self._ground, self._hud = Ground(), Hud(LAG_MAX_S)
         self._camera: Point | None = None
