@@ -72,7 +72,7 @@ class Panel:
             return
         stats, found = client.stats, client.diagnosis()
         tone = GREEN if found.verdict == "matched" else CAUSES.get(found.verdict, CAUSES["other entity"])
-        lines: list[tuple[str, Colour]] = [(f"{found.verdict}: {found.reason}", tone)]
+        lines = [(part, tone) for part in wrapped(f"{found.verdict}: {found.reason}")]
         lines += [(part, WHITE) for part in wrapped(found.advice)]
         lines += [(part, CAUSES["late input"]) for text in found.warnings for part in wrapped(text)]
         lines += [(part, FAINT) for text in predicted(client.core.scene) for part in wrapped(text)]
