@@ -180,6 +180,7 @@ def main() -> int:
         print(f"  {sys.executable} -m pip install pytest")
     print(f"  {sys.executable} -m pytest test_{name}.py")
     print(f"  {command('play')} --game {name}:{title}")
+    print(f"  {command('play')} --game {name}:{title} --picture {name}.png")
     print(f"  {command('server')} --game {name}:{title}")
     return 0
 

@@ -26,6 +26,8 @@ GAME = "sovereign_netcode.examples.tag:Tag"
 FRAMES_PER_S = 60
 OTHER_CODE = 3
 """Exit code if the server plays a game with another scene or other behaviours."""
+PICTURE_S = 5.0
+"""Time of play after which `--picture` saves the window, in seconds."""
 AGAIN_S = 0.5
 """Seconds between two attempts to import a changed game."""
 SCRIPT_S = 120.0
@@ -59,6 +61,9 @@ def arguments(argv: list[str] | None = None) -> argparse.Namespace:
         "--option", action="append", default=[], metavar="NAME=VALUE", help="option of the game on the server started"
     )
     parser.add_argument(
+        "--picture", metavar="OUT.png", help="play for some seconds, save a picture, and exit; needs no display"
+    )
+    parser.add_argument(
         "--script-demo", metavar="OUT.png", help="run a scripted session, save a picture, and exit; needs no display"
     )
     return parser.parse_args(argv)
@@ -75,11 +80,11 @@ def main(argv: list[str] | None = None) -> int:
         print(f"error: {error}", file=sys.stderr)
         return 2
     script = Script(options.script_demo) if options.script_demo else None
-    if script:
+    if script or options.picture:
         os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # like Ctrl-C, so that the server and the bots end, too
     try:
-        open_display(unseen=script is not None)
+        open_display(unseen=script is not None or options.picture is not None)
         with contextlib.ExitStack() as stack:
             url = options.url
             if url is None:
@@ -92,7 +97,7 @@ def main(argv: list[str] | None = None) -> int:
             title = "Sovereign Netcode" if options.url else options.game.rpartition(":")[2]
             while True:
                 with Client.connect(url, name=options.name, behaviours=rules.behaviours) as client:
-                    code = play(client, options.lag / 1000, script, title, rules)
+                    code = play(client, options.lag / 1000, script, title, rules, options.picture)
                 if not (options.reload and code == OTHER_CODE):
                     return code
                 rules = reloaded(options.game)
@@ -140,7 +145,9 @@ def open_display(*, unseen: bool) -> None:
         raise RuntimeError(f"no display to open a window on ({found}); --script-demo OUT.png needs none")
 
 
-def play(client: Client, lag_s: float, script: Script | None, title: str, rules: Rules) -> int:
+def play(
+    client: Client, lag_s: float, script: Script | None, title: str, rules: Rules, picture: str | None = None
+) -> int:
     """Plays until the player, the server or the script ends the session. Returns the exit code."""
     pygame.font.init()
     window = Window(client, script or keyboard, title, rules.keys, rules.commands)
@@ -150,6 +157,11 @@ def play(client: Client, lag_s: float, script: Script | None, title: str, rules:
         now = time.monotonic()
         window.frame(now)
         clock.tick(FRAMES_PER_S)
+        if picture and not client.playing:
+            started = now
+        elif picture and now - started > PICTURE_S:
+            window.save(picture)
+            window.over = CLOSED
         if script and now - started > SCRIPT_S:
             window.over = "the script took too long"
     if window.code == WRONG_SCENE:

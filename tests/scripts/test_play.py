@@ -370,3 +370,14 @@ def test_a_crate_is_a_box_of_its_size_in_the_colour_of_its_attribute() -> None:
 @pytest.mark.parametrize("name", ["red", "#12345", "#gggggg", 7, None])
 def test_a_colour_that_is_none_is_ignored(name: object) -> None:
     assert figures.colour_named(name) is None
+
+
+@pytest.mark.e2e
+@pytest.mark.slow
+def test_a_picture_of_any_game_is_saved_without_a_display(tmp_path: Path) -> None:
+    out = tmp_path / "out.png"
+    command = [sys.executable, "-m", "sovereign_netcode.play", "--game", "sovereign_netcode.examples.race:Race"]
+    done = subprocess.run([*command, "--picture", str(out)], cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+    pixels = pygame.surfarray.array3d(pygame.image.load(out)).reshape(-1, 3)
+    assert len(np.unique(pixels, axis=0)) > 200
