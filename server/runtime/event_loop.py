@@ -12,7 +12,7 @@ from pathlib import Path
 from types import FrameType
 from typing import TextIO
 
-COMPILING = "compiling the physics for this machine, which takes 5 to 20 s the first time"
+COMPILING = "compiling the physics for this machine, which takes up to some minutes the first time"
 """Notice that is shown while the kernel is compiled."""
 
 logger = logging.getLogger(__name__)

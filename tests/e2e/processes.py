@@ -22,7 +22,7 @@ from server.runtime.event_loop import COMPILING
 from shared.checks import Vec
 
 ROOT = Path(__file__).resolve().parents[2]
-START_S = 90.0
+START_S = 400.0
 """Seconds until a server is ready. Compiling the kernel for the first time takes long."""
 END_S = 10.0
 RECOVERY_S = 2.0
