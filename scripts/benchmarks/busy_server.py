@@ -22,7 +22,7 @@ import signal
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
-from types import FrameType, FunctionType, ModuleType
+from types import FrameType, FunctionType, ModuleType, SimpleNamespace
 from typing import Any, cast
 
 import msgpack
@@ -58,6 +58,7 @@ class Echo:
     def __init__(self, scene: str, size: int) -> None:
         self.scene = load_scene(scene)
         self.world = World(self.scene)  # for the server's log, which names its kernel
+        self.joining = SimpleNamespace(run=None)  # nobody joins, so nothing is loaded
         self.size = size
         self.faults = FaultReporter()
         self.links: dict[int, tuple[Transport, bool]] = {}
