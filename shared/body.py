@@ -131,7 +131,7 @@ class Body:
     def move(self) -> tuple[int, int]:
         """The direction of this tick's input: east and north, each -127 to 127."""
         x, y = self._input[:2]
-        return layout_move(x), layout_move(y)
+        return _limited(x), _limited(y)
 
     def held(self, button: str) -> bool:
         """Returns whether a button is held in this tick's input."""
@@ -373,6 +373,6 @@ class Body:
         return [world.seen(row) for row in world.rows_in(box, self._row, kind)]
 
 
-def layout_move(part: int) -> int:
+def _limited(part: int) -> int:
     """Returns a part of a direction within -127..127, as the kernel limits it."""
     return min(max(part, -127), 127)

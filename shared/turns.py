@@ -93,17 +93,17 @@ class Turns:
         missing = [entry.name for entry in entries if entry.code is None]
         if missing:
             raise SceneError(f"behaviours = {', '.join(missing)}: the scene needs these classes; pass them")
-        self._bodies: list[Body | None] = []
         made: list[Body] = []
         for entry in entries:
             assert entry.code is not None
             body = body_class(entry, extras.first)(world)
             body.behaviour, body.entry = entry.code(), entry
             made.append(body)
-        self._bodies = [made[k] if k >= 0 else None for k in extras.behaviour_of.tolist()]
+        self._bodies: list[Body | None] = [made[k] if k >= 0 else None for k in extras.behaviour_of.tolist()]
         self._behaves = extras.behaviour_of >= 0
-        self._always = np.array([body is not None and body.behaviour.always for body in self._bodies], np.bool_)
-        """Truth values by template: whether its entities have turns in every tick, [templates]."""
+        self._always = [body is not None and body.behaviour.always for body in self._bodies]
+        """Truth values by template: whether its entities have turns in every tick."""
+        self._always_array = np.array(self._always, np.bool_)
         self.rows: Int64s | None = None
         """Rows of the entities with behaviours, ascending by id; None: to be looked up."""
         self.announced: list[Announcement] = []
@@ -121,18 +121,16 @@ class Turns:
             self.announced, self.vanished, self.steered = [], [], []
         world, bodies = self._world, self._bodies
         aims, wakes, tick = world.extras.aims, world.extras.wakes_at, world.tick + 1
-        made, always = _Changes(inputs), self._always.tolist()
+        made, always = _Changes(inputs), self._always
         for row, state, values in self._candidates(inputs):
             entity = state[ID]
             due = 0 < values[wakes] <= tick
             awake = due or always[state[TEMPLATE]]
             input_ = inputs.get(entity)
-            if input_ is not None:
-                if type(input_) is not Input:
-                    input_ = checked_input(input_, f"inputs[{entity}]")
-                if not awake and input_ == NEUTRAL and rests(state) and not (aims and any(values[:3])):
-                    continue
-            elif not awake and rests(state) and not (aims and any(values[:3])):
+            if input_ is not None and type(input_) is not Input:
+                input_ = checked_input(input_, f"inputs[{entity}]")
+            neutral = input_ is None or input_ == NEUTRAL
+            if neutral and not awake and rests(state) and not (aims and any(values[:3])):
                 continue
             body = bodies[state[TEMPLATE]]
             assert body is not None
@@ -211,7 +209,7 @@ class Turns:
             (states[:, VX:CELL] != 0).any(axis=1)
             | (states[:, FLAGS] & FALLING != 0)
             | ((wakes > 0) & (wakes <= world.tick + 1))
-            | self._always[states[:, TEMPLATE]]
+            | self._always_array[states[:, TEMPLATE]]
         )
         if world.extras.aims:
             active |= (world.extra_rows[rows, :3] != 0).any(axis=1)

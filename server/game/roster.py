@@ -175,7 +175,7 @@ class Roster:
     def revive(self) -> None:
         """Puts the entities that fell out in the last tick at spawn points, unless the rules deal with them.
 
-        What a behaviour has spawned is removed instead.
+        An entity that a behaviour has spawned is removed instead.
         """
         for entity in self._fallen:
             if entity in self._world and not self._api.hooks.fell_out(entity):

@@ -1,4 +1,4 @@
-"""Kinds of blocks with a name: those that are not solid stop nothing, support nothing and are in nobody's way."""
+"""Kinds of blocks with a name: those that are not solid stop and support nothing, and block no place."""
 
 import itertools
 import random

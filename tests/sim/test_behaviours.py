@@ -241,7 +241,7 @@ def test_an_ability_that_nobody_uses_costs_no_bytes_while_players_walk() -> None
 def test_each_announcement_reaches_its_own_player_once(preset: str, seed: int) -> None:
     """Holds also where an input is late, so that the client predicts the announcement for another tick or not at all.
 
-    Those of the last seconds are left out of the count: they may be on their way.
+    The count leaves out the announcements of the last seconds, which may be on their way.
     """
     match = joined(Playground(), PRESETS[preset], *(Presser() for _ in range(4)), seed=seed)
     announced: list[tuple[int, int, str]] = []
