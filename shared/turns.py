@@ -106,6 +106,7 @@ class Turns:
         self._always_array = np.array(self._always, np.bool_)
         self.rows: Int64s | None = None
         """Rows of the entities with behaviours, ascending by id; None: to be looked up."""
+        self._few: list[int] | None = None  # the same as a list, if there are few
         self.announced: list[Announcement] = []
         """Announcements of the latest step."""
         self.vanished: list[int] = []
@@ -121,7 +122,8 @@ class Turns:
             self.announced, self.vanished, self.steered = [], [], []
         world, bodies = self._world, self._bodies
         aims, wakes, tick = world.extras.aims, world.extras.wakes_at, world.tick + 1
-        made, always = _Changes(inputs), self._always
+        always = self._always
+        made: _Changes | None = None
         for row, state, values in self._candidates(inputs):
             entity = state[ID]
             due = 0 < values[wakes] <= tick
@@ -145,15 +147,16 @@ class Turns:
                 if due:
                     body.set_column(wakes, 0)
             if body.changes:
+                made = made or _Changes(inputs)
                 self._collect(made, row, body)
-        return self._apply(made)
+        return self._apply(made) if made is not None else inputs
 
     def _candidates(self, inputs: Mapping[int, Input]) -> Iterable[tuple[int, list[int], list[int]]]:
         """Returns row, state and extra columns of the entities that may be active, ascending by id."""
         world, rows = self._world, self._found()
         entities, more = world.entity_rows, world.extra_rows
-        if len(rows) <= FEW:
-            return [(row, entities[row].tolist(), more[row].tolist()) for row in rows.tolist()]
+        if self._few is not None:
+            return [(row, entities[row].tolist(), more[row].tolist()) for row in self._few]
         rows = rows[self._active(rows, inputs)]
         return zip(rows.tolist(), entities[rows].tolist(), more[rows].tolist(), strict=True)
 
@@ -199,6 +202,7 @@ class Turns:
         if self.rows is None:
             rows = self._world.ordered_rows()
             self.rows = rows[self._behaves[self._world.entity_rows[rows, TEMPLATE]]]
+            self._few = self.rows.tolist() if len(self.rows) <= FEW else None
         return self.rows
 
     def _active(self, rows: Int64s, inputs: Mapping[int, Input]) -> npt.NDArray[np.bool_]:
