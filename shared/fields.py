@@ -5,6 +5,7 @@ A check returns whether a value that a peer sent is of the right type and within
 """
 
 import math
+import re
 from collections.abc import Callable
 from typing import Any
 
@@ -41,6 +42,12 @@ SEGMENTS_MAX = 1024
 """Limit of the segments in one snapshot."""
 TOKEN_MAX = 2048
 """Longest token, in characters."""
+PATH_MAX = 1024
+"""Longest path of a world on its server, with a reserved seat, in characters."""
+CODE_MAX = 16
+"""Longest code of a private world, in characters."""
+SEATS_MAX = 64
+"""Limit of the seats that one client reserves."""
 RESUME_BYTES = 16
 """Length of a resume token, in bytes."""
 LIST_MAX = 8 * 1024
@@ -56,6 +63,8 @@ FIRST_MAX = TICK_MAX - INPUT_ROWS_MAX
 """Greatest first tick of an `Inputs` message."""
 ENTITY_MAX = (1 << 31) - 1
 """Greatest number of an entity."""
+
+_PATH = re.compile(r"[!-~]+")
 
 Check = Callable[[Any], bool]
 """Function that returns whether a value is allowed in a field."""
@@ -80,7 +89,9 @@ tick, first, index = _whole(-1, TICK_MAX), _whole(0, FIRST_MAX), _whole(0, TICK_
 segment, offset, total = _whole(-(1 << 23), (1 << 23) - 1), _whole(0, PACKED_MAX), _whole(1, PACKED_MAX)
 """Checks: index of a segment along an axis, place within a packed segment, length of a packed segment."""
 name, token, reason = _text(NAME_MAX), _text(TOKEN_MAX), _text(REASON_MAX)
-"""Checks: name, identity token, reason in a `Bye` or a `Refusal`."""
+"""Checks: name, identity token, reason in a `Bye`, a `Refusal` or a `Go`."""
+world_code = _text(CODE_MAX)
+"""Check of the code of a private world; empty: none."""
 rows = _bytes(INPUT_ROWS_MAX * AIM_ROW_BYTES, INPUT_ROW_BYTES)
 """Check of packed inputs, for scenes with and without aim; `whole_rows` checks the rest."""
 payload, chunk = _bytes(PAYLOAD_MAX), _bytes(PACKED_MAX)
@@ -109,6 +120,16 @@ def table(value: Any) -> bool:
 def names(value: Any) -> bool:
     """Returns whether a value is a table whose keys are texts."""
     return type(value) is dict and all(type(name) is str for name in value)
+
+
+def path(value: Any) -> bool:
+    """Returns whether a value is a path with a query, as it stands in an HTTP request."""
+    return type(value) is str and len(value) <= PATH_MAX and value[:1] == "/" and _PATH.fullmatch(value) is not None
+
+
+def paths(value: Any) -> bool:
+    """Returns whether a value is a list of paths of worlds."""
+    return type(value) is list and len(value) <= SEATS_MAX and all(map(path, value))
 
 
 def resume(value: Any) -> bool:

@@ -1,4 +1,4 @@
-"""The messages of a server with which the rules of a game reach its clients. `shared.messages` lists all messages."""
+"""The messages of a server about its games and its worlds. `shared.messages` lists all messages."""
 
 from typing import Any, NamedTuple
 
@@ -43,3 +43,23 @@ class Private(NamedTuple):
     """All values of the game that only this player gets, by name."""
 
     values: dict[str, Any]
+
+
+class Go(NamedTuple):
+    """A request to connect to another path of this server, and to join the world there as a new player.
+
+    `path` is the path of a WebSocket request, with a reserved seat if there is one. `code` is the code of a private
+    world, or empty. `seats` has the paths of the seats that were reserved for the client's friends. `reason` says why
+    the client goes.
+    """
+
+    path: str
+    code: str
+    seats: list[str]
+    reason: str
+
+
+class Waiting(NamedTuple):
+    """Progress while a client waits for a world; the payload is a MessagePack table."""
+
+    payload: bytes

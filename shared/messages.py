@@ -15,6 +15,8 @@ packed little-endian records in a MessagePack `bin`. docs/protocol.md explains e
                                                            24 Announce  tick entity name payload
                                                            25 Refusal   number reason
                                                            26 Private   values
+                                                           27 Go        path code seats reason
+                                                           28 Waiting   payload
                                                             4 Bye       code reason wait
 
     Inputs.rows    n * [i8 move_x, i8 move_y, u8 buttons], for the ticks first, first + 1, ...; in a scene with aim
@@ -38,6 +40,8 @@ packed little-endian records in a MessagePack `bin`. docs/protocol.md explains e
     Shared         all shared values of the game by name, each time: a score, for example.
     Private        all values of the game that only this player gets, each time.
     Refusal        a reason for the verdict FORBIDDEN; it comes ahead of the snapshot with that verdict.
+    Go             asks the client to join another world: a match that was found, or where the rules send the player.
+    Waiting        progress while a client waits for a world.
     Ping           `corrections`: number of corrections of the client's prediction so far, for the operator.
     Pong.tick      the server time in ticks when it answered: 17.25 is a quarter of a tick after tick 17.
 
@@ -63,11 +67,13 @@ from shared.fields import (
     whole_rows,
 )
 from shared.game_messages import Announce as Announce
+from shared.game_messages import Go as Go
 from shared.game_messages import Happened as Happened
 from shared.game_messages import NextHappened as NextHappened
 from shared.game_messages import Private as Private
 from shared.game_messages import Refusal as Refusal
 from shared.game_messages import Shared as Shared
+from shared.game_messages import Waiting as Waiting
 
 VERSION = 3
 """Version of the protocol; both sides must have the same one."""
@@ -231,6 +237,8 @@ Message = (
     | Announce
     | Refusal
     | Private
+    | Go
+    | Waiting
 )
 KINDS: dict[int, tuple[type[Any], tuple[fields.Check, ...]]] = {
     1: (Hello, (fields.version, fields.digests, fields.name, fields.token, fields.resume)),
@@ -253,12 +261,14 @@ KINDS: dict[int, tuple[type[Any], tuple[fields.Check, ...]]] = {
     24: (Announce, (fields.tick, fields.entity, fields.name, fields.payload)),
     25: (Refusal, (fields.count, fields.reason)),
     26: (Private, (fields.names,)),
+    27: (Go, (fields.path, fields.world_code, fields.paths, fields.reason)),
+    28: (Waiting, (fields.payload,)),
 }
 """Message class and checks of the fields, by the number of the kind. A snapshot's last field has no check here:
 `shared.snapshot` checks the segments."""
 CLIENT_KINDS = frozenset({1, 2, 3, 4, 5, 6, 7})
 """Kinds of messages that a client may send."""
-SERVER_KINDS = frozenset({4, 17, 18, 19, 20, 21, 22, 23, 24, 25, 26})
+SERVER_KINDS = frozenset({4, 17, 18, 19, 20, 21, 22, 23, 24, 25, 26, 27, 28})
 """Kinds of messages that a server may send."""
 _KIND_OF = {kind: number for number, (kind, _) in KINDS.items()}
 _INPUTS_HEAD = bytes((0x94, _KIND_OF[Inputs]))

@@ -20,6 +20,7 @@ from shared.messages import (
     Announce,
     Bye,
     Command,
+    Go,
     Happened,
     Hello,
     Inputs,
@@ -35,6 +36,7 @@ from shared.messages import (
     Shared,
     Snapshot,
     Terrain,
+    Waiting,
     Welcome,
     decode_from_client,
     decode_from_server,
@@ -83,6 +85,9 @@ FROM_SERVER: list[Message] = [
     NextHappened(TICK_MAX),
     Refusal((1 << 32) - 1, "é" * 500),
     Private({"role": "spy"}),
+    Go("/arena-k7f3?seat=abc.def", "K7F3QD", ["/arena-k7f3?seat=ghi", "/" + "s" * 1023], "é" * 500),
+    Go("/", "", [], ""),
+    Waiting(bytes(1024)),
 ]
 
 
@@ -157,6 +162,11 @@ OUT_OF_BOUNDS: list[tuple[Message, str, list[Any]]] = [
     (Refusal(0, ""), "number", [-1, 1 << 32, 1.0, None]),
     (Refusal(0, ""), "reason", ["r" * 501, None, b""]),
     (Private({}), "values", [[], {1: 2}, None]),
+    (Go("/", "", [], ""), "path", ["", "arena", "ws://else", "/a b", "/a\n", "/ä", "/" + "s" * 1024, b"/", None]),
+    (Go("/", "", [], ""), "code", ["c" * 17, None, b""]),
+    (Go("/", "", [], ""), "seats", [["/"] * 65, ["else"], [None], "/", None]),
+    (Go("/", "", [], ""), "reason", ["r" * 501, None]),
+    (Waiting(b""), "payload", [bytes(1025), "text", None]),
     (NextHappened(0), "number", [-1, TICK_MAX + 1, 1.0, None]),
     (Shared({}), "values", [[], None, {b"name": 1}, {str(i): 0 for i in range(65)}]),
     (BLANK, "tick", [-2, TICK_MAX + 1, None]),
