@@ -78,7 +78,7 @@ class AsyncClient(BaseClient):
         self._due = 0.0
         self._state = self.core.state
         self._events = PendingEvents()
-        self._news = asyncio.Event()
+        self._arrived = asyncio.Event()
         self._answered: asyncio.Future[None] = self._loop.create_future()
         self._gone: asyncio.Future[None] = self._loop.create_future()
 
@@ -154,8 +154,8 @@ class AsyncClient(BaseClient):
         while not self._events:
             if self.core.state == "closed":
                 raise StopAsyncIteration
-            self._news.clear()
-            await self._news.wait()
+            self._arrived.clear()
+            await self._arrived.wait()
         return self._events.next()
 
     async def __aenter__(self) -> "AsyncClient":
@@ -272,7 +272,7 @@ class AsyncClient(BaseClient):
             self._transport.write(data)
         for event in core.events():
             self._events.append(event)
-            self._news.set()
+            self._arrived.set()
         if not self._answered.done():
             if connection.refused is not None:
                 self._answered.set_exception(connection.refused)

@@ -303,7 +303,7 @@ class Core:
             case messages.Happened():
                 self._game_events.happened(message, hold=self._joins)
             case messages.Announce():
-                self._game_events.happened(message, hold=self._joins, known=self._worlds.announced(message))
+                self._game_events.happened(message, hold=self._joins, announced=self._worlds.announced(message))
             case messages.Refusal():
                 self._commands.refused(message)
             case messages.NextHappened():

@@ -111,7 +111,7 @@ class InputLoop:
         """
         self._step += ticks
         self._settling = now
-        self.world.picture.interpolation.shift(ticks)
+        self.world.view_builder.interpolation.shift(ticks)
 
     def follow(self, now: float, *, online: bool) -> list[Message]:
         """Follows the steps of the server's time since the last call. Returns the messages to send before any ping."""
@@ -150,7 +150,7 @@ class InputLoop:
         alarm = False
         if online:
             alarm = self._reconcile(now)
-            shown = world.picture.advance(server_tick, now)
+            shown = world.view_builder.advance(server_tick, now)
             if not self._draws:
                 self.seen = shown
         messages = self._predict(now, controls)
@@ -185,7 +185,7 @@ class InputLoop:
 
     def view(self, now: float) -> View:
         """Returns what to draw now."""
-        view = self.world.picture.view(self.timeline, self.world.clock, now)
+        view = self.world.view_builder.view(self.timeline, self.world.clock, now)
         self._draws, self.seen = True, view.seen
         return view
 
@@ -260,7 +260,7 @@ class InputLoop:
         if done is not NOTHING:
             stats.replayed_ticks += done.replayed
             stats.repredictions += done.repredicted
-            world.picture.smooth(done, now)
+            world.view_builder.smooth(done, now)
             if done.correction:
                 stats.corrected(done.correction)
                 self._events.append(done.correction)

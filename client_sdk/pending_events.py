@@ -80,19 +80,19 @@ class GameEvents:
         self._count = 0
         """Number of events that have arrived, or are known to be lost."""
 
-    def happened(self, message: messages.Happened | messages.Announce, *, hold: bool, known: bool = False) -> None:
+    def happened(self, message: messages.Happened | messages.Announce, *, hold: bool, announced: bool = False) -> None:
         """Takes one event.
 
         Args:
             message: the event.
             hold: whether to hold it back until `release`.
-            known: whether the program has got it already, ahead of the server; then it is only counted.
+            announced: whether the program has got it already, ahead of the server; then it is only counted.
 
         Raises:
             ProtocolError: its payload is malformed.
         """
         self._count += 1
-        if known:
+        if announced:
             return
         data = payloads.unpack_value(message.payload)
         if isinstance(message, messages.Announce):

@@ -1,10 +1,10 @@
 """The replica: everything that a client knows of one server since the welcome.
 
 Theory of operation. A replica joins the confirmed world, which snapshots and terrain write; the prediction on top of
-it; the picture, which makes views of both; and the clock, which estimates the server's time. After a lost connection,
-the client keeps playing in the old replica while the messages of the new connection fill a second one. Once the second
-is complete (`complete`), it takes over the inputs and edits of the first (`take_over`). Both share one clock if the new
-welcome agrees with it within `CLOCK_S` seconds: then the client's timeline goes on.
+it; the view builder, which makes views of both; and the clock, which estimates the server's time. After a lost
+connection, the client keeps playing in the old replica while the messages of the new connection fill a second one. Once
+the second is complete (`complete`), it takes over the inputs and edits of the first (`take_over`). Both share one clock
+if the new welcome agrees with it within `CLOCK_S` seconds: then the client's timeline goes on.
 """
 
 from collections.abc import Sequence
@@ -27,7 +27,7 @@ restarted or stood still, and the client starts a new clock."""
 
 
 class Replica:
-    """A copy of the server's world, which messages fill, with its prediction, its picture and its clock.
+    """A copy of the server's world, which messages fill, with its prediction, its view builder and its clock.
 
     Args:
         welcome: the message that the connection began with.
@@ -57,7 +57,7 @@ class Replica:
         self.scene = check_scene(welcome.scene).bound(behaviours)
         self.confirmed = Confirmed(self.scene, welcome.entity, compiled=compiled)
         self.prediction = Prediction(self.confirmed, controls, neighbours=neighbours)
-        self.picture = ViewBuilder(self.scene, self.prediction)
+        self.view_builder = ViewBuilder(self.scene, self.prediction)
         self.clock = clock
         if clock.rate == 0 or abs(clock.tick(now) - welcome.tick) > CLOCK_S * self.scene.tick_rate:
             self.clock = ServerClock()
@@ -125,7 +125,7 @@ class Replica:
         self.wrong = self.confirmed.apply(snapshot) or self.wrong
         self.prediction.learn()
         placed = self.confirmed.placed.get(snapshot.tick)
-        self.picture.interpolation.push(snapshot.tick, self.confirmed.states, placed or frozenset())
+        self.view_builder.interpolation.push(snapshot.tick, self.confirmed.states, placed or frozenset())
 
     def take_over(self, old: "Replica") -> bool:
         """Takes the place of an earlier replica, and its inputs and edits if the own entity is the same.

@@ -94,8 +94,8 @@ class ViewBuilder:
         if not done.replayed:
             return
         if self._smoothing:
-            known = self._prediction.predicted
-            self._smoothing = {entity: old for entity, old in self._smoothing.items() if entity in known}
+            predicted = self._prediction.predicted
+            self._smoothing = {entity: old for entity, old in self._smoothing.items() if entity in predicted}
         for entity, offset in done.offsets.items():
             if entity not in done.acted:
                 self._smoothing.setdefault(entity, Smoothing()).add(offset, now)

@@ -188,7 +188,7 @@ class TickEncoder:
             self._allocate(len(w.changed))
         mine = self._ids, self._parts, self._due, self._packed
         n_parts = self._world.kernel.news(w.entities, w.changed, w.lengths, tick, self._check_ticks, *mine)
-        shares: list[SegmentDelta] = []
+        deltas: list[SegmentDelta] = []
         start = at = 0
         parts = self._parts[:n_parts].tolist()
         for i in range(0, n_parts, 8):
@@ -201,10 +201,10 @@ class TickEncoder:
                     self._packed[tails + row * ROW_BYTES + FLAGS_AT] |= ACTED
             packed = self._packed[at:stop].tobytes()
             fields = packed[: heads - at], packed[heads - at : tails - at], packed[tails - at :]
-            shares.append(SegmentDelta((x, y, z), ids, ids[whole - start :], fields))
+            deltas.append(SegmentDelta((x, y, z), ids, ids[whole - start :], fields))
             start, at = end, stop
         due = self._due[1 : 1 + self._due[0]].tolist()
-        return shares, {(due[i], due[i + 1], due[i + 2]) for i in range(0, len(due), 3)}
+        return deltas, {(due[i], due[i + 1], due[i + 2]) for i in range(0, len(due), 3)}
 
     def _allocate(self, room: int) -> None:
         """Makes room for `room` entities."""
@@ -241,24 +241,24 @@ def encode_part(
         attributes: id, attributes, id, attributes, ...
         fields: records of extra columns (`shared.extras`).
     """
-    news = b"", b"", encode_rows(rows, acted, placed)
-    return join_part(segment, ago, news, gone, edits, check, attributes, fields)
+    packed = b"", b"", encode_rows(rows, acted, placed)
+    return join_part(segment, ago, packed, gone, edits, check, attributes, fields)
 
 
 def join_part(
     segment: Cell,
     ago: int,
-    news: tuple[bytes, bytes, bytes],
+    packed: tuple[bytes, bytes, bytes],
     gone: Sequence[int] = (),
     edits: Sequence[tuple[int, int]] = (),
     check: int = 0,
     attributes: Sequence[Any] = (),
     extra: bytes = b"",
 ) -> bytes:
-    """Returns a segment's part like `encode_part`, from `news`: heads, tails and rows that are packed already."""
+    """Returns a segment's part like `encode_part`, from `packed`: its heads, tails and rows."""
     packed_gone = np.array(gone, "<u4").tobytes() if gone else b""
     packed_edits = np.array(edits, EDIT).tobytes() if edits else b""
-    fields = [*news, packed_gone, check, packed_edits, attributes, extra]
+    fields = [*packed, packed_gone, check, packed_edits, attributes, extra]
     while fields and not fields[-1]:
         del fields[-1]
     return pack((*segment, ago, *fields))
@@ -302,9 +302,9 @@ def decode_parts(
     if not segments:
         return [], NO_STATES, NO_TURNS
     corners: list[int] = []
-    news: tuple[list[bytes], list[bytes], list[bytes]] = ([], [], [])
-    parts = [_decode_part(segment, corners, news) for segment in segments]
-    heads, tails, rows = map(b"".join, news)
+    packed: tuple[list[bytes], list[bytes], list[bytes]] = ([], [], [])
+    parts = [_decode_part(segment, corners, packed) for segment in segments]
+    heads, tails, rows = map(b"".join, packed)
     kernel = kernel or kernels.get(False)
     states = _decode_rows(rows, corners, templates, kernel) if rows else NO_STATES
     return parts, states, _decode_turns(heads, tails, kernel) if heads or tails else NO_TURNS
@@ -325,10 +325,10 @@ def _decode_turns(heads: bytes, tails: bytes, kernel: Kernel) -> Int64s:
     return turns
 
 
-def _decode_part(part: Any, corners: list[int], news: tuple[list[bytes], ...]) -> DecodedDelta:
+def _decode_part(part: Any, corners: list[int], packed: tuple[list[bytes], ...]) -> DecodedDelta:
     """Checks and returns one part.
 
-    Appends its low corner (grid steps) and its number of rows to `corners`, and its heads, tails and rows to `news`.
+    Appends its low corner (grid steps) and its number of rows to `corners`, and its heads, tails and rows to `packed`.
     """
     if type(part) is not list or not 4 <= len(part) <= 12:
         raise ProtocolError("segment: must be a list of 4 to 12 fields")
@@ -349,7 +349,7 @@ def _decode_part(part: Any, corners: list[int], news: tuple[list[bytes], ...]) -
         )
     if heads and ago != 1:
         raise ProtocolError(f"segment.heads: not allowed with ago = {ago}, only with 1")
-    all_heads, all_tails, all_rows = news
+    all_heads, all_tails, all_rows = packed
     all_heads.append(heads)
     all_tails.append(tails)
     all_rows.append(rows)
@@ -357,19 +357,19 @@ def _decode_part(part: Any, corners: list[int], news: tuple[list[bytes], ...]) -
     if edits and int(edited["block"].max()) >= SEGMENT**3:
         raise ProtocolError("segment.edits: a block is out of range")
     left = np.frombuffer(gone, "<u4").tolist() if gone else []
-    said = _decode_attributes(attributes) if attributes != [] else []
+    tables = _decode_attributes(attributes) if attributes != [] else []
     entities = len(rows) // ROW_BYTES
     corners += (x * SIDE, y * SIDE, z * SIDE, entities)
-    return DecodedDelta((x, y, z), ago, entities, left, edited, check, said, fields)
+    return DecodedDelta((x, y, z), ago, entities, left, edited, check, tables, fields)
 
 
 def _decode_attributes(attributes: Any) -> list[tuple[int, dict[str, Any]]]:
     if type(attributes) is not list or len(attributes) % 2:
         raise ProtocolError("segment.attributes: must be a list of pairs of entity and table")
-    said = list(zip(attributes[::2], attributes[1::2], strict=True))
-    for entity, values in said:
+    tables = list(zip(attributes[::2], attributes[1::2], strict=True))
+    for entity, values in tables:
         if type(entity) is not int or not 0 < entity <= ENTITY_MAX:
             raise ProtocolError(f"segment.attributes: entity {shown(entity)}: not allowed")
         if type(values) is not dict or any(type(name) is not str for name in values):
             raise ProtocolError(f"segment.attributes of entity {entity}: not allowed")
-    return said
+    return tables

@@ -79,9 +79,9 @@ class Announcements:
 
     def add(self, tick: int, event: Announcement) -> None:
         """Takes an announcement of the tick that was just predicted or replayed."""
-        known = self._taken(self._before, tick, event) or self._taken(self._early, tick, event)
-        number = known.number if known is not None else self._count + 1
-        if known is None:
+        earlier = self._taken(self._before, tick, event) or self._taken(self._early, tick, event)
+        number = earlier.number if earlier is not None else self._count + 1
+        if earlier is None:
             self._count = number
             data = unpack_value(event.payload)
             self.events.append(Announced(tick, event.entity, event.name, data, number))
@@ -93,11 +93,11 @@ class Announcements:
         oldest = tick - KEPT_S * self._rate
         self._given = [each for each in self._given if each.tick > oldest]
         self._early = [each for each in self._early if each.tick > oldest]
-        known = self._taken(self._given, tick, event)
-        if known is None:
+        earlier = self._taken(self._given, tick, event)
+        if earlier is None:
             self._early.append(Pending(tick, 0, event))
             return False
-        self._certain.add(known.number)
+        self._certain.add(earlier.number)
         return True
 
     def take(self) -> list[Announced | Withdrawn]:

@@ -93,7 +93,7 @@ class Confirmed:
             if len(part.edits):
                 self._edit(part)
             if part.attributes:
-                self.attributes.update((entity, said) for entity, said in part.attributes if entity in world)
+                self.attributes.update((entity, values) for entity, values in part.attributes if entity in world)
         for segment in drops:
             if segment == self._coming:
                 self._coming = None

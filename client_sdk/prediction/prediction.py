@@ -75,29 +75,29 @@ class Prediction:
     """The confirmed and the predicted world of one client.
 
     Args:
-        known: the confirmed world, which snapshots write.
+        confirmed_copy: the confirmed copy, which snapshots write.
         controls: where the input delay is set.
         neighbours: whether the predicted world has other entities, so that blocking each other is predicted; otherwise
             it has the own entity only.
     """
 
-    def __init__(self, known: Confirmed, controls: Controls | None = None, *, neighbours: bool = True) -> None:
-        self.known = known
-        self.entity = known.entity
+    def __init__(self, confirmed_copy: Confirmed, controls: Controls | None = None, *, neighbours: bool = True) -> None:
+        self.confirmed_copy = confirmed_copy
+        self.entity = confirmed_copy.entity
         self.neighbours = neighbours
-        scene = known.world.scene
+        scene = confirmed_copy.world.scene
         self.last_own = self.entity + scene.extras.blocks[scene.template(scene.player)]
         """Greatest number of an entity that the own one may have spawned; they follow its own number."""
         self._controls = controls or Controls()
-        self.confirmed = known.world
-        self.predicted = World(known.world.scene, compiled=known.world.compiled)
-        self.attributes = known.attributes
+        self.confirmed = confirmed_copy.world
+        self.predicted = World(confirmed_copy.world.scene, compiled=confirmed_copy.world.compiled)
+        self.attributes = confirmed_copy.attributes
         """Attributes of the entities that the client sees, by entity and name."""
         self.begun = False
-        limits = self._bounds = bounds(known.world.scene.tick_rate)
+        limits = self._bounds = bounds(confirmed_copy.world.scene.tick_rate)
         self._inputs: Ring[Input] = Ring(limits.predicted)
         self._states: Ring[Int64s] = Ring(limits.predicted)
-        templates = known.world.scene.templates
+        templates = confirmed_copy.world.scene.templates
         self._shown_ahead = np.array([template.shown == "predicted" for template in templates], np.int64)
         self.announcements = Announcements(scene.tick_rate)
         """The announcements of the own entity, for the program."""
@@ -190,11 +190,11 @@ class Prediction:
         Args:
             late: whether the server lacked an input in time for a tick since the last comparison.
         """
-        known, tick = self.known, self.confirmed.tick
+        confirmed_copy, tick = self.confirmed_copy, self.confirmed.tick
         if tick == self._compared:
             return NOTHING
         skipped = tick - self._compared > 1
-        acted = known.take_acted()
+        acted = confirmed_copy.take_acted()
         placed = self._placed(self._compared, tick)
         self._compared = tick
         if not self.begun:
@@ -202,20 +202,20 @@ class Prediction:
         if tick > self.predicted.tick:  # the snapshot overtook the prediction: nothing to compare
             self._replay(tick)
             return Reconciled(None, False, 0, {}, acted, placed) if placed else NOTHING
-        guess, truth = self._states.get(tick), self._truth()
-        changed = known.terrain_changed or self._refused
-        if guess is not None and not changed and self._near_equal(guess, truth):
+        predicted_states, confirmed_states = self._states.get(tick), self._confirmed_states()
+        changed = confirmed_copy.terrain_changed or self._refused
+        if predicted_states is not None and not changed and self._near_equal(predicted_states, confirmed_states):
             return NOTHING
         correction = None
-        if guess is not None and (mine := self._difference(guess, truth)):
+        if predicted_states is not None and (mine := self._difference(predicted_states, confirmed_states)):
             others = len(self.confirmed) > 1
             causes = (
                 (late, "late input"),
                 (self.entity in acted, "server act"),
-                (known.edited_near, "unknown edit"),
+                (confirmed_copy.edited_near, "unknown edit"),
                 (others and (skipped or not self.neighbours), "other entity"),
-                (others and self._others_differ(guess, truth), "other entity"),
-                (not known.grounded(), "missing terrain"),
+                (others and self._others_differ(predicted_states, confirmed_states), "other entity"),
+                (not confirmed_copy.grounded(), "missing terrain"),
             )
             cause = next((cause for holds, cause in causes if holds), NONDETERMINISM)
             correction = Corrected(tick, *mine, self.predicted.tick - tick, cause)
@@ -259,8 +259,8 @@ class Prediction:
 
     def _placed(self, since: int, to: int) -> frozenset[int]:
         """Returns the entities that the server's rules placed after the tick `since`, up to `to`."""
-        ticks = range(max(since, to - self.known.follow_max) + 1, to + 1)
-        return frozenset().union(*(ids for tick in ticks if (ids := self.known.placed.get(tick))))
+        ticks = range(max(since, to - self.confirmed_copy.follow_max) + 1, to + 1)
+        return frozenset().union(*(ids for tick in ticks if (ids := self.confirmed_copy.placed.get(tick))))
 
     def _state(self, entity: int, tick: int) -> State | None:
         """Returns the kept state of an entity at the end of a tick; None if none is kept."""
@@ -277,13 +277,13 @@ class Prediction:
             The first tick whose states differ, with its states before and after; None: there is none.
         """
         ticks = range(self.confirmed.tick + 1, self.predicted.tick + 1)
-        guess = self._states.get(self.confirmed.tick)
-        known = (
-            guess is not None  # and nothing is new, and nothing far away, that a replay would correct
-            and not (self.known.terrain_changed or self._refused)
-            and guess.tobytes() == self._truth().tobytes()
+        predicted_states = self._states.get(self.confirmed.tick)
+        comparable = (
+            predicted_states is not None  # and nothing is new, and nothing far away, that a replay would correct
+            and not (self.confirmed_copy.terrain_changed or self._refused)
+            and predicted_states.tobytes() == self._confirmed_states().tobytes()
         )
-        before = [(tick, self._states.get(tick)) for tick in ticks] if known else []
+        before = [(tick, self._states.get(tick)) for tick in ticks] if comparable else []
         self._replay(self.predicted.tick)
         for tick, was in before:
             now = self._states.get(tick)
@@ -291,8 +291,8 @@ class Prediction:
                 return tick, was, now
         return None
 
-    def _truth(self) -> Int64s:
-        states = self.known.states
+    def _confirmed_states(self) -> Int64s:
+        states = self.confirmed_copy.states
         return states if self.neighbours else states[self._mine(states[:, ID])]
 
     def _replay(self, to: int) -> None:
@@ -303,12 +303,12 @@ class Prediction:
         if self._failed:
             self._failed = {failed for failed in self._failed if failed[0] > tick}
         self.predicted.restore(self.confirmed)
-        self.known.terrain_changed = self.known.edited_near = self._refused = False
+        self.confirmed_copy.terrain_changed = self.confirmed_copy.edited_near = self._refused = False
         if not self.neighbours:
             ids = self.predicted.states()[:, ID]
             for entity in ids[~self._mine(ids)].tolist():
                 self.predicted.forget(entity)
-        self._states.put(self.confirmed.tick, self._truth())
+        self._states.put(self.confirmed.tick, self._confirmed_states())
         while self.predicted.tick < to:
             self.step()
         self.announcements.end()
@@ -317,8 +317,8 @@ class Prediction:
         """Learns from a snapshot which announcements are final. Call it after each, also if more are about to come."""
         if not self.announcements.pending or self._acts_differ:
             return
-        guess = self._states.get(self.confirmed.tick)
-        if guess is not None and self._acts(guess) != self._acts(self._truth()):
+        predicted_states = self._states.get(self.confirmed.tick)
+        if predicted_states is not None and self._acts(predicted_states) != self._acts(self._confirmed_states()):
             self._acts_differ = True
         else:
             self.announcements.confirm(self.confirmed.tick)
@@ -331,15 +331,15 @@ class Prediction:
         acts: list[list[int]] = states[self._mine(states[:, ID])][:, (ID, CELL + extras.acts)].tolist()
         return acts
 
-    def _near_equal(self, guess: Int64s, truth: Int64s) -> bool:
+    def _near_equal(self, predicted_states: Int64s, confirmed_states: Int64s) -> bool:
         """Returns whether all entities are as predicted that could meet the own one, or are drawn as predicted."""
-        if guess.tobytes() == truth.tobytes():
+        if predicted_states.tobytes() == confirmed_states.tobytes():
             return True
         if self.confirmed.extras.count:
-            return bool(np.array_equal(self._counting(guess), self._counting(truth)))
+            return bool(np.array_equal(self._counting(predicted_states), self._counting(confirmed_states)))
         kernel, reach = self.confirmed.kernel, MEET_BLOCKS * BLOCK
-        a, b, always = map(kernel.lent, (guess, truth, self._shown_ahead))
-        return bool(kernel.alike(a, len(guess), b, len(truth), self.entity, reach, always))
+        a, b, always = map(kernel.lent, (predicted_states, confirmed_states, self._shown_ahead))
+        return bool(kernel.alike(a, len(predicted_states), b, len(confirmed_states), self.entity, reach, always))
 
     def _counting(self, states: Int64s) -> Int64s:
         """Returns the states that count in a comparison, as `bulk.alike` chooses them, with their extra columns.
@@ -360,17 +360,23 @@ class Prediction:
         """Returns for each entity whether it is the own one, or one that this has spawned."""
         return (ids >= self.entity) & (ids <= self.last_own)
 
-    def _difference(self, guess: Int64s, truth: Int64s) -> tuple[tuple[str, ...], float] | None:
+    def _difference(self, predicted_states: Int64s, confirmed_states: Int64s) -> tuple[tuple[str, ...], float] | None:
         """Returns the fields and the distance (blocks) by which the own entity differs; None if it does not."""
-        was, mine = guess[guess[:, ID] == self.entity], truth[truth[:, ID] == self.entity]
+        was, mine = (
+            predicted_states[predicted_states[:, ID] == self.entity],
+            confirmed_states[confirmed_states[:, ID] == self.entity],
+        )
         if not len(mine) or not len(was) or np.array_equal(mine, was):
             return None
         way = (mine[0, X : X + 3] - was[0, X : X + 3]) / BLOCK
         names = self.confirmed.extras.names
         return tuple(names[k] for k in np.flatnonzero(mine[0] != was[0])), float(np.sqrt((way * way).sum()))
 
-    def _others_differ(self, guess: Int64s, truth: Int64s) -> bool:
-        return not np.array_equal(guess[guess[:, ID] != self.entity], truth[truth[:, ID] != self.entity])
+    def _others_differ(self, predicted_states: Int64s, confirmed_states: Int64s) -> bool:
+        return not np.array_equal(
+            predicted_states[predicted_states[:, ID] != self.entity],
+            confirmed_states[confirmed_states[:, ID] != self.entity],
+        )
 
 
 def _offsets(before: Int64s, after: Int64s) -> dict[int, Place]:

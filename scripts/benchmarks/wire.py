@@ -135,9 +135,9 @@ def run(motion: str, entities: int, ticks: int, seed: int, *, compiled: bool | N
         scenery.tick()
         world, prediction = scenery.game.world, scenery.core.prediction
         assert prediction is not None
-        truth = scenery.seen(world.states())
-        differing += prediction.known.states.tobytes() != truth[:, :CELL].tobytes()
-        in_view += len(truth)
+        seen = scenery.seen(world.states())
+        differing += prediction.confirmed_copy.states.tobytes() != seen[:, :CELL].tobytes()
+        in_view += len(seen)
         moving += len(scenery.seen(world.changed))
     return {
         "motion": motion,

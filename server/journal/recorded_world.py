@@ -103,15 +103,15 @@ class Observer:
         """Makes the record of a tick: `[inputs, calls, mark]`, and the hash if one is due. Clears the calls."""
         calls, self.calls = self.calls, []
         held, aim = self._held, world.scene.aim
-        news: list[int] = []
+        changed: list[int] = []
         for entity, input_ in inputs.items():
             if held.get(entity) != input_:
                 held[entity] = input_
-                news += input_record(entity, input_, aim=aim)
+                changed += input_record(entity, input_, aim=aim)
         first, self._first = self._first, False
         if world.turns is not None:
             self.forget([*world.turns.steered, *world.turns.vanished])
-        parts: list[Any] = [news, calls, None if first else mark(world)]
+        parts: list[Any] = [changed, calls, None if first else mark(world)]
         due = world.tick % HASH_TICKS == 0 and len(world) <= self._hashed_max
         if first or (due and world.blocks.stale <= self._stale_max):
             parts.append(world.state_hash())

@@ -234,15 +234,15 @@ def redo(world: World, record: list[Any]) -> Moment:
     inputs, calls, marked, *hashes = record
     for call in calls:
         apply(world, call)
-    news: dict[int, Input] = {}
+    given: dict[int, Input] = {}
     if inputs is not None:
-        news = recorded_inputs(inputs, aim=world.scene.aim)
-        world.step(news)
+        given = recorded_inputs(inputs, aim=world.scene.aim)
+        world.step(given)
         if marked is not None and mark(world) != marked:
             raise DivergedError(world.tick, "the entities that changed are not the recorded ones")
     if hashes and not has_hash(world, hashes[0]):
         raise DivergedError(world.tick, "the world is not the recorded one")
-    return Moment(world, news, calls, bool(hashes), inputs is None)
+    return Moment(world, given, calls, bool(hashes), inputs is None)
 
 
 def input_record(entity: int, input_: Input, *, aim: bool) -> list[int]:

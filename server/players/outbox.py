@@ -54,18 +54,18 @@ class Outbox:
         """Notes that the player has reconnected, so events on their way may be lost."""
         self._unsure = True
 
-    def take(self, known: int, room: int) -> list[bytes]:
+    def take(self, complete_tick: int, room: int) -> list[bytes]:
         """Takes the messages to send now, and returns them.
 
         Args:
-            known: tick up to which the client has been sent everything in its view.
+            complete_tick: tick up to which the client has been sent everything in its view.
             room: bytes of events to send, about; at least one event is taken.
         """
         messages = []
         if self._unsure:
             self._unsure = False
             messages.append(encode(NextHappened(self._next)))
-        while self._waiting and self._waiting[0][0] <= known:
+        while self._waiting and self._waiting[0][0] <= complete_tick:
             messages.append(self._waiting.popleft()[1])
             self._next += 1
             room -= len(messages[-1])

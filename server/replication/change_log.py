@@ -28,14 +28,14 @@ from shared.world import World
 PACKS_PER_TICK = 8
 """Maximum number of segments whose blocks are packed anew in one tick, at 0.25 to 0.7 ms each. A client that joins in
 an unvisited area waits for its terrain; the tick does not wait."""
-SAID_BYTES = 32 * 1024
+ATTRIBUTE_BYTES = 32 * 1024
 """Maximum bytes of attributes in one segment delta, so that no message gets too long. Others follow a tick later."""
-SAID_FEW, SAID_ID_BYTES = 3, 9
-"""Number of entities whose attributes always fit into `SAID_BYTES`, and bytes that count for the number of an entity.
-The latter is more than a number takes, which bounds the length of the list, too."""
+FEW_ENTITIES, ENTITY_BYTES = 3, 9
+"""Number of entities whose attributes always fit into `ATTRIBUTE_BYTES`, and bytes that count for the number of an
+entity. The latter is more than a number takes, which bounds the length of the list, too."""
 CHECK_S = 1.0
 """Seconds between two checksums of a segment in which something changes."""
-NO_NEWS = (b"", b"", b"")
+NO_CHANGES = (b"", b"", b"")
 """Packed changes of a segment without any."""
 
 
@@ -48,12 +48,12 @@ class _Tick:
         self.edited: dict[Cell, set[int]] = defaultdict(set)  # offsets of changed blocks, by segment
         self.acted: set[int] = set()  # entities that the rules changed without placing them
         self.placed: set[int] = set()  # entities that the rules placed
-        self.said: dict[Cell, set[int]] = defaultdict(set)  # entities whose attributes are new in the segment
+        self.attributes: dict[Cell, set[int]] = defaultdict(set)  # entities whose attributes are new in the segment
         self.fields: dict[Cell, set[int]] = defaultdict(set)  # entities whose extra columns alone changed
 
     def more(self) -> set[Cell]:
         """Returns the segments with changes other than motion: removals, edits, attributes, extra columns."""
-        return self.gone.keys() | self.edited.keys() | self.said.keys() | self.fields.keys()
+        return self.gone.keys() | self.edited.keys() | self.attributes.keys() | self.fields.keys()
 
 
 class DeltaCache(dict[Cell, bytes]):
@@ -112,7 +112,8 @@ class ChangeLog:
         self.faults = faults or FaultReporter()
         self._world = world
         self._attributes = {} if attributes is None else attributes
-        self._said: set[int] = set()
+        self._attributes_changed: set[int] = set()
+        """Entities whose attributes are to be sent with the coming step."""
         self._named: set[int] = set()
         """Entities that have had attributes, in scenes where numbers are used again: a client may still know them."""
         self.history = bounds(world.scene.tick_rate).history
@@ -130,7 +131,7 @@ class ChangeLog:
         self._due: set[Cell] = set()
         """Segments whose checksums are to be sent in this tick."""
         self._check_ticks = in_ticks(CHECK_S, world.scene.tick_rate, 1)
-        self._news = TickEncoder(world, self._check_ticks)
+        self._encoder = TickEncoder(world, self._check_ticks)
         self._latest_fields: dict[Cell, bytes] = {}
         """Records of extra columns of the newest tick, by segment."""
         self._latest: dict[Cell, tuple[bytes, bytes, bytes]] | None = None
@@ -152,7 +153,7 @@ class ChangeLog:
 
     def note_attributes(self, entity: int) -> None:
         """Notes that the attributes of an entity were changed before the coming step."""
-        self._said.add(entity)
+        self._attributes_changed.add(entity)
 
     def note_removal(self, entity: int) -> None:
         """Notes that an entity was removed before the coming step."""
@@ -173,9 +174,9 @@ class ChangeLog:
             self._placed_at = self._world.tick
         for x, y, z in self._world.edited:
             now.edited[segment_of(x, y, z)].add(offset_of(x, y, z))
-        shares, self._due = self._news.pack(now.acted, now.placed)
+        deltas, self._due = self._encoder.pack(now.acted, now.placed)
         self._latest = {}
-        for segment, ids, whole, packed in shares:
+        for segment, ids, whole, packed in deltas:
             now.changed[segment] = ids
             self._latest[segment] = packed
             for entity in whole:
@@ -185,23 +186,23 @@ class ChangeLog:
                         now.gone[home].append(entity)
                     homes[entity] = segment
                     if entity in self._attributes or (home is None and entity in self._named):
-                        now.said[segment].add(entity)
-        for entity in self._said & homes.keys():
-            now.said[homes[entity]].add(entity)
+                        now.attributes[segment].add(entity)
+        for entity in self._attributes_changed & homes.keys():
+            now.attributes[homes[entity]].add(entity)
             if self._world.extras.spawns:
                 self._named.add(entity)
-        self._said.clear()
+        self._attributes_changed.clear()
         if self._world.extras.count:
-            self._record_fields(now, shares)
+            self._record_fields(now, deltas)
         self._ticks.put(self._world.tick, now)
         self._now = _Tick()
         self._parts.clear()
         self._packs_left = PACKS_PER_TICK
 
-    def _record_fields(self, now: _Tick, shares: list[SegmentDelta]) -> None:
+    def _record_fields(self, now: _Tick, deltas: list[SegmentDelta]) -> None:
         """Packs the extra columns of the entities that are sent whole, and of those whose extra columns changed."""
         world, extras = self._world, self._world.extras
-        whole = {entity: segment for segment, _, ids, _ in shares for entity in ids}
+        whole = {entity: segment for segment, _, ids, _ in deltas for entity in ids}
         records: dict[Cell, list[bytes]] = defaultdict(list)
         for entity, segment in whole.items():
             records[segment].append(self._fields_of(entity))
@@ -242,19 +243,19 @@ class ChangeLog:
         """Encodes the delta of a segment since a tick. `since(tick)[segment]` returns the shared copy instead."""
         if since == KEYFRAME:
             return self._keyframe(segment)
-        known = self.since(since)
-        return self._changes(segment, since, known) if segment in known.changed else b""
+        deltas = self.since(since)
+        return self._changes(segment, since, deltas) if segment in deltas.changed else b""
 
     def packed(self, segment: Cell) -> bytes | None:
         """Returns the present blocks of a segment, packed; None if too many were packed in this tick already."""
         version = self._world.blocks.version(segment)
-        known = self._packed.get(segment)
-        if known is None or known[0] != version:
+        kept = self._packed.get(segment)
+        if kept is None or kept[0] != version:
             if not self._packs_left:
                 return None
             self._packs_left -= 1
-            known = self._packed[segment] = (version, pack(self._world.blocks.segment(segment)))
-        return known[1]
+            kept = self._packed[segment] = (version, pack(self._world.blocks.segment(segment)))
+        return kept[1]
 
     def _keyframe(self, segment: Cell) -> bytes:
         if segment in self._world.blocks:
@@ -274,19 +275,20 @@ class ChangeLog:
         ticks = map(self._ticks.get, range(newest - self.history + 1, newest + 1))
         return set().union(*(tick.placed for tick in ticks if tick is not None))
 
-    def _changes(self, segment: Cell, since: int, known: DeltaCache) -> bytes:
+    def _changes(self, segment: Cell, since: int, deltas: DeltaCache) -> bytes:
         due = segment in self._due and segment in self._world.blocks
         check = checksum(self._world, segment) if due else 0
-        ticks = known.ticks
-        ago, news = self._world.tick - since, self._share(segment, since, ticks)
+        ticks = deltas.ticks
+        ago, packed = self._world.tick - since, self._packed_since(segment, since, ticks)
         fields = self._fields(segment, since, ticks) if self._world.extras.count else b""
-        if segment not in known.more:
-            return join_part(segment, ago, news, check=check, extra=fields)
+        if segment not in deltas.more:
+            return join_part(segment, ago, packed, check=check, extra=fields)
         gone = {entity for tick in ticks for entity in tick.gone.get(segment, ()) if self._home.get(entity) != segment}
         edited = {offset for tick in ticks for offset in tick.edited.get(segment, ())}
         kinds = self._kinds(segment, sorted(edited))
-        said = {entity for tick in ticks for entity in tick.said.get(segment, ()) if self._home.get(entity) == segment}
-        return join_part(segment, ago, news, sorted(gone), kinds, check, self._of(sorted(said)), fields)
+        fresh = {entity for tick in ticks for entity in tick.attributes.get(segment, ())}
+        named = sorted(entity for entity in fresh if self._home.get(entity) == segment)
+        return join_part(segment, ago, packed, sorted(gone), kinds, check, self._of(named), fields)
 
     def _fields(self, segment: Cell, since: int, ticks: list[_Tick]) -> bytes:
         """Returns the records of extra columns of the entities that changed and are still in the segment."""
@@ -306,25 +308,25 @@ class ChangeLog:
         return b"".join(records)
 
     def _of(self, entities: list[int]) -> list[Any]:
-        """Returns the attributes of entities as on the wire. Those beyond `SAID_BYTES` wait for the next tick."""
-        said = [
+        """Returns the attributes of entities as on the wire. Those beyond `ATTRIBUTE_BYTES` wait for the next tick."""
+        tables = [
             (entity, self._attributes.get(entity, {}))
             for entity in entities
             if entity in self._attributes or entity in self._named
         ]
-        if len(said) > SAID_FEW:
-            ends = accumulate(len(msgpack.packb(values)) + SAID_ID_BYTES for _, values in said)
-            fits = max(sum(end <= SAID_BYTES for end in ends), 1)
-            self._said.update(entity for entity, _ in said[fits:])
-            del said[fits:]
-        return [part for pair in said for part in pair]
+        if len(tables) > FEW_ENTITIES:
+            ends = accumulate(len(msgpack.packb(values)) + ENTITY_BYTES for _, values in tables)
+            fits = max(sum(end <= ATTRIBUTE_BYTES for end in ends), 1)
+            self._attributes_changed.update(entity for entity, _ in tables[fits:])
+            del tables[fits:]
+        return [part for pair in tables for part in pair]
 
-    def _share(self, segment: Cell, since: int, ticks: list[_Tick]) -> tuple[bytes, bytes, bytes]:
+    def _packed_since(self, segment: Cell, since: int, ticks: list[_Tick]) -> tuple[bytes, bytes, bytes]:
         """Returns the packed changes (heads, tails, rows) of the entities that changed and are still in the segment."""
         if self._latest is not None and since == self._world.tick - 1:
-            return self._latest.get(segment, NO_NEWS)
-        told = {entity for tick in ticks for entity in tick.changed.get(segment, ())}
-        here = {entity for entity in told if self._home.get(entity) == segment}
+            return self._latest.get(segment, NO_CHANGES)
+        changed = {entity for tick in ticks for entity in tick.changed.get(segment, ())}
+        here = {entity for entity in changed if self._home.get(entity) == segment}
         acted, placed = (
             {entity for ids in sets for entity in ids if entity in here}
             for sets in ([tick.acted for tick in ticks], [tick.placed for tick in ticks])

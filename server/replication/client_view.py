@@ -43,7 +43,7 @@ class ClientView:
         self.near = near
         self._fresh.update(
             dict.fromkeys(added, tick if self.sees else -1)
-        )  # -1: until these are sent, `known` precedes all
+        )  # -1: until these are sent, `complete_tick` precedes all
         self.sees.difference_update(dropped)
         for segment in dropped:
             self._fresh.pop(segment, None)
@@ -84,12 +84,12 @@ class ClientView:
         return not (self._behind or self._fresh)
 
     @property
-    def known(self) -> int:
+    def complete_tick(self) -> int:
         """Newest tick of which the client has been sent everything that was in its view at the end of that tick."""
         return min((self._tick, *self._behind.values(), *(since - 1 for since in self._fresh.values())))
 
     def waits(self, tick: int) -> int:
-        """Returns the number of ticks since the known segment that has waited longest was sent."""
+        """Returns the number of ticks since the segment that has waited longest was sent."""
         return tick - (min(self._behind.values()) if self._behind else self._tick)
 
     def take(self, log: ChangeLog, tick: int, room: int) -> tuple[int, bytes]:
@@ -103,18 +103,18 @@ class ClientView:
         Returns:
             The number of segment deltas, and their bytes.
         """
-        known = log.since(self._tick)
+        deltas = log.since(self._tick)
         if not (self._behind or self._fresh or self.drops):  # the usual case
-            n, plain = known.together(self.near)
+            n, plain = deltas.together(self.near)
             for segment in self._rest:
-                if segment in known.changed and (part := known[segment]):
+                if segment in deltas.changed and (part := deltas[segment]):
                     n += 1
                     plain += part
             if len(plain) <= room:
                 self._tick = tick
                 return n, plain
         special = self._behind | dict.fromkeys(self._fresh, KEYFRAME)
-        due = special | {segment: self._tick for segment in self.sees - special.keys() if known[segment]}
+        due = special | {segment: self._tick for segment in self.sees - special.keys() if deltas[segment]}
         parts = {segment: part for segment, since in due.items() if (part := log.since(since)[segment])}
         if sum(map(len, parts.values())) > room:
             parts = self._urgent(parts, due, tick, log.history, room)

@@ -161,7 +161,9 @@ class Sender:
         room, terrain = window - pacing.outstanding, stream.terrain_now or stream.terrain_due
         if stream.acked < 0 and (terrain or room <= 0):
             return
-        for message in outbox.take(stream.view.known, max(room // 2, EVENT_BYTES) if terrain else pacing.room(window)):
+        for message in outbox.take(
+            stream.view.complete_tick, max(room // 2, EVENT_BYTES) if terrain else pacing.room(window)
+        ):
             stream.send(message)
 
     def _send_terrain(self, stream: ClientStream, room: int) -> None:

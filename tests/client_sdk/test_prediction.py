@@ -39,10 +39,10 @@ class Pair:
         self.server.spawn("box", (16, 16, 1))
         for place in others:
             self.server.spawn("box", place)
-        self.known = Confirmed(ground(), ME, compiled=False)
-        self.client = Prediction(self.known, **options)
+        self.confirmed_copy = Confirmed(ground(), ME, compiled=False)
+        self.client = Prediction(self.confirmed_copy, **options)
         for segment in (HERE, BESIDE):
-            self.known.load_segment(segment, self.server.blocks.segment(segment).reshape(-1))
+            self.confirmed_copy.load_segment(segment, self.server.blocks.segment(segment).reshape(-1))
         self.settle()
         self.tell(since=-1)
         self.client.begin(self.server.tick)
@@ -69,7 +69,7 @@ class Pair:
             msgpack.unpackb(encode_part(segment, since, self.server.in_segment(segment), **fields))
             for segment in segments
         ]
-        return self.known.apply(snapshot(self.server.tick, parts))
+        return self.confirmed_copy.apply(snapshot(self.server.tick, parts))
 
     def reconcile(self, *, late: bool = False) -> Any:
         done = self.client.reconcile(late)
@@ -244,10 +244,10 @@ def test_an_entity_that_left_for_an_unseen_segment_is_gone_and_one_that_came_sta
 def test_a_dropped_segment_is_forgotten_with_all_that_is_in_it() -> None:
     pair = Pair((20, 20, 1), (40, 20, 1))
     pair.act(NEUTRAL)
-    pair.known.apply(snapshot(pair.server.tick, [], drops=[BESIDE]))
+    pair.confirmed_copy.apply(snapshot(pair.server.tick, [], drops=[BESIDE]))
     assert pair.client.confirmed.entities["id"].tolist() == [1, 2]
     assert list(pair.client.confirmed.blocks) == [HERE]
-    assert not pair.known.grounded()
+    assert not pair.confirmed_copy.grounded()
 
 
 def test_an_entity_that_walks_out_of_a_dropped_segment_into_a_seen_one_stays() -> None:
@@ -255,7 +255,7 @@ def test_an_entity_that_walks_out_of_a_dropped_segment_into_a_seen_one_stays() -
     pair.server.place(OTHER, (20, 20, 1))
     pair.act(NEUTRAL)
     part = msgpack.unpackb(encode_part(HERE, 3, pair.server.in_segment(HERE)))
-    pair.known.apply(snapshot(pair.server.tick, [part], drops=[BESIDE]))
+    pair.confirmed_copy.apply(snapshot(pair.server.tick, [part], drops=[BESIDE]))
     assert pair.client.confirmed.states().tolist() == pair.server.states().tolist()
 
 
@@ -263,7 +263,7 @@ def test_terrain_that_comes_is_a_reason_to_replay() -> None:
     pair = Pair()
     pair.ahead(EAST, EAST)
     pair.act(EAST)
-    pair.known.load_segment(BESIDE, np.zeros(32768, np.uint8))
+    pair.confirmed_copy.load_segment(BESIDE, np.zeros(32768, np.uint8))
     pair.tell()
     done = pair.reconcile()
     assert (done.correction, done.repredicted, done.replayed) == (None, True, 1)
@@ -326,7 +326,7 @@ def test_a_malformed_part_changes_nothing() -> None:
     pair.act(EAST)
     good = msgpack.unpackb(encode_part(HERE, 0, pair.server.in_segment(HERE)))
     with pytest.raises(ProtocolError):
-        pair.known.apply(snapshot(pair.server.tick, [good, [*good[:6], bytes(33), *good[7:]]], drops=[BESIDE]))
+        pair.confirmed_copy.apply(snapshot(pair.server.tick, [good, [*good[:6], bytes(33), *good[7:]]], drops=[BESIDE]))
     assert pair.client.confirmed.state_hash() == before
 
 

@@ -55,32 +55,32 @@ def take(view: ClientView, log: Log, tick: int, room: int) -> list[Cell]:
     return taken
 
 
-def test_known_is_the_tick_up_to_which_every_seen_segment_has_been_sent() -> None:
+def test_the_complete_tick_is_that_up_to_which_every_seen_segment_has_been_sent() -> None:
     view, log = seeing(), Log(dict.fromkeys(ROW, 10))
-    assert view.known == -2
+    assert view.complete_tick == -2
     assert take(view, log, 5, 20) == [OWN, NEAR]
-    assert view.known == -2, "nothing is known of one segment"
+    assert view.complete_tick == -2, "nothing is known of one segment"
     assert take(view, log, 6, 100) == [FAR, OWN, NEAR] or view.complete
-    assert view.known == 6
+    assert view.complete_tick == 6
     log.sizes[FAR] = 1000
     assert FAR not in take(view, log, 7, 20)
-    assert view.known == 6
+    assert view.complete_tick == 6
     assert FAR in take(view, log, 9, 2000)
-    assert view.known == 9
+    assert view.complete_tick == 9
 
 
-def test_a_segment_that_comes_into_view_limits_known_from_then_on() -> None:
+def test_a_segment_that_comes_into_view_limits_the_complete_tick_from_then_on() -> None:
     view, log = ClientView(), Log(dict.fromkeys(ROW, 10))
     view.move((OWN,), 2, 4)
     take(view, log, 5, 100)
-    assert view.known == 5
+    assert view.complete_tick == 5
     view.move(tuple(ROW), 2, 8)
     assert FAR not in take(view, log, 8, 20)
-    assert view.known == 7
+    assert view.complete_tick == 7
     assert FAR in take(view, log, 9, 2000)
-    assert view.known == 9
+    assert view.complete_tick == 9
     view.forget()
-    assert view.known == -2
+    assert view.complete_tick == -2
 
 
 def test_everything_goes_where_it_fits_first_whole_and_then_its_changes() -> None:

@@ -14,9 +14,9 @@ def happened(number: int, length: int = 0) -> bytes:
     return encode(Happened(number, "n", bytes(length)))
 
 
-def taken(outbox: Outbox, known: int, room: int = ALL) -> list[int | str]:
+def taken(outbox: Outbox, complete: int, room: int = ALL) -> list[int | str]:
     """Returns the ticks of the taken events; a `NextHappened` is given as a text."""
-    messages = map(decode_from_server, outbox.take(known, room))
+    messages = map(decode_from_server, outbox.take(complete, room))
     told: list[int | str] = []
     for message in messages:
         if isinstance(message, NextHappened):
@@ -78,8 +78,8 @@ def test_each_event_is_sent_once_or_counted_once(seed: int) -> None:
             outbox.add(tick, happened(tick), 8)
             sent += 1
         if rng.random() < 0.3 or tick == 999:
-            known, room = tick - rng.randrange(5), rng.choice((0, 20, ALL))
-            for message in map(decode_from_server, outbox.take(*((known, room) if tick < 999 else (tick, ALL)))):
+            complete, room = tick - rng.randrange(5), rng.choice((0, 20, ALL))
+            for message in map(decode_from_server, outbox.take(*((complete, room) if tick < 999 else (tick, ALL)))):
                 if isinstance(message, NextHappened):
                     missed += message.number - expected
                     expected = message.number

@@ -286,12 +286,12 @@ def test_the_parts_of_one_view_are_joined_once_for_all_its_clients(recorded: Rec
     for x in (3, 35):
         recorded.edit(x, 3, 9, 1)
     recorded.tick()
-    known = recorded.log.since(1)
+    deltas = recorded.log.since(1)
     all_three, both = (HOME, EAST, WEST), (HOME, WEST)
-    assert known.together(all_three) == (2, known[HOME] + known[EAST])
-    assert known.together(all_three)[1] is known.together(all_three)[1]
-    assert known.together(both) == (1, known[HOME]), "another view is joined separately"
-    assert known.together(all_three) == (2, known[HOME] + known[EAST])
+    assert deltas.together(all_three) == (2, deltas[HOME] + deltas[EAST])
+    assert deltas.together(all_three)[1] is deltas.together(all_three)[1]
+    assert deltas.together(both) == (1, deltas[HOME]), "another view is joined separately"
+    assert deltas.together(all_three) == (2, deltas[HOME] + deltas[EAST])
 
 
 def test_a_tick_packs_few_segments_and_the_next_one_packs_on(recorded: Recorded) -> None:

@@ -53,8 +53,8 @@ def test_a_player_whose_connection_is_lost_goes_on_with_the_same_entity(preset: 
     assert all(event.cause != "nondeterminism" for event in player.events if isinstance(event, Corrected))
     prediction = player.core.prediction
     assert prediction
-    truth = match.game.world
-    assert prediction.confirmed.tick > truth.tick - 64
+    world = match.game.world
+    assert prediction.confirmed.tick > world.tick - 64
 
 
 def test_commands_sent_meanwhile_are_carried_out_once() -> None:
