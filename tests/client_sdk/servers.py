@@ -78,6 +78,16 @@ def scripted_server(script: Callable[[socket.socket], object]) -> Iterator[str]:
     assert not failed, failed
 
 
+def request(sock: socket.socket) -> bytes:
+    """Returns a client's request, up to the end of its head."""
+    data = b""
+    while b"\r\n\r\n" not in data:
+        received = sock.recv(65536)
+        assert received, "the client has closed"
+        data += received
+    return data
+
+
 def accept(sock: socket.socket) -> Peer:
     """Runs the server's side of the handshake. Returns the peer."""
     peer = Peer()

@@ -17,7 +17,7 @@ from client_sdk.events import Answered, Event, Joined, Left
 from client_sdk.transports import connection
 from client_sdk.transports.connection import ConnectError
 from shared import messages
-from tests.client_sdk.servers import accept, real_server, scripted_server, silent_server
+from tests.client_sdk.servers import accept, real_server, request, scripted_server, silent_server
 from tests.lengths import long
 
 pytestmark = pytest.mark.e2e
@@ -172,7 +172,7 @@ def test_a_refused_connection_reads_like_advice(run: Run) -> None:
 
 def test_a_page_that_is_no_game_reads_like_advice(run: Run) -> None:
     def script(sock: socket.socket) -> None:
-        sock.recv(65536)
+        request(sock)
         sock.sendall(b"HTTP/1.1 404 Not Found\r\nContent-Length: 0\r\n\r\n")
 
     async def scene() -> None:

@@ -16,7 +16,7 @@ from client_sdk.transports.polling import PollingTransport
 from shared import messages
 from shared.messages import Bye, encode
 from shared.scene import load_scene
-from tests.client_sdk.servers import accept, real_server, scripted_server, silent_server, until_closed
+from tests.client_sdk.servers import accept, real_server, request, scripted_server, silent_server, until_closed
 
 pytestmark = pytest.mark.e2e
 
@@ -194,7 +194,7 @@ def test_a_refused_connection_reads_like_advice() -> None:
 
 def test_a_page_that_is_no_game_reads_like_advice() -> None:
     def script(sock: socket.socket) -> None:
-        sock.recv(65536)
+        request(sock)
         sock.sendall(b"HTTP/1.1 404 Not Found\r\nContent-Length: 0\r\n\r\n")
 
     with (

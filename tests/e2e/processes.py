@@ -25,6 +25,8 @@ ROOT = Path(__file__).resolve().parents[2]
 START_S = 400.0
 """Seconds until a server is ready. Compiling the kernel for the first time takes long."""
 END_S = 10.0
+BUSY = re.compile("stalled|suspended|goes on")
+"""Events of the watchdog, which also a machine causes that is busy with other work."""
 RECOVERY_S = 2.0
 """Seconds within which a player moves again after a stall or a reconnect."""
 MOVING_BLOCKS = 1.0
@@ -85,10 +87,19 @@ class ServerProcess:
             reader.join(END_S)
         return code
 
-    def log(self, *, but: str = "") -> list[dict[str, Any]]:
-        """Returns the log so far, without the entries of level `but` and without the notice about compiling."""
+    def log(self, *, but: str = "", busy: bool = False) -> list[dict[str, Any]]:
+        """Returns the log so far without the notice about compiling.
+
+        Args:
+            but: level of entries that are left out.
+            busy: whether it has the entries of the watchdog, too.
+        """
         entries = [json.loads(line) for line in self.errors]
-        return [entry for entry in entries if entry["level"] != but and entry["event"] != COMPILING]
+        return [
+            entry
+            for entry in entries
+            if entry["level"] != but and entry["event"] != COMPILING and (busy or not BUSY.search(entry["event"]))
+        ]
 
     def rest(self) -> list[str]:
         """Waits for the end of stdout. Returns the lines that have not been read yet."""

@@ -15,7 +15,7 @@ from server.config.limits import Limits
 from server.game import Game
 from shared import messages
 from shared.scene import load_scene
-from tests.client_sdk.servers import scripted_server
+from tests.client_sdk.servers import request, scripted_server
 from tests.e2e.processes import END_S, running
 from tests.server.test_tokens import GOOD, KEY, NOW, OTHER, signed
 
@@ -70,7 +70,7 @@ async def test_a_host_that_does_not_exist() -> None:
 
 def test_another_kind_of_server_is_there() -> None:
     def page(sock: socket.socket) -> None:
-        sock.recv(65536)
+        request(sock)
         sock.sendall(b"HTTP/1.1 404 Not Found\r\nContent-Length: 0\r\n\r\n")
 
     with scripted_server(page) as url, pytest.raises(ConnectError) as error:
@@ -83,7 +83,7 @@ def test_another_kind_of_server_is_there() -> None:
 
 def test_the_server_is_about_to_start_again() -> None:
     def page(sock: socket.socket) -> None:
-        sock.recv(65536)
+        request(sock)
         sock.sendall(
             b"HTTP/1.1 503 Service Unavailable\r\nContent-Type: text/plain\r\nRetry-After: 3\r\nContent-Length: 24\r\n"
             b"\r\nthe server is going down"

@@ -19,7 +19,7 @@ import pytest
 from client_sdk.client import Client
 from server.runtime.event_loop import COMPILING, announce_compiling
 from shared import kernels
-from tests.e2e.processes import ROOT, START_S, other, page, running, stats, until
+from tests.e2e.processes import BUSY, ROOT, START_S, other, page, running, stats, until
 from tests.lengths import long
 
 pytestmark = pytest.mark.e2e
@@ -36,13 +36,14 @@ def on_a_terminal(cache: Path) -> list[str]:
     with subprocess.Popen(command, cwd=ROOT, env=environment, stdin=its, stdout=its, stderr=its) as process:
         os.close(its)
         try:
-            text = ""
-            while "listening on" not in text:
-                text += os.read(seen, 1000).decode()
+            shown = b""
+            while b"listening on" not in shown:
+                shown += os.read(seen, 1000)
         finally:
             process.terminate()
             os.close(seen)
-    words = [line.partition(" ")[0] for line in text.splitlines()]
+    lines = [line for line in shown.decode(errors="replace").splitlines() if not BUSY.search(line)]
+    words = [line.partition(" ")[0] for line in lines]
     return words[: words.index("listening") + 1]
 
 

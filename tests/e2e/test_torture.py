@@ -7,7 +7,6 @@ snapshots and the server's lateness during an attack, compared with those before
 import contextlib
 import json
 import os
-import re
 import subprocess
 import sys
 import time
@@ -34,8 +33,6 @@ WINDOWS = 3
 SHARE_MIN = 0.9
 """Least share of the snapshots during an attack, of those that the worst served honest player got before."""
 GROWTH_MB_MAX = 24.0
-BUSY = re.compile("stalled|suspended|goes on")
-"""Log lines of the watchdog on a machine that is busy with other work."""
 GATEWAYS = KINDS["gateway"].choices if "gateway" in KINDS else ("",)
 ATTACKS: dict[str, dict[str, Any]] = {
     "half open": {"peers": {"nothing": 100, "half_a_request": 100, "slow_loris": 100}},
@@ -142,7 +139,7 @@ def test_honest_players_are_served_during_an_attack_and_nothing_is_left_of_it(
     with running("--port", "0", "--scene", "flat", "--tick-rate", "32", "--resume-s", "2", *flags) as server:
         storm(server, attack, 1000 / 32)
         assert server.end(15) == 0
-        assert [entry for entry in server.log(but="info") if not BUSY.search(entry["event"])] == []
+        assert server.log(but="info") == []
 
 
 def test_a_neighbour_that_takes_all_the_processor_delays_and_breaks_nothing() -> None:
