@@ -20,7 +20,7 @@ does not.
 import importlib
 import inspect
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -30,6 +30,7 @@ from server.functions import RulesError as RulesError
 from server.functions import checked_function as checked_function
 from server.functions import checked_result as checked_result
 from server.players.player import Player
+from server.players.ticket import Ticket as Ticket
 from shared.behaviours import Behaviour, checked_classes
 from shared.checks import SceneError, shown
 from shared.scene import Scene
@@ -116,6 +117,19 @@ class Rules:
             ValueError: the player may not join; the client gets the text as the reason.
         """
         return None
+
+    @staticmethod
+    def pair(waiting: list[Ticket]) -> Iterable[Sequence[Ticket]]:
+        """Returns groups of the clients that wait for a match, each of which gets a new world (`docs/worlds.md`).
+
+        Called about once per second while clients wait. Without a `pair` of its own, a kind of worlds lets each client
+        join the fullest world with room for it, or makes one.
+
+        Args:
+            waiting: the tickets, in the order in which they came: `name`, `subject`, `properties`, `seats`, `waited_s`,
+                and `loaded`, the result of `load_player`. Tickets in no group go on waiting.
+        """
+        return ()
 
     def on_start(self) -> None:
         """Called once, when the world exists and no player has joined. Not called when a saved game is restored."""

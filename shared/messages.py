@@ -103,10 +103,10 @@ VERDICT_TEXTS = (
 GOING_AWAY, PROTOCOL, TEXT, TOO_BIG, INTERNAL = 1001, 1002, 1003, 1009, 1011
 """Close codes of WebSocket (RFC 6455) that the server and the client use."""
 WRONG_VERSION, WRONG_SCENE, MALFORMED, FULL, TOO_SLOW, NO_HELLO, TAKEN_OVER, UNAUTHORISED = range(4001, 4009)
-KICKED, NOT_ADMITTED = range(4009, 4011)
+KICKED, NOT_ADMITTED, ENDED = range(4009, 4012)
 """Close codes of this protocol. FULL: the server has no room for another player. TOO_SLOW: the connection cannot keep
 up, or nothing was received for too long. NO_HELLO: no `Hello` came in time. TAKEN_OVER: another one goes on.
-KICKED: the rules removed the player. NOT_ADMITTED: the rules do not let the client join."""
+KICKED: the rules removed the player. NOT_ADMITTED: the rules do not let the client join. ENDED: the world has ended."""
 
 
 class ProtocolError(ValueError):

@@ -93,6 +93,16 @@ class Limits:
         64, Option(int, "maximum commands of a player that wait for their tick", "N", 1, 10_000)
     )
     name_max: int = setting(NAME_MAX, Option(int, "maximum characters of a player's name", "N", 1, NAME_MAX))
+    worlds_max: int = setting(1000, Option(int, "maximum worlds at once, besides the default one", "N", 1, 100_000))
+    creations_per_s: float = setting(
+        20.0, Option(float, "maximum worlds that clients make per second; a burst may be those of 2 s", "N", 0.01, 1000)
+    )
+    asks_per_s: float = setting(
+        2.0, Option(float, "maximum requests for a world per second and address; a burst may be 10 s", "N", 0.01, 1000)
+    )
+    seat_s: float = setting(
+        30.0, Option(float, "seconds for which a seat in a world is reserved for a player", "S", 0.1, HOUR_S)
+    )
     joins_per_tick: int = 8
     """Players that may join in one tick. Others wait for the next tick, because a spawn costs 1 to 2 ms."""
     outbox_max: int = 1024

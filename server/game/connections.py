@@ -14,7 +14,7 @@ from server.observability.errors import FaultReporter
 from server.players.player import Player
 from server.replication.client_stream import Transport
 from shared import fields, messages
-from shared.messages import Bye, encode
+from shared.messages import Bye, Go, encode
 
 
 class Connections:
@@ -99,8 +99,20 @@ class Connections:
         except Exception:
             self.fail(session, "saying goodbye")
 
-    def shut_down(self, reason: str, wait: float) -> None:
+    def send_away(self, player: Player, go: Go) -> None:
+        """Sends the client of a player to another world. The player leaves in the next tick."""
+        session = player.session
+        if session is not None and not session.closed:
+            self._roster.dismiss(session)
+            try:
+                session.send(encode(go))
+                session.close(1000, "")
+            except Exception:
+                self.fail(session, "sending a client away")
+        player.session, player.reconnect_until = None, -math.inf
+
+    def shut_down(self, reason: str, wait: float, code: int = messages.GOING_AWAY) -> None:
         """Ends all connections. Arguments as for `end`."""
         for session in tuple(self.sessions):
             if not session.closed:
-                self.end(session, messages.GOING_AWAY, reason, wait)
+                self.end(session, code, reason, wait)

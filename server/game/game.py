@@ -190,16 +190,17 @@ class Game:
         """Removes a session whose connection is gone. Its player may reconnect."""
         self.connections.lost(session, now)
 
-    def shut_down(self, reason: str, wait: float) -> None:
+    def shut_down(self, reason: str, wait: float, code: int = messages.GOING_AWAY) -> None:
         """Lets the rules finish (`on_stop`), and closes all connections.
 
         Args:
             reason: the reason, sent to the clients.
-            wait: seconds after which the clients should reconnect.
+            wait: seconds after which the clients should reconnect; negative: they should not.
+            code: the close code.
         """
         with self.api.turn:
             self.api.hooks.stop()
-        self.connections.shut_down(reason, wait)
+        self.connections.shut_down(reason, wait, code)
 
     def keep(self) -> list[list[Any]]:
         """Returns the persisted state and the unanswered commands as notes, for a checkpoint."""
@@ -249,7 +250,10 @@ class Game:
         return inputs
 
     def _kick(self) -> None:
-        """Removes the players whom the rules have kicked in this tick."""
+        """Removes the players whom the rules have kicked or sent to another world in this tick."""
+        for player, go in self.api.sent_away:
+            self.connections.send_away(player, go)
+        self.api.sent_away.clear()
         for player, reason in self.api.kicked:
             self.connections.remove(player, messages.KICKED, reason or "kicked by the game")
         self.api.kicked.clear()

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any
+from typing import Any, Protocol
 
 from server.auth.identity import checked_subject
 from server.config.limits import Limits
@@ -17,6 +17,14 @@ from server.observability.errors import FaultReporter
 from server.rules import Rules
 from shared import messages
 from shared.messages import Hello, Welcome, encode
+
+
+class Door(Protocol):
+    """The door of a world, which decides whether new players may join."""
+
+    def refusal(self, session: Session) -> tuple[int, str] | None:
+        """Returns the close code and the reason for which a new player may not join; None: the player may join."""
+        ...
 
 
 class Joining:
@@ -52,6 +60,8 @@ class Joining:
         self.authenticate = authenticate
         self.run: Runner = at_once
         """Runner of `load_player`."""
+        self.door: Door | None = None
+        """Decides whether new players may join one of many worlds; None: it is the only one."""
         self._load = rules.load_player if type(rules).load_player is not Rules.load_player else None
 
     def hello(self, session: Session, hello: Hello, now: float) -> None:
@@ -160,6 +170,9 @@ class Joining:
                 reason = "the player goes on over another connection"
                 self._connections.end(player.session, messages.TAKEN_OVER, reason)
             session.seat(player)
+        elif self.door is not None and (refusal := self.door.refusal(session)) is not None:
+            self._connections.refuse(session, *refusal)
+            return
         elif self._roster.connected >= self._limits.clients_max:
             reason = f"the server is full ({self._limits.clients_max} clients)"
             self._connections.refuse(session, messages.FULL, reason)

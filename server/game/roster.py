@@ -72,6 +72,7 @@ class Roster:
         player = self._api.players[entity] = Player(entity, name, session.subject, self._queue())
         player.edits_left = 0.0  # otherwise each leave and new join would give another burst
         player.announced, player.loaded = False, loaded
+        player.handed = session.reserved.data if session.reserved is not None else None
         self._counters.joined += 1
         try:
             session.seat(player)

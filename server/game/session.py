@@ -1,12 +1,15 @@
 """A session: one connection of a client, from the handshake to its end."""
 
 import math
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from server.players.input_queue import InputQueue
 from server.players.player import SETTLED_MAX, Player
 from server.replication.client_stream import ClientStream, Transport
 from shared.messages import Hello
+
+if TYPE_CHECKING:
+    from server.worlds.seats import Seat
 
 
 class Session:
@@ -29,6 +32,8 @@ class Session:
         """Whether `Rules.load_player` runs for the client."""
         self.loaded: Any = None
         """Result of `Rules.load_player`."""
+        self.reserved: Seat | None = None
+        """Seat on which the client comes to one of many worlds (`server.worlds`); None: without one."""
         self.hello: Hello | None = None
         """Hello of a client that waits to join."""
         self.greeting: tuple[int, bytes] | None = None

@@ -1,14 +1,18 @@
-"""The part of the game API that removes players and keeps them out."""
+"""The part of the game API that removes players, keeps them out, and sends them to other worlds."""
 
 import math
+from typing import Any
 
+from server.functions import RulesError
 from server.game_api.entries import Entries
+from server.game_api.hosting import Hosting
 from server.game_api.turn import Turn
 from server.journal.recorded_world import RecordedWorld
 from server.players.persisted_state import PersistedState
 from server.players.player import Player
 from shared.checks import SceneError, duration, shown, text
 from shared.fields import REASON_MAX, TICK_MAX
+from shared.messages import Go
 
 BANS_MAX = 10_000
 """Maximum number of players that are kept out. If there are more, the one whose time ends first may join again."""
@@ -25,6 +29,10 @@ class PlayersApi:
         self._bans = Entries(self._world, self.kept, "bans")
         self.kicked: list[tuple[Player, str]] = []
         """Players to remove, each with the reason. The game removes them at the end of the tick."""
+        self.hosting: Hosting | None = None
+        """The worlds of the server; None: this game is the only one."""
+        self.sent_away: list[tuple[Player, Go]] = []
+        """Players who go to other worlds. The game sends them there at the end of the tick."""
 
     def kick(self, player: Player, reason: str = "", for_s: float | None = None) -> None:
         """Removes a player from the game. The client gets the reason with `Left`, and does not reconnect by itself.
@@ -51,6 +59,47 @@ class PlayersApi:
             self._ban(_identity(player.name, player.subject), min(self._world.tick + wait, TICK_MAX), reason)
         if player not in [known for known, _ in self.kicked]:
             self.kicked.append((player, reason))
+
+    @property
+    def worlds(self) -> "Hosting":
+        """The worlds of the server: this one's name and properties, and how to make and find others (docs/worlds.md).
+
+        Raises:
+            RulesError: the server has no other worlds.
+        """
+        if self.hosting is None:
+            raise RulesError("worlds: this game runs alone; declare kinds of worlds in the server's settings")
+        return self.hosting
+
+    def send_away(self, player: Player, world: str, data: Any = None, reason: str = "") -> bool:
+        """Sends a player to another world of the server. The client connects there by itself, and gets `Moved`.
+
+        The player leaves this world in the next tick. In the other one it joins as a new player; `player.handed` is
+        `data` there, when `on_join` is called.
+
+        Args:
+            player: the player.
+            world: name of the world.
+            data: anything that the rules of the other world understand; clients do not see it.
+            reason: text of at most 500 characters for the client.
+
+        Returns:
+            Whether the player goes; False: its connection is lost at the moment.
+
+        Raises:
+            RulesError: the server has no other worlds.
+            SceneError: `player` is not a player of this game.
+            WorldsError: there is no such world, or it is full.
+        """
+        self.turn.check("send_away")
+        if player not in self.kept.players.values():
+            raise SceneError(f"player = {shown(player)}: must be a `Player` of this game")
+        reason = text(reason, "reason", REASON_MAX, shortest=0)
+        worlds = self.worlds
+        if player.session is None or player.session.closed or player in [known for known, _ in self.sent_away]:
+            return False
+        self.sent_away.append((player, worlds.seat(world, player.subject, data, reason)))
+        return True
 
     def pardon(self, who: str) -> bool:
         """Lets players who were kicked for some time join again. Returns whether there was one.

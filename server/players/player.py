@@ -35,6 +35,8 @@ class Player:
         """Whether `on_join` has been called for the player."""
         self.loaded: Any = None
         """Result of `Rules.load_player`; not saved."""
+        self.handed: Any = None
+        """Data that the rules of another world handed over with the player (`GameApi.send_away`); not saved."""
         self.inputs = inputs or InputQueue()
         self.commands: deque[Command] = deque()
         """Commands that wait for their tick."""

@@ -1,0 +1,151 @@
+"""All worlds of one server, and the way of each connection into one of them.
+
+Theory of operation. A world begins with a game that the host makes, and ticks while somebody is in it. `tick`, which
+the host calls about ten times per second, gives seats to those who wait, lets empty worlds rest, and ends those that
+were empty for too long. A client is never moved from world to world over one connection: it gets a path with a reserved
+seat, and connects anew. So a world never sees a client of another one, and a world may as well be in another process.
+"""
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from server.config.limits import Limits
+from server.game import Game
+from server.game.loading import Runner, at_once
+from server.observability.errors import FaultReporter
+from server.worlds.api import RulesWorlds
+from server.worlds.bucket import Bucket
+from server.worlds.directory import Directory
+from server.worlds.host import Host, Way
+from server.worlds.hosted import Entrance
+from server.worlds.kinds import Kind, WorldsError
+from server.worlds.lobby import VERBS, Lobby, LobbySession, Request
+from server.worlds.matchmaking import Matchmaking
+from shared.fields import PATH_MAX
+
+ADDRESSES_MAX = 4096
+"""Maximum number of addresses whose requests are counted. Of more, the one that asked longest ago is forgotten."""
+BURST_S = 10.0
+"""Seconds whose allowed requests of an address may come at once."""
+
+
+class Worlds(Directory):
+    """All worlds of one server.
+
+    Args:
+        kinds: the kinds of worlds.
+        limits: the limits.
+        host: makes the games and runs the ticks.
+        default: the default world, at the path `/`; None: there is none.
+        authenticate: returns the subject of a client's token, as for `Game`.
+        key: key of the seats, at least 32 bytes; None: a new one.
+        faults: where exceptions in our own code are reported.
+        run: runs `Rules.load_player` for those who wait for a match.
+    """
+
+    def __init__(
+        self,
+        kinds: Mapping[str, Kind],
+        limits: Limits,
+        host: Host,
+        *,
+        default: Game | None = None,
+        authenticate: Callable[[str], str] | None = None,
+        key: bytes | None = None,
+        faults: FaultReporter | None = None,
+        run: Runner = at_once,
+    ) -> None:
+        super().__init__(kinds, limits, host, key=key, faults=faults)
+        self.default = default
+        self.matchmaking = Matchmaking(self)
+        self.lobby = self.matchmaking.lobby = Lobby(self.matchmaking, limits, authenticate, self.faults, run)
+        self._asked: dict[str, Bucket] = {}
+        if default is not None:
+            default.api.hosting = RulesWorlds(self, None)
+
+    def route(self, target: str, address: str = "") -> Way | str:
+        """Returns what the path of a WebSocket request leads to, or the reason why it leads nowhere.
+
+        Args:
+            target: path and query.
+            address: the client's address, by which requests are limited; empty: they are not.
+        """
+        path, _, query = target[:PATH_MAX].partition("?")
+        name = path.strip("/")
+        if not name:
+            return self.default or "there is no default world; ask for a match"
+        try:
+            if name in VERBS:
+                if address and not self._limit(address).take(self.now):
+                    self.counts["refused_often"] += 1
+                    return "too many requests from your address; wait some seconds"
+                return _LobbyWay(self.lobby, Request(name, query))
+            world, seat = self.get(name), None
+            if query.startswith("seat="):
+                found = self.seats.take(name, query.removeprefix("seat="), self.now)
+                if isinstance(found, str):
+                    self.counts["seats_refused"] += 1
+                    return found
+                seat = found
+            return Entrance(world, seat, self.wake)
+        except WorldsError as error:
+            return str(error)
+
+    def tick(self, now: float) -> None:
+        """Does what is due: call it about ten times per second.
+
+        Args:
+            now: the current time in seconds.
+        """
+        self.look_after(now)
+        self.matchmaking.tick(now)
+
+    def shut_down(self, reason: str, wait: float) -> None:
+        """Closes all connections but those of the default world, because the server goes down.
+
+        Args:
+            reason: the reason, sent to the clients.
+            wait: seconds after which the clients should reconnect.
+        """
+        self.draining = True
+        self.lobby.shut_down(reason, wait)
+        for world in tuple(self.worlds.values()):
+            self.rest(world)
+            world.game.shut_down(reason, wait)
+
+    def stats(self) -> dict[str, Any]:
+        """Returns figures for `/stats`."""
+        return {
+            "worlds": len(self.worlds),
+            "worlds_ticking": sum(world.ticking for world in self.worlds.values()),
+            "worlds_asleep": len(self.asleep),
+            "seats_reserved": len(self.seats),
+            "waiting": self.matchmaking.waiting,
+            "lobby_connections": len(self.lobby.sessions),
+            "worlds_counts": dict(self.counts),
+        }
+
+    def _limit(self, address: str) -> Bucket:
+        """Returns the limit of an address, and makes it the one that asked last."""
+        rate = self.limits.asks_per_s
+        limit = self._asked.pop(address, None) or Bucket(rate, max(1.0, rate * BURST_S))
+        if len(self._asked) >= ADDRESSES_MAX:
+            del self._asked[next(iter(self._asked))]
+        self._asked[address] = limit
+        return limit
+
+
+class _LobbyWay:
+    """The way into the lobby for one connection.
+
+    Args:
+        lobby: the lobby.
+        request: what the client asks for.
+    """
+
+    def __init__(self, lobby: Lobby, request: Request) -> None:
+        self._lobby, self._request = lobby, request
+        self.receive, self.lost = lobby.receive, lobby.lost
+
+    def open(self, link: Any, now: float) -> LobbySession:
+        return self._lobby.open(link, self._request, now)
