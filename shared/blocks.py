@@ -17,7 +17,7 @@ import hashlib
 import itertools
 import math
 import zlib
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from typing import TypeVar
 
 import numpy as np
@@ -45,6 +45,9 @@ DIGEST_BYTES = 16
 
 Kinds = npt.NDArray[np.uint8]
 """Kinds of blocks; for a whole segment [32768], by index z << 10 | y << 5 | x."""
+
+Large = tuple[Kinds, npt.NDArray[np.uint32], npt.NDArray[np.int32]]
+"""The arrays `kinds`, `solid` and `heads` of `Blocks`."""
 
 _versions = itertools.count(1)
 
@@ -173,6 +176,11 @@ class Blocks:
         self._free: list[int] = []
         self._stale: set[int] = set()
         """Rows whose digests are not up to date."""
+        self.generated: dict[Cell, int] = {}
+        """Versions of segments whose blocks are as the scene's generator makes them."""
+        self.lend: Callable[[], Large] | None = None
+        """Function that returns the large arrays for a copy of these blocks, which then must not change any more.
+        None: the arrays are copied."""
 
     def __contains__(self, index: Cell) -> bool:
         return index in self.rows
@@ -323,8 +331,13 @@ class Blocks:
             self.digests[:] = other.digests
             return False
         self.count, self.rows, self._free = other.count, dict(other.rows), list(other._free)
-        for name in ("kinds", "solid", "segments", "versions", "digests", "heads", "table", "near"):
+        self.generated = dict(other.generated)
+        for name in ("segments", "versions", "digests", "table", "near"):
             setattr(self, name, getattr(other, name).copy())
+        if other.lend is not None:
+            self.kinds, self.solid, self.heads = other.lend()
+        else:
+            self.kinds, self.solid, self.heads = other.kinds.copy(), other.solid.copy(), other.heads.copy()
         return True
 
     def _touch(self, row: int) -> None:

@@ -54,6 +54,7 @@ class World(TurnWorld):
         for index in self.scene.segments() if indices is None else indices:
             segment = blocks.checked_segment(index)
             self._load(segment, terrain.generate(self.scene.terrain, segment))
+            self.blocks.generated[segment] = self.blocks.version(segment)
 
     def load_segment(self, index: Cell, kinds: blocks.Kinds) -> None:
         """Adds or replaces a segment, and wakes the entities that overlap or touch it.

@@ -266,6 +266,8 @@ class _FilePen(Observer):
 
 def packed(world: WorldState, index: Cell) -> bytes | None:
     """Returns the packed blocks of a loaded segment; None if they are as generated."""
+    if world.blocks.generated.get(index) == world.blocks.version(index):
+        return None
     kinds = world.blocks.segment(index)
     with suppress(SceneError):
         if np.array_equal(terrain.generate(world.scene.terrain, index), kinds.reshape(-1)):

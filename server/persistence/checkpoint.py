@@ -10,7 +10,6 @@ import numpy.typing as npt
 from server.journal import former
 from server.journal.recorded_world import RecordedWorld
 from server.journal.records import checked_states
-from shared import terrain
 from shared.blocks import DIGEST_BYTES, Kinds, digest_of, pack, unpack
 from shared.checks import Cell
 from shared.layout import FALLING, FLAGS, ID, Int64s
@@ -118,30 +117,44 @@ class Copy:
         return kinds
 
 
-def generated(scene: Scene, *, compiled: bool | None = None) -> tuple[RecordedWorld, Checkpoint]:
-    """Returns a new world of a scene with all its terrain, and its checkpoint."""
+def generated(
+    scene: Scene, *, compiled: bool | None = None, terrain: World | None = None
+) -> tuple[RecordedWorld, Checkpoint]:
+    """Returns a new world of a scene with all its terrain, and its checkpoint. Arguments as for `Store`."""
     world = RecordedWorld(scene, compiled=compiled)
-    world.load_terrain()
+    if terrain is None:
+        world.load_terrain()
+    else:
+        world.restore(terrain)
     segments: list[Segment] = [(*cell, None) for cell in world.blocks]
     return world, Checkpoint(world.tick, world.next_id, b"", world.state_hash(), NOTHING, segments, [])
 
 
-def restored(scene: Scene, checkpoint: Checkpoint, *, compiled: bool | None = None) -> RecordedWorld:
-    """Restores the world of a checkpoint that has all segments.
+def restored(
+    scene: Scene, checkpoint: Checkpoint, *, compiled: bool | None = None, terrain: World | None = None
+) -> RecordedWorld:
+    """Restores the world of a checkpoint that has all segments. Arguments as for `Store`.
 
     Raises:
         ValueError: the hash of the result differs from the saved one.
     """
+    world = RecordedWorld(scene, compiled=compiled)
+    if terrain is not None:
+        world.restore(terrain)
+    as_generated = [(x, y, z) for x, y, z, packed in checkpoint.segments if packed is None]
+    world.load_terrain(cell for cell in as_generated if cell not in world.blocks)
     loaded = {
-        (x, y, z): terrain.generate(scene.terrain, (x, y, z)) if packed is None else unpack(packed)
+        (x, y, z): world.blocks.segment((x, y, z)).reshape(-1) if packed is None else unpack(packed)
         for x, y, z, packed in checkpoint.segments
     }
     states = checked_states(scene, np.frombuffer(checkpoint.states, "<i8").astype(np.int64))
     if _hash(checkpoint, loaded, states) != checkpoint.hash:  # before the kernel gets them: it does not check its rows
         raise ValueError(f"the world of tick {checkpoint.tick} is not the one that was saved")
-    world = RecordedWorld(scene, compiled=compiled)
-    for cell, kinds in loaded.items():
-        world.load_segment(cell, kinds)
+    for cell in [cell for cell in world.blocks if cell not in loaded]:
+        world.unload_segment(cell)
+    for x, y, z, packed in checkpoint.segments:
+        if packed is not None:
+            world.load_segment((x, y, z), loaded[x, y, z])
     world.write(states)
     world.next_id = checkpoint.next_id
     world.rebase(checkpoint.tick)

@@ -15,6 +15,7 @@ from server.persistence.checkpoint import Known
 from server.persistence.database import Database, Saved, StoreError
 from shared.checks import Cell
 from shared.scene import Scene
+from shared.world import World
 
 logger = logging.getLogger(__name__)
 
@@ -43,7 +44,9 @@ class Loaded(NamedTuple):
     """Segments of the checkpoint."""
 
 
-def load(path: Path, scene: Scene, game: str = "", *, compiled: bool | None = None) -> Loaded:
+def load(
+    path: Path, scene: Scene, game: str = "", *, compiled: bool | None = None, terrain: World | None = None
+) -> Loaded:
     """Restores a world from its checkpoint and its log, comparing each tick, or makes and saves a new one.
 
     Args:
@@ -52,6 +55,7 @@ def load(path: Path, scene: Scene, game: str = "", *, compiled: bool | None = No
             if the world was saved by a clean stop.
         game: the name of the game, which must be the same, too; empty: none.
         compiled: whether the kernel is compiled, as for `World`.
+        terrain: a world whose terrain is shared, as for `Store`.
 
     Raises:
         StoreError: the saved world cannot be used. It has not been changed.
@@ -63,7 +67,7 @@ def load(path: Path, scene: Scene, game: str = "", *, compiled: bool | None = No
         logger.info("%s: migrated from schema version %d to %d", path, version, len(database.MIGRATIONS))
     saved = database.read(path) if version else None
     if saved is None:
-        return _new(path, scene, game, compiled)
+        return _new(path, scene, game, compiled, terrain)
     if saved.game is not None and saved.game != game:
         raise StoreError(
             f"{path}: was saved by {_served(saved.game)}, and this is {_served(game)}. Start the same game, or use "
@@ -81,7 +85,7 @@ def load(path: Path, scene: Scene, game: str = "", *, compiled: bool | None = No
                 f"{path}: was saved with another scene (different: {', '.join(differ)}). Start with the scene that it "
                 "was saved with, or use another directory"
             )
-        return _replayed(scene, saved, compiled)
+        return _replayed(scene, saved, compiled, terrain)
     except StoreError:
         raise
     except DivergedError as error:
@@ -126,8 +130,8 @@ def _served(game: str) -> str:
     return f"a server of the game {game}" if game else "a server without a game"
 
 
-def _new(path: Path, scene: Scene, game: str, compiled: bool | None) -> Loaded:
-    world, first = checkpoint.generated(scene, compiled=compiled)
+def _new(path: Path, scene: Scene, game: str, compiled: bool | None, terrain: World | None) -> Loaded:
+    world, first = checkpoint.generated(scene, compiled=compiled, terrain=terrain)
     file = Database(path)
     try:
         file.save(first, msgpack.packb(scene.to_table()), 0, game)
@@ -136,8 +140,8 @@ def _new(path: Path, scene: Scene, game: str, compiled: bool | None) -> Loaded:
     return Loaded(world, None, [], world.tick, 0, 0, checkpoint.saved_of(world))
 
 
-def _replayed(scene: Scene, saved: Saved, compiled: bool | None) -> Loaded:
-    world = checkpoint.restored(scene, saved.checkpoint, compiled=compiled)
+def _replayed(scene: Scene, saved: Saved, compiled: bool | None, terrain: World | None) -> Loaded:
+    world = checkpoint.restored(scene, saved.checkpoint, compiled=compiled, terrain=terrain)
     known = checkpoint.saved_of(world)  # before the log, because segments that it touches go into the next checkpoint
     notes: list[Note] = []
     chain = saved.chain

@@ -54,6 +54,7 @@ from server.persistence.restore import claimed, load
 from shared.checks import Cell, text
 from shared.inputs import Input
 from shared.scene import Scene
+from shared.world import World
 from shared.world_state import WorldState
 
 LOG_BYTES_MAX = 32 << 20
@@ -88,6 +89,7 @@ class Store(Observer):
         power: whether a durable tick survives a power cut (by an fsync), or only the end of the process.
         checkpoint_s: seconds of the world's time between two checkpoints.
         compiled: whether the kernel is compiled, as for `World`.
+        terrain: a world of the scene as it was generated, for `World.restore`; None: it is generated anew.
 
     Attributes:
         world: the saved world, or a new one.
@@ -108,6 +110,7 @@ class Store(Observer):
         power: bool = True,
         checkpoint_s: float = 60.0,
         compiled: bool | None = None,
+        terrain: World | None = None,
     ) -> None:
         super().__init__(first=False, hashed_max=HASHED_MAX, stale_max=STALE_MAX)
         text(game, "game", GAME_MAX, shortest=0)
@@ -123,11 +126,9 @@ class Store(Observer):
         self.commit_s, self.checkpoint_s = Histogram(), Histogram()
         """Durations from the end of a step until its record was on disk, and durations of checkpoints."""
         # Used by the thread only:
-        self._chain_there = 0
-        self._retry_s = RETRY_S
+        self._chain_there, self._retry_s, self._began = 0, RETRY_S, 0.0
         self._copying: Copy | None = None
         self._pieces: Iterator[Checkpoint | None] = iter(())
-        self._began = 0.0
         # Shared by the event loop and the thread, guarded by the lock of `_wake`:
         self._wake = threading.Condition()
         self._records: list[tuple[int, bytes, float]] = []
@@ -135,15 +136,14 @@ class Store(Observer):
         self._urgent = self._closing = self._copy_due = self._gap = self._reopening = False
         self._claim = claimed(self._path.parent)
         try:
-            loaded = load(self._path, scene, game, compiled=compiled)
+            loaded = load(self._path, scene, game, compiled=compiled, terrain=terrain)
             self._file: Database | None = Database(self._path, power=power)
             self._saved: Saved = loaded.saved
             self._seals: dict[bytes, Saved] = {self._file.seal(): loaded.saved}
-        except sqlite3.Error as error:
+        except BaseException as error:
             self._claim.close()
-            raise StoreError(f"{self._path}: cannot be written ({error})") from error
-        except BaseException:
-            self._claim.close()
+            if isinstance(error, sqlite3.Error):
+                raise StoreError(f"{self._path}: cannot be written ({error})") from error
             raise
         self.world, self.kept = loaded.world, loaded.kept
         self.notes: Sequence[tuple[int, Any]] = loaded.notes
