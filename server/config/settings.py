@@ -15,7 +15,8 @@ from pathlib import Path
 from typing import Any
 
 from server.config.hosts import ANY, is_loopback
-from server.config.limits import Limits
+from server.config.kinds import KindSettings, kinds_from
+from server.config.limits import HOUR_S, Limits
 from server.config.options import Option, Parser, SettingsError, checked, kinds_of, nearest, setting, to_toml
 from shared import kernels
 from shared.bounds import TICK_RATE_MAX
@@ -29,8 +30,8 @@ CONFIG_VARIABLE = ENV_PREFIX + "CONFIG"
 """Environment variable with the path of the TOML file."""
 ADDRESSES = ("none", "loopback", "private", "all")
 """Groups of client addresses, each including the one before; choices of the setting `figures`."""
-KEY_VARIABLE = "SOVEREIGN_AUTH_KEY"
-"""Environment variable with the key itself. There is no flag for it: every user of a machine can read flags."""
+KEY_VARIABLE, OPERATOR_VARIABLE = "SOVEREIGN_AUTH_KEY", "SOVEREIGN_OPERATOR_TOKEN"
+"""Environment variables with secrets. They have no flags, because every user of a machine can read flags."""
 LOG_FORMATS = ("pretty", "json")
 """Choices of the setting `log_format`."""
 LOG_LEVELS = ("debug", "info", "warning", "error")
@@ -106,6 +107,12 @@ class Settings:
     restart_s: float = setting(
         2.0, Option(float, "seconds after which clients should reconnect when the server stops", "S", 0, 3600)
     )
+    drain_s: float = setting(
+        0.0, Option(float, "seconds that worlds may go on to their end when the server is to stop", "S", 0, 24 * HOUR_S)
+    )
+    operator_token_file: str | None = setting(
+        None, Option(str, f"file with the token of operators; alternatively itself in {OPERATOR_VARIABLE}", "FILE")
+    )
     log_level: str = setting("info", Option(str, "lowest level of the log lines on stderr", choices=LOG_LEVELS))
     log_format: str = setting("pretty", Option(str, "format of the log", choices=LOG_FORMATS))
     game: str | None = setting(None, Option(str, "class with the rules of a game (default: none)", "MODULE:CLASS"))
@@ -133,6 +140,8 @@ class Settings:
     limits: Limits = field(default_factory=Limits)
     options: Mapping[str, object] = field(default_factory=dict)
     """Options of the game by name, as the operator gave them; `server.rules` checks them."""
+    worlds: Mapping[str, KindSettings] = field(default_factory=dict)
+    """Kinds of worlds by name; empty: the server has one world."""
     origins: Mapping[str, str] = field(default_factory=dict, compare=False)
 
     def to_toml(self) -> str:
@@ -150,6 +159,8 @@ class Settings:
         for name, value in self.options.items():
             shown = to_toml(value) if isinstance(value, str | int | float | bool) else repr(value)
             lines.append(f"{name} = {shown}  # {self.origins.get(f'option {name}', 'default')}")
+        for name, kind in self.worlds.items():
+            lines += ["", *kind.to_toml(name)]
         return "\n".join(lines) + "\n"
 
 
@@ -158,14 +169,14 @@ GROUPS = {
     "network": ("host", "port", "tls_cert", "tls_key", "allowed_origins", "allowed_hosts"),
     "access": ("auth", "auth_key_file"),
     "saving": ("data", "durability", "checkpoint_s", "record"),
-    "operation": ("log_level", "log_format", "figures", "page", "restart_s"),
+    "operation": ("log_level", "log_format", "figures", "page", "restart_s", "drain_s", "operator_token_file"),
 }
 """Groups of settings as `--help` shows them, the ones for beginners first. Settings in no group are shown as limits."""
 SECTIONS: dict[str, dict[str, Option]] = {"": kinds_of(Settings), "limits": kinds_of(Limits)}
 """Options by the table of the TOML file that has them, and by name. A name is in one table only."""
 KINDS: dict[str, Option] = {name: kind for names in SECTIONS.values() for name, kind in names.items()}
 """Options of all settings by name."""
-VARIABLES = [*(ENV_PREFIX + name.upper() for name in KINDS), CONFIG_VARIABLE, KEY_VARIABLE]
+VARIABLES = [*(ENV_PREFIX + name.upper() for name in KINDS), CONFIG_VARIABLE, KEY_VARIABLE, OPERATOR_VARIABLE]
 """Environment variables that are read. Another variable that begins with `ENV_PREFIX` is an error."""
 DEFAULTS: dict[str, Any] = {f.name: f.default for owner in (Settings, Limits) for f in dataclasses.fields(owner)}
 """Default values of all settings by name."""
@@ -216,7 +227,8 @@ def load(
     for name, value, origin in _options(options, config):
         of_game[name], origins[f"option {name}"] = value, origin
     limits = Limits(**{name: values.pop(name) for name in SECTIONS["limits"] if name in values})
-    settings = Settings(**values, limits=limits, options=of_game, origins=origins)
+    worlds = {} if config is None else kinds_from(_read(config).get("worlds", {}), f"file {config}")
+    settings = Settings(**values, limits=limits, options=of_game, worlds=worlds, origins=origins)
     _check_together(settings)
     return settings
 
@@ -262,7 +274,8 @@ def _entries(config: str) -> Iterator[tuple[str, object]]:
         SettingsError: the file cannot be read, or has an unknown name or a name in the wrong table.
     """
     tables = {"": _read(config)}
-    tables[""].pop("options", None)
+    for apart in ("options", "worlds"):
+        tables[""].pop(apart, None)
     tables |= {name: tables[""].pop(name) for name in SECTIONS if isinstance(tables[""].get(name), dict)}
     for section, table in tables.items():
         known, place = SECTIONS[section], f"[{section}] in " if section else ""

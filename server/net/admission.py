@@ -38,8 +38,9 @@ HOST = re.compile(r"(?:\[([^]]*)\]|([^]:%[]*))(?::\d*)?")
 class Request(NamedTuple):
     """The parts of an HTTP request that matter for admission.
 
-    `host` is the header `Host`, empty if there is none. `origin` is the header `Origin`, None if there is none.
-    `upgrade` says whether the request asks for a WebSocket.
+    `target` is path and query. `host` is the header `Host`, empty if there is none. `origin` is the header `Origin`,
+    None if there is none. `upgrade` says whether the request asks for a WebSocket. `authorization` is the header
+    `Authorization`, empty if there is none.
     """
 
     method: str
@@ -47,6 +48,7 @@ class Request(NamedTuple):
     host: str
     origin: str | None
     upgrade: bool
+    authorization: str = ""
 
 
 class Admission:
@@ -118,7 +120,8 @@ class Admission:
             if request.host and ANY not in self._hosts and not self._own(request.host):
                 self.refused["host"] += 1
                 return line(HTTPStatus.MISDIRECTED_REQUEST, f"{request.host[:100]!r} {NOT_OWN}")
-            return self._pages.get(request.method, request.target, trusted=self.trusted(address))
+            trusted = self.trusted(address)
+            return self._pages.get(request.method, request.target, trusted=trusted, authorization=request.authorization)
         reason, page = self._refusal(request, address, now)
         if page is not None:
             self.refused[reason] += 1

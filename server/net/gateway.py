@@ -2,6 +2,7 @@
 
 import asyncio
 import ssl
+from collections.abc import Callable
 from typing import Any, Protocol
 
 from server.net.addresses import listeners
@@ -9,6 +10,7 @@ from server.net.admission import Admission
 from server.net.tls_accept import Handshakes
 from server.net.websocket import Connection
 from server.observability.errors import FaultReporter
+from server.observability.pages import Page
 
 ACCEPT_BACKLOG = 1024
 """Connections that may wait to be accepted."""
@@ -34,10 +36,20 @@ class Gateway:
         game: gets every event.
         admission: decides which connections are accepted, and answers requests for pages.
         faults: where exceptions of the game are reported.
+        route: returns what gets the events of a WebSocket instead of `game`, from the target (path and query) of its
+            request and the address of its client; or the page that answers the request instead. None: any target leads
+            to `game`.
     """
 
-    def __init__(self, game: Events, admission: Admission | None = None, faults: FaultReporter | None = None) -> None:
+    def __init__(
+        self,
+        game: Events,
+        admission: Admission | None = None,
+        faults: FaultReporter | None = None,
+        route: Callable[[str, str], Events | Page] | None = None,
+    ) -> None:
         self.game = game
+        self.route = route
         self.admission = admission or Admission()
         self.faults = faults or FaultReporter()
         self.connections: set[Connection] = set()

@@ -25,6 +25,7 @@ from websockets.server import ServerProtocol
 
 from server.net.http import answer_request
 from server.net.tls_accept import AcceptedSocket
+from server.observability.pages import BROKEN, Page
 from shared.fields import CLIENT_MESSAGE_MAX
 
 try:
@@ -35,7 +36,7 @@ if sys.platform == "linux":
     import fcntl
     from termios import TIOCOUTQ as SIOCOUTQ
 if TYPE_CHECKING:
-    from server.net.gateway import Gateway
+    from server.net.gateway import Events, Gateway
 
 CLOSE_S = 2.0
 """Seconds in which a peer must finish closing before it is aborted."""
@@ -70,6 +71,7 @@ class Connection(AcceptedSocket):
     def __init__(self, gateway: "Gateway", loop: asyncio.AbstractEventLoop) -> None:
         self.opened = False
         self._gateway = gateway
+        self._events: Events = gateway.game  # what gets the events of this connection
         self._loop = loop
         self._protocol = ServerProtocol(max_size=CLIENT_MESSAGE_MAX, logger=_quiet)
         self._transport: asyncio.Transport | None = None
@@ -183,19 +185,38 @@ class Connection(AcceptedSocket):
 
     def _shake_hands(self, data: bytes) -> bytes:
         """Handles the HTTP request. Returns the bytes after it, from clients that do not wait for the answer."""
-        rest = answer_request(self._protocol, data, self._gateway.admission, self._address or "")
+        rest = answer_request(self._protocol, data, self._gateway.admission, self._address or "", self._find_events)
         self._flush()
         if not self._live:
             return b""
         self._open()
         return rest
 
+    def _find_events(self, target: str) -> Page | None:
+        """Finds what gets the events of this connection. Returns the page that refuses the request; None: it is good.
+
+        Args:
+            target: target of the request for a WebSocket: path and query.
+        """
+        if self._gateway.route is None:
+            return None
+        try:
+            found = self._gateway.route(target, self._address or "")
+        except Exception:
+            self._gateway.faults.report("route")
+            return BROKEN
+        if isinstance(found, Page):
+            self._gateway.admission.refused["path"] += 1
+            return found
+        self._events = found
+        return None
+
     def _open(self) -> None:
         if self._timer is not None:
             self._timer.cancel()
         self.opened = True
         try:
-            self._session = self._gateway.game.open(self, time.monotonic())
+            self._session = self._events.open(self, time.monotonic())
         except Exception:
             self._gateway.faults.report("open")
             self.close(CloseCode.INTERNAL_ERROR, "internal error")
@@ -274,7 +295,7 @@ class Connection(AcceptedSocket):
 
     def _deliver(self, message: bytes) -> None:
         try:
-            self._gateway.game.receive(self._session, message, time.monotonic())
+            self._events.receive(self._session, message, time.monotonic())
         except Exception:
             self._gateway.faults.report("receive")
             self.close(CloseCode.INTERNAL_ERROR, "internal error")
@@ -302,7 +323,7 @@ class Connection(AcceptedSocket):
         if session is None:
             return
         try:
-            self._gateway.game.lost(session, time.monotonic())
+            self._events.lost(session, time.monotonic())
         except Exception:
             self._gateway.faults.report("lost")
 

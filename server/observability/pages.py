@@ -20,6 +20,19 @@ class Page(NamedTuple):
     headers: tuple[tuple[str, str], ...] = ()
 
 
+class PageRequest(NamedTuple):
+    """A request for a page: its parts, and whether its client may see private pages.
+
+    `query` is the part of the target behind `?`. `authorization` is the header `Authorization`, empty if there is none.
+    """
+
+    method: str
+    path: str
+    query: str
+    trusted: bool
+    authorization: str
+
+
 def line(status: int, text: str, **headers: str) -> Page:
     """Returns a page with one line of text.
 
@@ -64,6 +77,8 @@ class Pages:
         public: functions that make the pages for every client, by path. `/` and `/healthz` exist besides.
         private: functions that make the pages for trusted clients, by path. They take precedence over public ones.
         failed: called with the path of a page whose function has raised.
+        more: makes the pages whose paths come and go, and answers other methods than GET. It is asked first; None: this
+            request is not for it.
     """
 
     def __init__(
@@ -71,20 +86,34 @@ class Pages:
         public: Mapping[str, Callable[[], Page]] | None = None,
         private: Mapping[str, Callable[[], Page]] | None = None,
         failed: Callable[[str], None] = lambda path: None,
+        more: Callable[[PageRequest], Page | None] | None = None,
     ) -> None:
         self._public = {"/": lambda: GAME, "/healthz": lambda: HEALTHY, **(public or {})}
         self._private = private or {}
         self._failed = failed
+        self._more = more
 
-    def get(self, method: str, target: str, *, trusted: bool) -> Page:
+    def get(self, method: str, target: str, *, trusted: bool, authorization: str = "") -> Page:
         """Returns the answer to a request. Never raises.
 
         Args:
             method: the HTTP method.
             target: the request target: path and query.
             trusted: whether the client may see private pages.
+            authorization: the header `Authorization`; empty if there is none.
         """
-        path = target.partition("?")[0]
+        path, _, query = target.partition("?")
+        try:
+            if self._more is not None:
+                page = self._more(PageRequest(method, path, query, trusted, authorization))
+                if page is not None:
+                    return page
+            return self._get(method, path, trusted)
+        except Exception:
+            self._failed(path)
+            return BROKEN
+
+    def _get(self, method: str, path: str, trusted: bool) -> Page:
         make = (self._private.get(path) if trusted else None) or self._public.get(path)
         if method != "GET":
             return NO_GET
@@ -92,8 +121,4 @@ class Pages:
             return line(HTTPStatus.FORBIDDEN, f"{path}: not allowed for your address")
         if make is None:
             return line(HTTPStatus.NOT_FOUND, f"{path}: no such page")
-        try:
-            return make()
-        except Exception:
-            self._failed(path)
-            return BROKEN
+        return make()

@@ -166,6 +166,7 @@ class Ticker:
         alarm: makes a timer that calls the given function.
         faults: where ticks that raise are reported.
         clock: returns the current time in seconds.
+        paused: whether no tick runs before `resume`.
     """
 
     def __init__(
@@ -176,6 +177,8 @@ class Ticker:
         alarm: Callable[[Callable[[], None]], Alarm],
         faults: FaultReporter | None = None,
         clock: Callable[[], float] = time.monotonic,
+        *,
+        paused: bool = False,
     ) -> None:
         self.lateness = Histogram()
         self.work = Histogram()
@@ -189,16 +192,35 @@ class Ticker:
         self._faults = faults or FaultReporter()
         self._clock = clock
         self._failures_in_a_row = 0
-        self._stopped = False
-        self._alarm = alarm(self._ring)
+        self._make_alarm = alarm
+        self._alarm: Alarm | None = None
         self._schedule = Schedule(rate, clock())
-        self._alarm.set(self._schedule.deadline)
+        if not paused:
+            self._start()
+
+    def resume(self, phase: float) -> None:
+        """Lets ticks run. Does nothing if they do.
+
+        Args:
+            phase: part of the tick's time, from 0 to 1, by which the deadlines are after the whole multiples of it, so
+                that the ticks of several tickers can be spread.
+        """
+        if self._alarm is None:
+            rate, skipped = self._schedule.rate, self._schedule.skipped
+            first = (math.floor(self._clock() * rate - phase) + 1 + phase) / rate
+            self._schedule = Schedule(rate, first)
+            self._schedule.skipped = skipped
+            self._start()
 
     def stop(self) -> None:
-        """Stops the ticker. No tick runs after this."""
-        if not self._stopped:
-            self._stopped = True
+        """Stops the ticker. No tick runs after this, unless it is resumed."""
+        if self._alarm is not None:
             self._alarm.close()
+            self._alarm = None
+
+    def _start(self) -> None:
+        self._alarm = self._make_alarm(self._ring)
+        self._alarm.set(self._schedule.deadline)
 
     def stats(self) -> dict[str, Any]:
         """Returns the figures of the ticker since the start. `histogram.between` computes those of a period."""
@@ -213,13 +235,13 @@ class Ticker:
         }
 
     def _ring(self) -> None:
-        if self._stopped:
+        if self._alarm is None:
             return
         now = self._clock()
         deadline = self._schedule.take(now)
         if deadline is not None:
             self._run(deadline, now)
-        if not self._stopped:
+        if self._alarm is not None:
             self._alarm.set(self._schedule.deadline)
 
     def _run(self, deadline: float, now: float) -> None:

@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from server.observability.pages import Page, Pages, json_page, ready_page
+from server.observability.pages import Page, PageRequest, Pages, json_page, line, ready_page
 
 
 def test_pages_by_path_and_method() -> None:
@@ -35,3 +35,27 @@ def test_a_page_that_fails_is_reported_and_does_not_show_the_reason(figures: obj
     pages = Pages(private={"/stats": json_page(figures)}, failed=failed.append)  # type: ignore[arg-type]
     page = pages.get("GET", "/stats", trusted=True)
     assert (page.status, page.body, failed) == (500, b"internal error\n", ["/stats"])
+
+
+def test_pages_that_come_and_go_and_other_methods() -> None:
+    asked: list[PageRequest] = []
+    there = {"/a/live"}
+
+    def more(request: PageRequest) -> Page | None:
+        asked.append(request)
+        if request.method == "DELETE" and request.authorization == "Bearer x":
+            there.discard(request.path)
+            return line(200, "gone")
+        return line(200, "here") if request.method == "GET" and request.path in there else None
+
+    failed: list[str] = []
+    pages = Pages({"/readyz": lambda: Page(200, b"yes")}, failed=failed.append, more=more)
+    assert pages.get("GET", "/a/live?x=1", trusted=True).body == b"here\n"
+    assert asked == [PageRequest("GET", "/a/live", "x=1", True, "")]
+    assert pages.get("GET", "/readyz", trusted=False).body == b"yes"
+    assert pages.get("DELETE", "/a/live", trusted=False).status == 405
+    assert pages.get("DELETE", "/a/live", trusted=False, authorization="Bearer x").status == 200
+    assert pages.get("GET", "/a/live", trusted=True).status == 404
+    pages = Pages(failed=failed.append, more=lambda request: 1 / 0)  # type: ignore[arg-type, return-value]
+    assert pages.get("GET", "/b", trusted=True).status == 500
+    assert failed == ["/b"]

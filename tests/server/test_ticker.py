@@ -235,3 +235,46 @@ async def test_alarms_ring_once_never_early_and_not_after_close(
     alarm.close()
     await asyncio.sleep(0.01)
     assert len(rings) == 3
+
+
+@pytest.mark.parametrize("phase", [0.0, 0.25, 0.5, 0.75])
+def test_a_phase_puts_the_deadlines_between_the_whole_multiples_of_the_ticks_time(phase: float) -> None:
+    bench = Bench()
+    bench.ticker.stop()
+    bench.now = 103 * PERIOD + 0.3 * PERIOD
+    bench.ticker.resume(phase)
+    first = 104 if phase < 0.3 else 103
+    bench.run(3)
+    assert [deadline / PERIOD - phase for deadline, _ in bench.calls] == [first, first + 1, first + 2]
+
+
+def test_a_ticker_that_rests_runs_nothing_and_skips_nothing() -> None:
+    bench = Bench()
+    bench.run(2)
+    bench.ticker.stop()
+    assert bench.at is None
+    bench.ring()
+    bench.now += 60.0
+    bench.ticker.resume(0.5)
+    bench.ticker.resume(0.25)  # it runs already
+    before = bench.now
+    bench.run(2)
+    assert len(bench.calls) == 4
+    assert before < bench.calls[2][0] <= before + PERIOD
+    assert bench.calls[2][0] % PERIOD == PERIOD / 2
+    assert (bench.ticker.ticks, bench.ticker.stats()["skipped_s"]) == (4, 0.0)
+
+
+def test_a_paused_ticker_has_no_alarm_until_it_is_resumed() -> None:
+    bench = Bench()
+    made: list[Alarm] = []
+
+    def alarm(ring: Callable[[], None]) -> Alarm:
+        made.append(bench.alarm(ring))
+        return made[-1]
+
+    ticker = Ticker(RATE, bench.tick, bench.breaks, alarm, clock=lambda: bench.now, paused=True)
+    assert not made
+    ticker.stop()
+    ticker.resume(0.0)
+    assert len(made) == 1
