@@ -115,7 +115,13 @@ class Directory:
             WorldsError: the host cannot make its game.
         """
         world = HostedWorld(name, kind, properties, code, self.seats, self.now)
-        world.begin(self._host.begin(world))
+        try:
+            world.begin(self._host.begin(world))
+        except WorldsError:
+            raise
+        except Exception as error:
+            self.faults.report(f"beginning the world {name}")
+            raise WorldsError(f"the world {name!r} could not be made") from error
         world.game.api.hosting = RulesWorlds(self, world)
         self.worlds[name] = world
         self._of_kind[kind.name] += 1

@@ -7,7 +7,7 @@ from server.worlds.bucket import Bucket
 from server.worlds.directory import Directory
 from server.worlds.hosted import HostedWorld
 from server.worlds.kinds import Kind, WorldsError, matches
-from server.worlds.lobby import Lobby, LobbySession
+from server.worlds.lobby import Lobby, LobbySession, Request
 from server.worlds.queue import Queue
 from shared import messages
 from shared.messages import Go
@@ -52,19 +52,18 @@ class Matchmaking:
         assert session.ticket is not None
         try:
             if request.verb == "match":
-                self._queues[self._directory.kind(request.kind).name].add(session)
-                self._serve(self._directory.kind(request.kind), now)
+                kind = self._fitting(request)
+                self._queues[kind.name].add(session)
+                self._serve(kind, now)
             elif request.verb == "join":
                 world = self._directory.coded(request.code)
                 if world.free < request.seats:
                     raise WorldsError(f"the world has no {request.seats} free seats")
                 self._send_on(session, world, "joined by code")
             else:
-                kind = self._creatable(request.kind)
+                kind = self._creatable(self._fitting(request))
                 if not self._creations.take(now):
                     raise WorldsError("too many worlds are being made; try again in a second")
-                if request.seats > kind.players_max:
-                    raise WorldsError(f"seats = {request.seats}: the worlds have {kind.players_max} seats")
                 world = self._directory.create(kind.name, request.properties, private=request.private)
                 self._send_on(session, world, "created")
         except WorldsError as error:
@@ -118,10 +117,7 @@ class Matchmaking:
         Raises:
             WorldsError: it can never be made.
         """
-        seats = sum(session.request.seats for session in group)
-        if seats > kind.players_max:
-            raise WorldsError(f"seats = {seats}: the worlds of the kind {kind.name} have {kind.players_max}")
-        self._creatable(kind.name)
+        self._creatable(kind)
         directory = self._directory
         if directory.draining or not directory.room_for(kind) or not self._creations.take(now):
             return None
@@ -129,8 +125,15 @@ class Matchmaking:
         common = {name: value for name, value in first.items() if all(each.get(name) == value for each in others)}
         return directory.create(kind.name, common)
 
-    def _creatable(self, name: str) -> Kind:
-        kind = self._directory.kind(name)
+    def _fitting(self, request: Request) -> Kind:
+        """Returns the kind that a client asks for. Raises `WorldsError`: there is none, or it has too few seats."""
+        kind = self._directory.kind(request.kind)
+        if request.seats > kind.players_max:
+            raise WorldsError(f"seats = {request.seats}: the worlds of the kind {kind.name} have {kind.players_max}")
+        return kind
+
+    def _creatable(self, kind: Kind) -> Kind:
+        """Returns a kind. Raises `WorldsError`: clients may not make worlds of it."""
         if not kind.create:
             raise WorldsError(f"clients may not make worlds of the kind {kind.name}")
         return kind

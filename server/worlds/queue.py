@@ -3,7 +3,7 @@
 from collections.abc import Iterable, Iterator
 
 from server.observability.errors import FaultReporter
-from server.players.ticket import Ticket
+from server.players.ticket import Property, Ticket
 from server.worlds.kinds import Kind
 from server.worlds.lobby import TELL_S, Lobby, LobbySession
 
@@ -12,7 +12,9 @@ PAIR_S = 1.0
 PAIR_SOON_S = 0.1
 """Seconds between two calls of `Rules.pair` if somebody has come since."""
 FULL_S = 1.0
-"""Seconds after which a client that found all worlds full is looked at again."""
+"""Seconds after which clients that found no world are looked at again, unless somebody has come since."""
+MISSES_MAX = 32
+"""Maximum number of different requests without a world in one pass."""
 
 
 class Queue:
@@ -26,7 +28,8 @@ class Queue:
     def __init__(self, kind: Kind, faults: FaultReporter) -> None:
         self._kind, self._faults = kind, faults
         self._waiting: dict[LobbySession, None] = {}
-        self._new = self._full = False
+        self._new = False
+        self._misses: set[tuple[int, frozenset[tuple[str, Property]]]] = set()
         self._paired_at = self._full_at = float("-inf")
 
     def __len__(self) -> int:
@@ -43,28 +46,27 @@ class Queue:
 
     def wait(self, group: list[LobbySession]) -> None:
         """Takes note that there is no world for a group now."""
-        self._full = True
+        self._misses.add(_wish(group[0]))
 
     def groups(self, now: float) -> Iterator[list[LobbySession]]:
         """Yields the groups that play together now: those that `Rules.pair` forms, or each client by itself.
 
-        After `wait`, no further group is yielded, and none at all for `FULL_S` seconds.
+        A client whose wish is that of one for whom there was no world (`wait`) is left out.
         """
-        self._full = False
-        if self._kind.pair is None:
-            if now - self._full_at < FULL_S and not self._new:
-                return
-            self._new = False
-            for session in tuple(self._waiting):
-                yield [session]
-                if self._full:
-                    self._full_at = now
-                    return
+        self._misses.clear()
+        if self._kind.pair is not None:
+            yield from self._paired(now)
             return
-        for group in self._paired(now):
-            yield group
-            if self._full:
-                return
+        if now - self._full_at < FULL_S and not self._new:
+            return
+        self._new = False
+        for session in tuple(self._waiting):
+            if _wish(session) not in self._misses:
+                yield [session]
+            if len(self._misses) >= MISSES_MAX:
+                break
+        if self._misses:
+            self._full_at = now
 
     def tell(self, lobby: Lobby, now: float) -> None:
         """Tells those who wait, every `TELL_S` seconds, how it goes."""
@@ -109,3 +111,8 @@ class Queue:
                 raise ValueError(f"pair returned {tickets}: more seats than a world has ({self._kind.players_max})")
             found.append([sessions.pop(ticket) for ticket in tickets])
         return found
+
+
+def _wish(session: LobbySession) -> tuple[int, frozenset[tuple[str, Property]]]:
+    """Returns the number of seats and the properties that a client wants."""
+    return session.request.seats, frozenset(session.request.properties.items())

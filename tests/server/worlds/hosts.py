@@ -25,7 +25,7 @@ class SimpleHost:
     def begin(self, world: HostedWorld) -> Game:
         self.done.append(("begin", world.name))
         limits = Limits(clients_max=world.kind.players_max)
-        return Game(world.kind.scene, rules=world.kind.rules(), compiled=False, limits=limits)
+        return Game(world.kind.scene, rules=world.kind.rules(), limits=limits)
 
     def wake(self, world: HostedWorld) -> None:
         self.done.append(("wake", world.name))
