@@ -22,14 +22,18 @@ from client_sdk.events import (
     Happened,
     Joined,
     Left,
+    Matched,
+    Moved,
     Resumed,
     Resynchronised,
     SegmentLoaded,
+    Waiting,
     Withdrawn,
 )
 from client_sdk.loopback import Loopback
 from client_sdk.stats import Stats
 from client_sdk.transports.connection import ConnectError
+from client_sdk.transports.listing import WorldEntry, list_worlds
 from client_sdk.view import EntityView, View
 from shared.inputs import Input, make_input
 
@@ -55,12 +59,17 @@ __all__ = [
     "Left",
     "Link",
     "Loopback",
+    "Matched",
+    "Moved",
     "Resumed",
     "Resynchronised",
     "SegmentLoaded",
     "Stats",
     "View",
+    "Waiting",
     "Withdrawn",
+    "WorldEntry",
+    "list_worlds",
     "make_input",
 ]
 

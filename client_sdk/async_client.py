@@ -13,8 +13,9 @@ import ssl
 import time
 from collections.abc import Callable, Iterable
 from types import TracebackType
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING, Any, cast
 
+from client_sdk import addresses
 from client_sdk.base import BaseClient, set_link
 from client_sdk.compiling import COMPILER
 from client_sdk.core import READ_BYTES, Core
@@ -30,6 +31,7 @@ from client_sdk.transports.connection import (
     stalled,
     unreachable,
 )
+from client_sdk.transports.listing import WorldEntry, list_worlds
 from client_sdk.view import View
 from shared.behaviours import Behaviour
 from shared.checks import duration
@@ -41,6 +43,8 @@ if TYPE_CHECKING:
 
 TIMEOUT_S = 5.0
 """Time that a handshake may take, in seconds."""
+NUMERIC = socket.NI_NUMERICHOST | socket.NI_NUMERICSERV
+"""Flags for the text of an IP address, with the scope of a link-local one."""
 WAIT_S_MIN = 0.001
 """Shortest time to the next update, in seconds: timers are no finer."""
 WAIT_S_MAX = 1.0
@@ -73,6 +77,7 @@ class AsyncClient(BaseClient):
         self._connection = Connection(url, core)
         self._before_update = before_update
         self._loop = asyncio.get_running_loop()
+        self._host = ""
         self._transport: asyncio.Transport | None = None
         self._timer: asyncio.TimerHandle | None = None
         self._due = 0.0
@@ -133,6 +138,39 @@ class AsyncClient(BaseClient):
             raise
         return client
 
+    @classmethod
+    async def match(cls, url: str, kind: str, *, seats: int = 1, **options: Any) -> "AsyncClient":
+        """Joins a world of a kind, one that has the given properties or a new one, and waits for it if need be.
+
+        The arguments are those of `Client.match`.
+        """
+        own = addresses.options_of(cls.connect, options)
+        return await cls.connect(addresses.matching(url, kind, seats, options), **own)
+
+    @classmethod
+    async def create(cls, url: str, kind: str, *, private: bool = False, **options: Any) -> "AsyncClient":
+        """Makes a world of a kind and joins it, with the events `Matched` and `Joined`.
+
+        The arguments are those of `Client.create`.
+        """
+        own = addresses.options_of(cls.connect, options)
+        return await cls.connect(addresses.creating(url, kind, private, options), **own)
+
+    @classmethod
+    async def join(cls, url: str, *, code: str = "", seat: str = "", world: str = "", **options: Any) -> "AsyncClient":
+        """Joins a world that exists already. Pass one of `code`, `seat` and `world`.
+
+        The arguments are those of `Client.join`.
+        """
+        return await cls.connect(addresses.joining(url, code=code, seat=seat, world=world), **options)
+
+    @staticmethod
+    async def list_worlds(
+        url: str, kind: str | None = None, timeout: float = TIMEOUT_S, *, tls: ssl.SSLContext | None = None
+    ) -> list[WorldEntry]:
+        """Returns the public worlds of a server, as `client_sdk.list_worlds` does, in a thread of its own."""
+        return await asyncio.to_thread(list_worlds, url, kind, timeout, tls=tls)
+
     def view(self) -> View:
         """Returns what to draw now; positions in blocks, velocities in blocks/s."""
         return self.core.view(time.monotonic())
@@ -170,6 +208,7 @@ class AsyncClient(BaseClient):
 
     def _made(self, transport: asyncio.Transport) -> None:
         self._transport = transport
+        self._host = self._host or socket.getnameinfo(transport.get_extra_info("peername"), NUMERIC)[0]
         transport.set_write_buffer_limits(UNSENT_MAX)
         if self.core.port.appetite < READ_BYTES:  # with a slow simulated link, unread bytes wait at the server
             transport.get_extra_info("socket").setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 0)
@@ -194,17 +233,24 @@ class AsyncClient(BaseClient):
             transport.pause_reading()
 
     async def _dial(self, timeout: float) -> None:
-        """Connects, and waits at most `timeout` seconds until the server has answered."""
+        """Connects, and waits at most `timeout` seconds until the server has answered.
+
+        All connections but the first go to the IP address of the first one.
+        """
         connection, uri = self._connection, self._connection.uri
         async with asyncio.timeout(timeout):
             await self._loop.create_connection(
-                lambda: _Stream(self, connection), uri.host, uri.port, ssl=(self._tls or True) if uri.secure else None
+                lambda: _Stream(self, connection),
+                self._host or uri.host,
+                uri.port,
+                ssl=(self._tls or True) if uri.secure else None,
+                server_hostname=uri.host if uri.secure else None,
             )
             await self._answered
 
     async def _redial(self) -> None:
-        """Reconnects once. After a failure, the core decides when to try again."""
-        connection = self._connection = Connection(self._connection.url, self.core)
+        """Connects anew, once. After a failure, the core decides when to try again."""
+        connection = self._connection = Connection(self._connection.address, self.core)
         self._answered, self._gone = self._loop.create_future(), self._loop.create_future()
         try:
             await self._dial(TIMEOUT_S)
@@ -252,7 +298,8 @@ class AsyncClient(BaseClient):
             self._connection.look(now)
         core.port.update(now)
         self._read_on()
-        if core.state == "reconnecting" and self._transport is None and now >= core.reconnect.retry_at:
+        if core.dials(now):
+            self._drop()
             core.reconnect.trying()
             self._redialing = self._loop.create_task(self._redial())
         self._pump(now)

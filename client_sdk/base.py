@@ -62,6 +62,21 @@ class BaseClient:
         return self.core.entity
 
     @property
+    def world(self) -> str:
+        """The name of the world; empty in the default world, and as long as the server looks for one."""
+        return self.core.travel.world
+
+    @property
+    def code(self) -> str:
+        """The code of the world if it is a private one, for friends to join: `Client.join(url, code=...)`."""
+        return self.core.travel.code
+
+    @property
+    def seats(self) -> tuple[str, ...]:
+        """The seats that were reserved for others, one for each player: `Client.join(url, seat=...)`."""
+        return self.core.travel.seats
+
+    @property
     def shared(self) -> Mapping[str, Any]:
         """The values that the rules of the game share with all clients, by name."""
         return self.core.shared

@@ -13,8 +13,9 @@ import ssl
 import time
 from collections.abc import Iterable
 from types import TracebackType
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
+from client_sdk import addresses
 from client_sdk.base import BaseClient, set_link
 from client_sdk.compiling import COMPILER
 from client_sdk.core import Core
@@ -104,6 +105,62 @@ class Client(BaseClient):
         core = Core(name, scene, token=token, patience_s=patience_s, behaviours=behaviours)
         set_link(core, link)
         return cls(core, PollingTransport(Connection(url, core), duration(timeout, "timeout"), checked_tls(tls)))
+
+    @classmethod
+    def match(cls, url: str, kind: str, *, seats: int = 1, **options: Any) -> "Client":
+        """Joins a world of a kind, one that has the given properties or a new one, and waits for it if need be.
+
+        Returns as soon as the server has answered. The events are `Waiting` as long as there is no world, `Matched`,
+        and `Joined`.
+
+        Args:
+            url: address of the server, like ws://localhost:8765.
+            kind: the kind of world.
+            seats: number of seats to reserve; `client.seats` has those beyond the first.
+            options: the arguments of `connect`. All others are properties of the world: texts, whole numbers, or truth
+                values, as in mode="2v2".
+
+        Raises:
+            ValueError: an argument is not valid.
+            ConnectError: there is no connection; the text says why, and what to do.
+        """
+        own = addresses.options_of(cls.connect, options)
+        return cls.connect(addresses.matching(url, kind, seats, options), **own)
+
+    @classmethod
+    def create(cls, url: str, kind: str, *, private: bool = False, **options: Any) -> "Client":
+        """Makes a world of a kind and joins it, with the events `Matched` and `Joined`.
+
+        Args:
+            url: address of the server, like ws://localhost:8765.
+            kind: the kind of world.
+            private: whether only those with the world's code (`client.code`) may join.
+            options: the arguments of `connect`. All others are properties of the world, as for `match`.
+
+        Raises:
+            ValueError: an argument is not valid.
+            ConnectError: there is no connection; the text says why, and what to do.
+        """
+        own = addresses.options_of(cls.connect, options)
+        return cls.connect(addresses.creating(url, kind, private, options), **own)
+
+    @classmethod
+    def join(cls, url: str, *, code: str = "", seat: str = "", world: str = "", **options: Any) -> "Client":
+        """Joins a world that exists already. Pass one of `code`, `seat` and `world`.
+
+        Args:
+            url: address of the server, like ws://localhost:8765.
+            code: the code of a private world.
+            seat: a reserved seat: one of a friend's `client.seats`.
+            world: the name of a world.
+            options: the arguments of `connect`.
+
+        Raises:
+            ValueError: an argument is not valid.
+            TypeError: `connect` has no such argument.
+            ConnectError: there is no connection; the text says why, and what to do.
+        """
+        return cls.connect(addresses.joining(url, code=code, seat=seat, world=world), **options)
 
     def poll(self, now: float | None = None) -> list[Event]:
         """Reads what has arrived. Returns the events since the last call, oldest first. Never blocks."""

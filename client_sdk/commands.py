@@ -71,9 +71,9 @@ class SentCommands:
         """Returns the messages to send again after a reconnect; the server knows which commands it has carried out."""
         return list(self._unanswered.values())
 
-    def give_up(self) -> list[Answered]:
+    def give_up(self, why: str) -> list[Answered]:
         """Forgets all commands, because the player is a new one to the server. Returns a failed result for each."""
         numbers = list(self._unanswered)
         self._unanswered.clear()
         self._reasons.clear()
-        return [Answered(number, False, "the connection was lost") for number in numbers]
+        return [Answered(number, False, why) for number in numbers]

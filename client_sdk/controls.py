@@ -72,6 +72,11 @@ class Controls:
         aim = self._aimed if released and self._aimed != NO_AIM else self.held.aim
         return self.held._replace(buttons=self.held.buttons | pressed, aim=aim)
 
+    def restart(self) -> None:
+        """Forgets the input, because it was made for another scene."""
+        self.held, self._unresolved = NEUTRAL, None
+        self.forget()
+
     def forget(self) -> None:
         """Forgets presses, because the tick that they were meant for has no input."""
         self._pressed = 0

@@ -8,38 +8,30 @@
               the old one
     closed    the connection is over for good
 
+A `Go` of the server leads to another world: the client joins it from the start, over a new connection
+(`client_sdk.travel`).
+
 `now` is always a time in float seconds; all calls use one monotonic clock.
 """
 
 import math
 from collections.abc import Iterable
-from typing import Any, SupportsIndex
+from typing import Any
 
 from client_sdk.advice import advised
-from client_sdk.commands import SentCommands
-from client_sdk.controls import Controls
-from client_sdk.events import Disconnected, Event, Joined, Left, Resumed, SegmentLoaded
-from client_sdk.input_loop import InputLoop
-from client_sdk.pending_events import GameEvents, PendingEvents
+from client_sdk.events import Disconnected, Joined, Left, Resumed, SegmentLoaded
+from client_sdk.pending_events import GameEvents
 from client_sdk.port import Port
-from client_sdk.prediction.prediction import Prediction
+from client_sdk.program_side import ProgramSide
 from client_sdk.reconnect import Reconnect
 from client_sdk.replica import Replica
-from client_sdk.stats import Stats
-from client_sdk.timing.server_clock import ServerClock
-from client_sdk.timing.timeline import Timeline
-from client_sdk.view import NOTHING, View
-from client_sdk.worlds import Worlds
-from shared import edits, fields, messages
-from shared.behaviours import Behaviour, BehaviourError, checked_classes
-from shared.buttons import Names
-from shared.checks import SceneError, duration, shown, text, whole
-from shared.inputs import Input, checked_input, clamp
+from client_sdk.travel import Travel, progress
+from shared import fields, messages
+from shared.behaviours import Behaviour, BehaviourError
+from shared.checks import duration, text
 from shared.messages import ProtocolError, decode_from_server, encode
 from shared.scene import Scene
 
-INPUT_DELAY_MAX = 3
-"""Longest input delay, in ticks."""
 COME_AGAIN = (messages.TOO_SLOW, messages.GOING_AWAY, messages.NO_HELLO)
 """Close codes after which a client reconnects although the server did not ask for it: the connection was at fault."""
 NAME_MAX = 1 << 16
@@ -48,7 +40,7 @@ READ_BYTES = 64 * 1024
 """Number of bytes that a transport reads at once from a connection without a simulated link."""
 
 
-class Core:
+class Core(ProgramSide):
     """The client as a state machine.
 
     Args:
@@ -76,71 +68,22 @@ class Core:
         neighbours: bool = True,
         behaviours: Iterable[type[Behaviour]] = (),
     ) -> None:
+        super().__init__(scene, behaviours, compiled=compiled, neighbours=neighbours)
         self.name = text(name, "name", NAME_MAX, shortest=0)
-        if scene is not None and not isinstance(scene, Scene):
-            raise SceneError(f"scene = {shown(scene)}: must be a `Scene`, or None for the server's")
-        self.scene = scene
-        self.state = "joining"
         self.port: Port = self
         """The object that a transport talks to; `client_sdk.netsim.linked` puts a simulated link in front."""
         self.close_request: tuple[int, str] | None = None
         """Close code and reason with which the transport has to close the connection now; None: it must not."""
-        self.stats = Stats()
         self.reconnect = Reconnect(duration(patience_s, "patience_s", endless=True))
-        self.controls = Controls()
+        self.travel = Travel()
         self.shared: dict[str, Any] = {}
         """The values that the rules of the game share with all clients, by name."""
         self.private: dict[str, Any] = {}
         """The values that the rules of the game share with this player only, by name."""
         self._token = text(token, "token", fields.TOKEN_MAX, shortest=0)
         self._resume = b""
-        self._open = False
-        self._commands = SentCommands()
-        self._out: list[bytes] = []
-        self._events = PendingEvents()
+        self._scene_asked = scene
         self._game_events = GameEvents(self._events)
-        self.behaviours = checked_classes(behaviours)
-        self._worlds = Worlds(
-            self.stats,
-            self._events,
-            self.controls,
-            self.behaviours,
-            compiled=compiled,
-            neighbours=neighbours,
-        )
-
-    @property
-    def prediction(self) -> Prediction | None:
-        """The confirmed and the predicted world; None before the welcome."""
-        world = self._worlds.current
-        return world.prediction if world else None
-
-    @property
-    def entity(self) -> int:
-        """The number of the own entity; 0 before the welcome."""
-        world = self._worlds.current
-        return world.prediction.entity if world else 0
-
-    @property
-    def clock(self) -> ServerClock:
-        """The estimate of the server time."""
-        return self._worlds.clock
-
-    @property
-    def timeline(self) -> Timeline | None:
-        """The client's own time in ticks; None before the client has joined."""
-        play = self._worlds.play
-        return play.timeline if play else None
-
-    @property
-    def waiting(self) -> int:
-        """The number of events that the program has not taken."""
-        return len(self._events)
-
-    @property
-    def connected(self) -> bool:
-        """Whether there is a connection, as far as the core knows."""
-        return self._open
 
     @property
     def appetite(self) -> int:
@@ -150,6 +93,13 @@ class Core:
     def outstanding(self) -> int:
         """Returns 0, because without a simulated link, no bytes wait between the transport and the core."""
         return 0
+
+    def dials(self, now: float) -> bool:
+        """Returns whether the transport has to open a new connection now, to the path `travel.path`.
+
+        A stream of the old connection that is still open is not needed any more.
+        """
+        return now >= self.reconnect.retry_at and self.state != "closed"
 
     # -- what comes in -------------------------------------------------------------------------------------
 
@@ -174,36 +124,18 @@ class Core:
 
     def lost(self, code: int, reason: str, now: float) -> None:
         """Takes the loss of the connection, or the failure of an attempt to connect."""
-        if self.state in ("playing", "reconnecting"):
-            if self._open or self.reconnect.retry_at == math.inf:  # otherwise a `Bye` has already announced it
-                self._cut_off(Left(code, reason, 0.0), now)
+        if self.travel.leaving:
+            self.close_request = None
+            self.reconnect.plan(now + self.travel.left())
+        elif not self._open and self.reconnect.retry_at < math.inf:  # a `Bye` has already announced it
+            return
+        elif self.state in ("playing", "reconnecting"):
+            self._cut_off(Left(code, reason, 0.0), now)
+        elif self._worlds.filled is None and self.travel.again():
+            self._open = False
+            self.reconnect.plan(now + self.travel.left())
         else:
             self._end(Left(code, reason))
-
-    def command(self, name: str, data: Any = None) -> int:
-        """Sends a command to the rules of the game, for the next tick. Returns its number, which `Answered` repeats.
-
-        Raises:
-            RuntimeError: the client has not joined.
-            ValueError: the name or the data are too long (32 characters, 1,024 bytes), or MessagePack cannot hold the
-                data.
-        """
-        play = self._joined("command")
-        return self._order(self._commands.command(play.world.prediction.next_order, play.seen, name, data))
-
-    def edit(self, x: SupportsIndex, y: SupportsIndex, z: SupportsIndex, kind: SupportsIndex) -> int:
-        """Places (kind 1 to 255) or removes (0) a block with the next tick. Returns the number of the edit.
-
-        Raises:
-            RuntimeError: the client has not joined.
-            TypeError: an argument is not a whole number.
-            EditError: an argument is out of range (a `ValueError`).
-        """
-        play, edit = self._joined("edit"), edits.checked(x, y, z, kind)
-        payload = edits.pack(edit)  # before the prediction: an edit that cannot be sent must not be predicted
-        number = self._commands.number()
-        tick = play.world.prediction.edit(number, edit)
-        return self._order(messages.Command(number, tick, play.seen, edits.NAME, payload))
 
     def close(self) -> None:
         """Leaves the game: sends Bye and asks the transport to close the connection."""
@@ -212,32 +144,6 @@ class Core:
                 self._send(messages.Bye(messages.GOING_AWAY, "", -1.0))
             self.close_request = (1000, "")
             self._end(Left(1000, "closed by this client"))
-
-    @property
-    def input(self) -> Input:
-        """The input that was set most recently."""
-        return self.controls.held
-
-    def set_input(self, input_: Input, buttons: Names = ()) -> None:
-        """Sets the player's input from the next tick on. A short press between two ticks counts in the next tick.
-
-        Args:
-            input_: the input.
-            buttons: buttons that are held besides, by name. `Controls.resolve` finds their bits if the scene is not
-                known yet; the clients call it ahead of each update.
-
-        Raises:
-            ValueError: `input_` is not an `Input`, or the scene has no such button or no aim.
-        """
-        self.controls.set(clamp(checked_input(input_, "input")), buttons, self.scene)
-
-    def set_input_delay(self, ticks: int) -> None:
-        """Sets the input delay: inputs take effect `ticks` ticks (0 to 3) later. More delay means fewer replays.
-
-        Raises:
-            ValueError: `ticks` is not 0 to 3.
-        """
-        self.controls.delay = whole(ticks, "ticks", 0, INPUT_DELAY_MAX)
 
     # -- time ----------------------------------------------------------------------------------------------
 
@@ -277,15 +183,6 @@ class Core:
         self.stats.bytes_up += sum(map(len, out))
         return out
 
-    def events(self) -> list[Event]:
-        """Returns the events since the last call, oldest first."""
-        return self._events.take() if self._events else []
-
-    def view(self, now: float) -> View:
-        """Returns what to draw now: the own entity as predicted, the others a little in the past."""
-        play = self._worlds.play
-        return play.view(now) if play else NOTHING
-
     # -- inside --------------------------------------------------------------------------------------------
 
     def _take(self, message: messages.Message, now: float) -> None:
@@ -313,11 +210,11 @@ class Core:
             case messages.Shared():
                 self.shared = message.values
             case messages.Bye():
-                left = Left(message.code, advised(message.code, message.reason), message.wait)
-                if self.state in ("playing", "reconnecting") and (message.wait >= 0 or message.code in COME_AGAIN):
-                    self._cut_off(left, now)
-                else:
-                    self._end(left)
+                self._bye(message, now)
+            case messages.Go():
+                self._go(message, now)
+            case messages.Waiting() if self.state == "joining" and not self._worlds.filled:
+                self._events.append(progress(message))
             case _:
                 raise ProtocolError(f"unexpected {type(message).__name__} message from a server")
 
@@ -339,11 +236,12 @@ class Core:
         if self.scene is not None and world.scene.digests != self.scene.digests:
             raise ProtocolError("Welcome.scene: not the scene that the client requested")
         self.scene, self._resume = world.scene, welcome.resume
+        self.travel.welcomed()
         self.reconnect.spread = welcome.entity
         if worlds.play and welcome.entity == self.entity:
             self._out += self._commands.again()
         elif worlds.play:
-            for answered in self._commands.give_up():
+            for answered in self._commands.give_up("the connection was lost"):
                 self._events.append(answered)
             self._game_events.restart()
             self.private = {}
@@ -357,8 +255,40 @@ class Core:
         self._events.append(Resumed(tick, away_s) if same else Joined(self.entity, world.scene, tick))
         self._game_events.release()
         self.reconnect.back()
+        self.travel.plays(now)
         for inputs in play.unreceived() if same else ():
             self._send(inputs)
+
+    def _bye(self, bye: messages.Bye, now: float) -> None:
+        left = Left(bye.code, advised(bye.code, bye.reason), bye.wait)
+        if self.state in ("playing", "reconnecting") and (bye.wait >= 0 or bye.code in COME_AGAIN):
+            self._cut_off(left, now)
+        elif self.state == "joining" and not self._worlds.filled and self.travel.again(bye):
+            self._depart()
+        else:
+            self._end(left)
+
+    def _go(self, go: messages.Go, now: float) -> None:
+        """Leaves for another world, as a new player there."""
+        event = self.travel.go(go, now, lobby=self.state == "joining" and not self._worlds.filled)
+        for answered in self._commands.give_up("the client went to another world"):
+            self._events.append(answered)
+        self._game_events.restart()
+        self._events.append(event)
+        self.state, self._resume = "joining", b""
+        self.shared, self.private = {}, {}
+        if self.scene is not self._scene_asked:
+            self.scene = self._scene_asked
+            self.controls.restart()
+        self._worlds.restart()
+        self.reconnect.back()
+        self._depart()
+
+    def _depart(self) -> None:
+        """Asks the transport to close the connection, and sends nothing more over it."""
+        self._open = False
+        self._out.clear()
+        self.close_request = (1000, "")
 
     def _cut_off(self, left: Left, now: float) -> None:
         """Starts to reconnect after a lost connection, or ends if the client may not reconnect."""
@@ -370,19 +300,6 @@ class Core:
             return
         self.state = "reconnecting"
         self._events.append(Disconnected(left.reason, self.reconnect.retry_at - now))
-
-    def _joined(self, what: str) -> InputLoop:
-        play = self._worlds.play
-        if play is None or self.state == "closed":
-            raise RuntimeError(f"{what}: the client has not joined")
-        return play
-
-    def _order(self, command: messages.Command) -> int:
-        """Sends a command now, or over the next connection. Returns its number."""
-        message = self._commands.file(command)
-        if self._open:
-            self._out.append(message)
-        return command.number
 
     def _send(self, message: messages.Message) -> None:
         self._out.append(encode(message))

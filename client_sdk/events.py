@@ -9,7 +9,9 @@ from shared.scene import Scene
 
 @dataclass(frozen=True)
 class Joined:
-    """The player has joined: inputs count from `tick` on. Only `SegmentLoaded` and `Left` may come before it.
+    """The player has joined: inputs count from `tick` on.
+
+    Only `Waiting`, `Matched`, `Moved`, `SegmentLoaded` and `Left` may come before it.
 
     `entity` is the number of the own entity, and `scene` the one that the server plays.
     """
@@ -17,6 +19,45 @@ class Joined:
     entity: int
     scene: Scene
     tick: int
+
+
+@dataclass(frozen=True)
+class Waiting:
+    """The client waits for a world: at place `position` of `waiting` who wait, for `waited_s` seconds so far.
+
+    0 stands for what the server does not report. `data` is what the queue of the kind of world adds.
+    """
+
+    position: int
+    waiting: int
+    waited_s: float
+    data: dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Matched:
+    """The server has found or made the world `world`, and the client goes there; `Joined` follows.
+
+    `code` is the code of a private world, for friends to join (`Client.join(url, code=...)`); empty: it has none.
+    `seats` has the seats that were reserved for others, each of them for one player and for some seconds only
+    (`Client.join(url, seat=...)`). If the world does not take the client after all, the client asks the server again:
+    then a second `Matched` follows, or `Left`.
+    """
+
+    world: str
+    code: str
+    seats: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Moved:
+    """The rules have sent the player to the world `world`, and the client goes there; `Joined` follows, or `Left`.
+
+    `world` is empty for the default world. `reason` is the text of the rules.
+    """
+
+    world: str
+    reason: str
 
 
 @dataclass(frozen=True)
@@ -136,8 +177,8 @@ class EventsDropped:
     """At this place, `count` events are missing, because too many waited.
 
     The server drops game events (`Happened`) if more than 1,024 wait for a slow or lost connection. The client drops
-    events if the program leaves more than 10,000 of them; then other events may be among them. `Joined`,
-    `Disconnected`, `Resumed` and `Left` are never dropped.
+    events if the program leaves more than 10,000 of them; then other events may be among them. `Joined`, `Matched`,
+    `Moved`, `Disconnected`, `Resumed` and `Left` are never dropped.
     """
 
     count: int
@@ -183,6 +224,9 @@ class SegmentLoaded:
 
 Event = (
     Joined
+    | Waiting
+    | Matched
+    | Moved
     | Disconnected
     | Resumed
     | Left

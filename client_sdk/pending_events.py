@@ -1,6 +1,17 @@
 """The events that wait until the program takes them: in order and bounded; dropped ones are counted."""
 
-from client_sdk.events import Announced, Disconnected, Event, EventsDropped, Happened, Joined, Left, Resumed
+from client_sdk.events import (
+    Announced,
+    Disconnected,
+    Event,
+    EventsDropped,
+    Happened,
+    Joined,
+    Left,
+    Matched,
+    Moved,
+    Resumed,
+)
 from shared import messages, payloads
 
 EVENTS_MAX = 10_000
@@ -9,7 +20,7 @@ NEVER, GAME, OTHER = range(3)
 """Kinds of events: never dropped, game events, and other events of the SDK."""
 KINDS = {
     Happened: GAME, Announced: GAME, EventsDropped: GAME,
-    Joined: NEVER, Disconnected: NEVER, Resumed: NEVER, Left: NEVER,
+    Joined: NEVER, Matched: NEVER, Moved: NEVER, Disconnected: NEVER, Resumed: NEVER, Left: NEVER,
 }  # fmt: skip
 """Kind of an event by its class; all others are OTHER."""
 

@@ -54,6 +54,10 @@ class Reconnect:
         self.retry_at = due
         return True
 
+    def plan(self, at: float) -> None:
+        """Plans an attempt for a local time in seconds."""
+        self.retry_at = at
+
     def trying(self) -> None:
         """Notes that an attempt has begun."""
         self.retry_at = math.inf

@@ -180,6 +180,12 @@ class Worlds:
         self._stats.reconnects += old is not None
         return play, same
 
+    def restart(self) -> None:
+        """Forgets everything of the world, because the client goes to another one."""
+        self.filled = self.play = None
+        self.plain_for_now = False
+        self._pings.clear()
+
     def _stepped(self, ticks: float, now: float) -> None:
         """Follows a step of the server's time, by `ticks`; 0: there was none."""
         if not ticks:

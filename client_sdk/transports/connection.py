@@ -12,7 +12,8 @@ in common, so that each of them adds only a socket. Nothing is compressed: the c
 
 import math
 import ssl
-from urllib.parse import urlsplit
+from dataclasses import replace
+from urllib.parse import urlsplit, urlunsplit
 
 from websockets.client import ClientProtocol
 from websockets.exceptions import InvalidStatus, InvalidURI
@@ -37,7 +38,7 @@ LOOK_S = 1.0
 asleep could not receive anything."""
 CLOSE_S = 2.0
 """Time that a server gets to finish the closing handshake, in seconds; then the client closes the stream anyway."""
-REFUSALS = (403, 429, 503)
+REFUSALS = (400, 403, 404, 409, 429, 503)
 """HTTP statuses with which a server refuses a client and sends the reason as text."""
 REASON_BYTES_MAX = 123
 """Room for the reason in a close frame, in bytes (RFC 6455)."""
@@ -55,10 +56,10 @@ class ConnectError(ConnectionError):
 
 
 class Connection:
-    """One WebSocket connection of a core.
+    """One WebSocket connection of a core, to the path that the core names.
 
     Args:
-        url: address of the server, like ws://host:8765.
+        url: address of the server, like ws://host:8765. Its path is the first one of the core.
         core: the state machine whose messages are sent and received.
 
     Raises:
@@ -66,8 +67,15 @@ class Connection:
     """
 
     def __init__(self, url: str, core: Core) -> None:
+        self.address = url
+        """The address that the program gave; the next connection begins with it."""
+        self.uri = parsed(url)
+        core.travel.path = core.travel.path or self.uri.resource_name
+        if self.uri.resource_name != core.travel.path:
+            path, _, query = core.travel.path.partition("?")
+            self.uri = replace(self.uri, path=path, query=query)
+            url = urlunsplit(urlsplit(url)._replace(path=path, query=query))
         self.url = url
-        self.uri = _parse(url)
         self.core = core
         self.refused: ConnectError | None = None
         """The error with which the handshake failed; None while it may still succeed, and after it has succeeded."""
@@ -222,7 +230,7 @@ def checked_tls(tls: object) -> ssl.SSLContext | None:
     return tls
 
 
-def _parse(url: object) -> WebSocketURI:
+def parsed(url: object) -> WebSocketURI:
     hint = "a server's address looks like ws://localhost:8765"
     if not isinstance(url, str):
         raise ConnectError(f"url = {shown(url)}: must be a text; {hint}")

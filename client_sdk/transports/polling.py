@@ -21,7 +21,7 @@ NOT_NOW = (BlockingIOError, InterruptedError, ssl.SSLWantReadError, ssl.SSLWantW
 
 
 class PollingTransport:
-    """A connection over one non-blocking TCP socket (TLS for wss://), and over new ones when it reconnects.
+    """A connection over one non-blocking TCP socket (TLS for wss://), and over new ones when the core needs them.
 
     The constructor blocks until the handshake is done.
 
@@ -53,13 +53,12 @@ class PollingTransport:
             raise
 
     def poll(self, now: float) -> None:
-        """Reads what has arrived, writes what waits, and reconnects if it is time to; never blocks."""
+        """Reads what has arrived, writes what waits, and connects anew if it is time to; never blocks."""
         core = self._connection.core
-        if self._socket is None and core.state == "reconnecting":
-            if self._dialing is not None:
-                self._dial_on(self._dialing, now)
-            elif now >= core.reconnect.retry_at:
-                self._dial(now)
+        if core.dials(now):
+            self._dial(now)
+        elif self._dialing is not None and core.state != "closed":
+            self._dial_on(self._dialing, now)
         if self._socket is None:
             return
         if now > self._dial_until and not self._connection.opened:
@@ -92,8 +91,9 @@ class PollingTransport:
             self._drop()
 
     def _dial(self, now: float) -> None:
-        """Begins to reconnect, to the IP address of the first connection."""
-        self._connection = Connection(self._connection.url, self._connection.core)
+        """Begins another connection, to the IP address of the first one."""
+        self._drop()
+        self._connection = Connection(self._connection.address, self._connection.core)
         self._connection.core.reconnect.trying()
         self._dial_until = now + self._timeout
         try:
@@ -106,7 +106,7 @@ class PollingTransport:
             self._give_up(error.strerror or str(error), now)
 
     def _dial_on(self, sock: socket.socket, now: float) -> None:
-        """Continues a reconnect: checks the TCP connect, then the TLS handshake, and gives up when time is over."""
+        """Continues to connect: checks the TCP connect, then the TLS handshake, and gives up when time is over."""
         try:
             if isinstance(sock, ssl.SSLSocket):
                 sock.do_handshake()

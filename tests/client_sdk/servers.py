@@ -40,6 +40,8 @@ class Peer:
 
     def __init__(self) -> None:
         self.protocol = ServerProtocol(max_size=None)
+        self.path = ""
+        """Path of the client's request."""
 
     def receive(self, data: bytes) -> list[Event]:
         """Takes bytes of the client and returns the events in them. A request for a WebSocket is accepted."""
@@ -48,6 +50,7 @@ class Peer:
         events = self.protocol.events_received()
         for event in events:
             if isinstance(event, Request):
+                self.path = event.path
                 self.protocol.send_response(self.protocol.accept(event))
         return events
 
@@ -56,16 +59,17 @@ class Peer:
 
 
 @contextlib.contextmanager
-def scripted_server(script: Callable[[socket.socket], object]) -> Iterator[str]:
-    """Yields the URL of a server that runs `script` with its first connection and then closes it."""
+def scripted_server(*scripts: Callable[[socket.socket], object]) -> Iterator[str]:
+    """Yields the URL of a server that runs a script with each of its connections in turn, and then closes it."""
     failed: list[BaseException] = []
 
     def serve() -> None:
         try:
-            sock, _ = listener.accept()
-            with sock:
-                sock.settimeout(10)
-                script(sock)
+            for script in scripts:
+                sock, _ = listener.accept()
+                with sock:
+                    sock.settimeout(10)
+                    script(sock)
         except BaseException as error:
             failed.append(error)
 

@@ -22,15 +22,18 @@ from client_sdk.netsim.links import PRESETS
 from server.game import Game
 from server.rules import with_options
 from shared.inputs import make_input
+from shared.messages import Go
 from shared.scene import Scene, Template, load_scene
 from sovereign_netcode.playtest import Match, bot, wander
-from tests.client_sdk.servers import ROOT, real_server
+from tests.client_sdk.servers import ROOT, real_server, scripted_server
+from tests.client_sdk.test_worlds_over_sockets import Told
 from tests.lengths import long
 from tests.readme.pages import programs
-from tests.readme.run_snippet import LOOPS
+from tests.readme.run_snippet import LOOPS, URL
 
 ENGINES = ["pygame-ce", "pyglet", "arcade", "Panda3D", "ursina"]
 ON_A_SERVER = ["asyncio", "A bot"]
+WORLDS = "Worlds and matches"
 WAITS = "Threads, timers and asyncio"
 GAMES = ["Buttons and aim", "Behaviours", "Declared commands", "Before a join", "Options"]
 ALONE = ["A game", "Without a socket", "Testing it", "Agents that learn", WAITS, *GAMES]
@@ -45,7 +48,7 @@ def run(*arguments: str) -> str:
 
 
 def test_there_are_no_others() -> None:
-    assert sorted(programs()) == sorted([*ENGINES, *LOOPS, *ON_A_SERVER, *ALONE, A_FILE])
+    assert sorted(programs()) == sorted([*ENGINES, *LOOPS, *ON_A_SERVER, *ALONE, WORLDS, A_FILE])
 
 
 @pytest.mark.parametrize("engine", [ENGINES[0], *long(*ENGINES[1:])])
@@ -69,6 +72,16 @@ def test_asyncio_and_bots() -> None:
         said = run("A bot", url)
         assert "Joined(" in said
         assert "walked" in said
+
+
+def test_worlds_and_matches(capsys: pytest.CaptureFixture[str]) -> None:
+    told = Told()
+    go = Go("/arena-1?seat=a", "", ["/arena-1?seat=b"], "matched")
+    with scripted_server(told.sends_on(go), told.says_goodbye) as url:
+        exec(compile(programs()[WORLDS].replace(URL, url), WORLDS, "exec"), {})
+    assert told.paths[0] == "/match?kind=arena&mode=2v2&seats=2"
+    found = "found arena-1 - a friend joins with Client.join(url, seat=...): ('/arena-1?seat=b',)"
+    assert capsys.readouterr().out.splitlines() == [found, "over: that was it"]
 
 
 def alone(name: str) -> dict[str, Any]:

@@ -1,0 +1,139 @@
+"""The way of a client from world to world on one server: where it connects next, and how often.
+
+Theory of operation. A server names another path by `Go`. The client then ends its connection (`leaving`), and connects
+to that path as a new player as soon as the end of the old connection is known. Only the path changes: the transport
+keeps host and port. A `Go` ahead of a welcome came from a lobby. If the world that a lobby named does not take the
+client, the client asks the lobby again. If a world has sent the client away, it tries the new path again. Both are
+bounded, and so is the number of worlds without play in between.
+"""
+
+import math
+
+from client_sdk.events import Matched, Moved, Waiting
+from shared import fields, messages, payloads
+from shared.messages import Bye, Go, ProtocolError
+
+FINAL = (messages.WRONG_VERSION, messages.WRONG_SCENE, messages.MALFORMED, messages.UNAUTHORISED, messages.KICKED)
+"""Close codes after which a client does not ask a lobby for another world: that would not take it, either."""
+LOBBIES = ("match", "create", "join", "worlds")
+"""First parts of paths that are no names of worlds."""
+ATTEMPTS_MAX = 3
+"""Number of further attempts if the new path does not take the client."""
+AGAIN_S = 0.25
+"""Wait before the first further attempt, in seconds; it doubles with each."""
+WAIT_S_MAX = 10.0
+"""Longest wait that a server may ask for before a further attempt, in seconds. Beyond it, the client leaves."""
+WORLDS_MAX = 8
+"""Limit of the worlds that a client is sent to without `PLAYED_S` seconds of play in between."""
+PLAYED_S = 1.0
+"""Time of play after which the worlds are counted anew, in seconds."""
+
+
+class Travel:
+    """The path of the client's world, and the attempts to get there."""
+
+    def __init__(self) -> None:
+        self.path = ""
+        """The path and query of the next connection; empty: those of the transport's address."""
+        self.code = ""
+        """The code of the world if it is a private one."""
+        self.seats: tuple[str, ...] = ()
+        """The paths of the seats that were reserved for others."""
+        self.leaving = False
+        """Whether the old connection is being closed, because the next one leads elsewhere."""
+        self._wait_s = 0.0
+        self._arriving = False
+        """Whether a `Go` led here, and no welcome has come yet."""
+        self._lobby = ""
+        """The path of the lobby that has sent the client on; empty: none has."""
+        self._failed = 0
+        self._worlds = 0
+        self._playing_since = math.inf
+
+    @property
+    def world(self) -> str:
+        """The name of the world; empty in the default world, and in a lobby."""
+        name = self.path.partition("?")[0].strip("/")
+        return "" if name in LOBBIES else name
+
+    def go(self, go: Go, now: float, *, lobby: bool) -> Matched | Moved:
+        """Takes the path of another world. Returns the event for the program.
+
+        Args:
+            go: the server's message.
+            now: local time in seconds.
+            lobby: whether the connection has had no welcome yet.
+
+        Raises:
+            ProtocolError: the client was sent to too many worlds without play in between.
+        """
+        if now - self._playing_since >= PLAYED_S:
+            self._worlds = 0
+        self._playing_since = math.inf
+        self._worlds += 1
+        if self._worlds > WORLDS_MAX:
+            raise ProtocolError(
+                f"Go.path = {go.path!r}: world {self._worlds} in a row with less than {PLAYED_S:g} s of play"
+            )
+        if lobby:
+            self._lobby = self._lobby or self.path
+        else:
+            self._lobby, self._failed = "", 0
+        self.path, self.code, self.seats = go.path, go.code, tuple(go.seats)
+        self.leaving, self._arriving, self._wait_s = True, True, 0.0
+        return Matched(self.world, self.code, self.seats) if lobby else Moved(self.world, go.reason)
+
+    def left(self) -> float:
+        """Notes that the old connection has ended. Returns the wait before the next one, in seconds."""
+        self.leaving = False
+        return self._wait_s
+
+    def again(self, bye: Bye | None = None) -> bool:
+        """Takes the failure of the way to a world, before its welcome. Returns whether there is a further attempt.
+
+        Args:
+            bye: the refusal; None: there was no connection, or it was lost.
+        """
+        wait_s = max(bye.wait if bye else 0.0, AGAIN_S * 2**self._failed)
+        final = bye is not None and (bye.code in FINAL or not self._lobby)
+        if not self._arriving or final or self._failed >= ATTEMPTS_MAX or wait_s > WAIT_S_MAX:
+            return False
+        self._failed += 1
+        if self._lobby:
+            self.path, self.code, self.seats, self._arriving = self._lobby, "", (), False
+        self.leaving, self._wait_s = True, wait_s
+        return True
+
+    def welcomed(self) -> None:
+        """Notes that a world has taken the client. From now on, the client reconnects without its seat."""
+        self.path = without_seat(self.path)
+        self._arriving, self._lobby, self._failed = False, "", 0
+
+    def plays(self, now: float) -> None:
+        """Notes that play has begun."""
+        self._playing_since = now
+
+
+def without_seat(path: str) -> str:
+    """Returns a path whose query has no reserved seat."""
+    name, _, query = path.partition("?")
+    kept = "&".join(field for field in query.split("&") if field.partition("=")[0] != "seat")
+    return f"{name}?{kept}" if kept else name
+
+
+def progress(message: messages.Waiting) -> Waiting:
+    """Returns the event for a message to a client that waits.
+
+    Raises:
+        ProtocolError: the message is malformed.
+    """
+    table = payloads.unpack_value(message.payload)
+    if not isinstance(table, dict) or not all(type(name) is str for name in table):
+        raise ProtocolError("Waiting.payload: must be a table of names")
+    position, waiting, waited_s = (table.pop(name, 0) for name in ("position", "waiting", "waited_s"))
+    for name, value in (("position", position), ("waiting", waiting)):
+        if not fields.count(value):
+            raise ProtocolError(f"Waiting.{name}: must be a whole number from 0 to {fields.COMMAND_MAX}")
+    if type(waited_s) not in (int, float) or not 0 <= waited_s < math.inf:
+        raise ProtocolError("Waiting.waited_s: must be a time in seconds")
+    return Waiting(position, waiting, float(waited_s), table)
