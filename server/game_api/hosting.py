@@ -5,6 +5,10 @@ from typing import Any, Protocol
 from shared.messages import Go
 
 
+class WorldsError(ValueError):
+    """A world that cannot be made, found or used. The text is the reason, for players and operators."""
+
+
 class Hosting(Protocol):
     """The worlds of a server, as the rules of one of them see them."""
 

@@ -79,7 +79,7 @@ class PlayersApi:
 
         Args:
             player: the player.
-            world: name of the world.
+            world: name of the world; empty: the default one.
             data: anything that the rules of the other world understand; clients do not see it.
             reason: text of at most 500 characters for the client.
 

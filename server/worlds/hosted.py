@@ -8,7 +8,7 @@ from server.game.session import Session
 from server.players.ticket import Property
 from server.replication.client_stream import Transport
 from server.worlds.kinds import Kind
-from server.worlds.seats import Seat, Seats
+from server.worlds.seats import Seats
 from shared import messages
 
 FULL = "this world is full"
@@ -51,9 +51,8 @@ class HostedWorld:
         self.game = game
         game.joining.door = self
 
-    def arrive(self, session: Session, seat: Seat) -> None:
-        """Takes a connection whose client has a seat."""
-        session.reserved = seat
+    def arrive(self, session: Session) -> None:
+        """Takes a new connection whose client has a seat."""
         self._arriving.append(session)
 
     @property
@@ -111,22 +110,19 @@ class HostedWorld:
 
 
 class Entrance:
-    """The way into a world for one connection.
+    """The way into a game for one connection.
 
     Args:
-        world: the world.
-        seat: the seat on which the client comes; None: without one.
-        arriving: called before the connection opens.
+        game: the game.
+        opened: called with the new session.
     """
 
-    def __init__(self, world: HostedWorld, seat: Seat | None, arriving: Callable[[HostedWorld], None]) -> None:
-        self._world, self._seat, self._arriving = world, seat, arriving
-        self.receive, self.lost = world.game.receive, world.game.lost
+    def __init__(self, game: Game, opened: Callable[[Session], None]) -> None:
+        self._game, self._opened = game, opened
+        self.receive, self.lost = game.receive, game.lost
 
     def open(self, link: Transport, now: float) -> Session:
         """Adds the connection to the game and returns its session."""
-        self._arriving(self._world)
-        session = self._world.game.open(link, now)
-        if self._seat is not None:
-            self._world.arrive(session, self._seat)
+        session = self._game.open(link, now)
+        self._opened(session)
         return session

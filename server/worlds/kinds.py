@@ -5,6 +5,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from server.game_api.hosting import WorldsError as WorldsError
 from server.players.ticket import Property, Ticket
 from server.rules import Rules, overrides, prepared
 from shared.checks import SceneError, shown, whole
@@ -20,10 +21,6 @@ PROPERTIES_MAX, TEXT_MAX, WHOLE_MAX = 16, 64, (1 << 53) - 1
 
 Pair = Callable[[list[Ticket]], Iterable[Sequence[Ticket]]]
 """Function that forms groups of tickets; each group gets a world of its own."""
-
-
-class WorldsError(ValueError):
-    """A world that cannot be made, found or used. The text is the reason, for players and operators."""
 
 
 @dataclass(frozen=True)

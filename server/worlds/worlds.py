@@ -7,22 +7,28 @@ seat, and connects anew. So a world never sees a client of another one, and a wo
 """
 
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any
 
 from server.config.limits import Limits
 from server.game import Game
 from server.game.loading import Runner, at_once
+from server.game.session import Session
 from server.observability.errors import FaultReporter
 from server.worlds.api import RulesWorlds
 from server.worlds.bucket import Bucket
 from server.worlds.directory import Directory
 from server.worlds.host import Host, Way
-from server.worlds.hosted import Entrance
+from server.worlds.hosted import Entrance, HostedWorld
 from server.worlds.kinds import Kind, WorldsError
 from server.worlds.lobby import VERBS, Lobby, LobbySession, Request
 from server.worlds.matchmaking import Matchmaking
+from server.worlds.seats import Seat
 from shared.fields import PATH_MAX
+from shared.messages import Go
 
+NO_DEFAULT = "there is no default world; ask for a match"
+"""Reason for a path that leads to the default world where there is none."""
 ADDRESSES_MAX = 4096
 """Maximum number of addresses whose requests are counted. Of more, the one that asked longest ago is forgotten."""
 BURST_S = 10.0
@@ -72,24 +78,38 @@ class Worlds(Directory):
         """
         path, _, query = target[:PATH_MAX].partition("?")
         name = path.strip("/")
-        if not name:
-            return self.default or "there is no default world; ask for a match"
+        seated = query.startswith("seat=")
+        if not name and not seated:
+            return self.default or NO_DEFAULT
         try:
             if name in VERBS:
                 if address and not self._limit(address).take(self.now):
                     self.counts["refused_often"] += 1
                     return "too many requests from your address; wait some seconds"
                 return _LobbyWay(self.lobby, Request(name, query))
-            world, seat = self.get(name), None
-            if query.startswith("seat="):
-                found = self.seats.take(name, query.removeprefix("seat="), self.now)
-                if isinstance(found, str):
-                    self.counts["seats_refused"] += 1
-                    return found
-                seat = found
-            return Entrance(world, seat, self.wake)
+            world = self.get(name) if name else None
+            game = self.default if world is None else world.game
+            if game is None:
+                return NO_DEFAULT
+            seat = self.seats.take(name, query.removeprefix("seat="), self.now) if seated else None
+            if isinstance(seat, str):
+                self.counts["seats_refused"] += 1
+                return seat
+            return Entrance(game, partial(self._opened, world, seat))
         except WorldsError as error:
             return str(error)
+
+    def seat(self, name: str, subject: str, data: Any, reason: str) -> Go:
+        """Reserves a seat in a world, or in the default one. Returns the message that sends a client there.
+
+        Raises:
+            WorldsError: there is no such world, or it has no free seat.
+        """
+        if name:
+            return super().seat(name, subject, data, reason)
+        if self.default is None:
+            raise WorldsError(NO_DEFAULT)
+        return Go(f"/?seat={self.seats.reserve('', subject, data, self.now)}", "", [], reason)
 
     def tick(self, now: float) -> None:
         """Does what is due: call it about ten times per second.
@@ -124,6 +144,14 @@ class Worlds(Directory):
             "lobby_connections": len(self.lobby.sessions),
             "worlds_counts": dict(self.counts),
         }
+
+    def _opened(self, world: HostedWorld | None, seat: Seat | None, session: Session) -> None:
+        """Takes a new connection to a world."""
+        session.reserved = seat
+        if world is not None:
+            self.wake(world)
+            if seat is not None:
+                world.arrive(session)
 
     def _limit(self, address: str) -> Bucket:
         """Returns the limit of an address, and makes it the one that asked last."""

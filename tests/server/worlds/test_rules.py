@@ -133,6 +133,19 @@ def test_the_default_world_is_nobody_s_to_end() -> None:
         worlds.end()
 
 
+def test_a_player_is_sent_to_the_default_world() -> None:
+    server = Server(kind("hall", Hall), default=(default := Game(FLAT, compiled=False)))
+    peer = server.play("/match?kind=hall")
+    server.run(0.3)
+    commands(peer, 0, "go", b"\xa0")
+    server.run(0.2)
+    assert peer.go.path.startswith("/?seat=")
+    arrived = server.peer(peer.go.path)
+    default.tick(server.now, server.now)
+    assert arrived.welcome is not None
+    assert server.peer(peer.go.path).refused == "the seat has expired; ask for a match again"
+
+
 class Duel(Rules):
     """Two players of about the same rating; those who wait longer take a larger difference."""
 
