@@ -32,7 +32,7 @@ class Hall(Rules):
 
 
 class Arena(Rules):
-    """Takes note of what was handed over, and does what it is told."""
+    """Keeps what was handed over, and locks, describes or ends its world by command."""
 
     def on_join(self, player: Player) -> None:
         self.game.set(player.entity, "handed", player.handed)
