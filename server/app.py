@@ -9,37 +9,42 @@ import signal
 import ssl
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
-from pathlib import Path
-from typing import Any
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import structlog
+from prometheus_client.core import Metric
 
 from server import describe
-from server.auth.access import authenticator, tls_context
+from server.auth.access import authenticator, operator_token, tls_context
 from server.config.options import SettingsError, nearest
 from server.config.settings import Settings, parse
 from server.game import Game
-from server.journal.recorded_world import RecordedWorld
 from server.net.addresses import bracketed, reachable
 from server.net.admission import Admission
-from server.net.gateway import Gateway
+from server.net.gateway import Events, Gateway
 from server.observability.histogram import Histogram
 from server.observability.live import Live
 from server.observability.metrics import metrics_page
-from server.observability.pages import Pages, json_page, ready_page
+from server.observability.pages import Page, PageRequest, Pages, json_page, line, ready_page
 from server.persistence.database import StoreError
 from server.persistence.store import Store
 from server.rules import Rules, RulesError, load_rules, prepared
 from server.runtime import healthcheck, log, reload
 from server.runtime.event_loop import announce_compiling, freeze, leave, loop_factory, on_signals, rss_mb, signals
+from server.runtime.keeping import recorded, saved
 from server.runtime.tasks import Tasks
+from server.runtime.terrain import TerrainPool
 from server.runtime.ticker import Ticker, best_alarm
 from server.runtime.warmup import warm_up
 from server.runtime.watchdog import Watchdog
 from shared import kernels
 from shared.checks import SceneError
-from shared.scene import Scene, load_scene
+from shared.scene import load_scene
+
+if TYPE_CHECKING:
+    from server.hosting.hosting import Hosting
+    from server.worlds.kinds import Kind
 
 READY_S = 1.0
 """Seconds. The server is ready if a tick began within this time."""
@@ -51,10 +56,18 @@ def _token(arguments: Sequence[str]) -> int:
     return tokens.main(arguments)
 
 
-COMMANDS = {"token": _token, "check": healthcheck.main, "describe": describe.main}
+def _worlds(arguments: Sequence[str]) -> int:
+    from server.hosting import command  # a server with one world does not need it
+
+    return command.main(arguments)
+
+
+COMMANDS = {"token": _token, "check": healthcheck.main, "describe": describe.main, "worlds": _worlds}
 """Functions of the other commands of `sovereign-server`, by name."""
 STOP_S = 1.5
 """Seconds that the shutdown waits for peers to finish closing. With the wait for the disk it takes less than 5 s."""
+
+STARTING = line(503, "the server is starting", retry_after="1")
 
 logger = structlog.stdlib.get_logger("server")
 
@@ -98,7 +111,7 @@ def command(name: str) -> Callable[[Sequence[str]], int]:
 
 
 def run(settings: Settings) -> int:
-    """Serves one world until a signal. Returns the exit code.
+    """Serves the default world, and many others if the settings declare kinds, until a signal. Returns the exit code.
 
     Raises:
         RulesError: the rules cannot be used.
@@ -115,11 +128,19 @@ def run(settings: Settings) -> int:
     if settings.reach is not None:
         scene = dataclasses.replace(scene, reach=settings.reach)
     scene = prepared(rules, scene)
+    kinds, token = {}, operator_token(settings.operator_token_file, os.environ)
+    if settings.worlds:
+        from server.hosting.declared import declared_kinds  # a server with one world does not need its libraries
+
+        kinds = declared_kinds(settings)
     kernels.force(settings.kernel)
     if settings.kernel == kernels.AUTO and kernels.trouble():
         logger.warning("the physics is slower, or has to be compiled", kernel=kernels.describe())
     with kernels.compiling(lambda: announce_compiling(sys.stderr)):
-        world = warm_up(scene)
+        terrain = TerrainPool()
+        world = warm_up(scene, terrain.world(scene) if kinds else None)
+        for other in {kind.scene.fingerprint: kind.scene for kind in kinds.values()}.values():
+            warm_up(other, terrain.world(other))
     with asyncio.Runner(loop_factory=loop_factory()) as runner, contextlib.ExitStack() as stack:
         store = None
         if settings.data is not None:
@@ -136,14 +157,35 @@ def run(settings: Settings) -> int:
             seed=settings.seed,
             authenticate=authenticate,
         )
-        return runner.run(Server(settings, game, store).serve())
+        more = Declared(kinds, terrain, token) if kinds else None
+        return runner.run(Server(settings, game, store, more).serve())
+
+
+class Declared(NamedTuple):
+    """The declared kinds of worlds, the terrain that worlds share, and the token of operators (empty: none)."""
+
+    kinds: "Mapping[str, Kind]"
+    terrain: TerrainPool
+    token: str
 
 
 class Server:
-    """All parts of a running server, with their start and their end."""
+    """All parts of a running server, with their start and their end.
 
-    def __init__(self, settings: Settings, game: Game, store: Store | None = None) -> None:
+    Args:
+        settings: the settings.
+        game: the game of the default world.
+        store: the store of the default world; None: it is not saved.
+        declared: what further worlds need; None: there are none.
+    """
+
+    def __init__(
+        self, settings: Settings, game: Game, store: Store | None = None, declared: Declared | None = None
+    ) -> None:
         self.settings = settings
+        self.hosting: Hosting | None = None
+        """The worlds besides the default one, from the start on; None: there are none."""
+        self._declared = declared
         self.game = game
         self.store = store
         self.faults = game.faults
@@ -152,15 +194,20 @@ class Server:
             settings.limits,
             Pages(
                 {"/readyz": ready_page(self.unready)},
-                {"/stats": json_page(self.stats), "/metrics": metrics_page(self.stats, self._durations), **live},
+                {
+                    "/stats": json_page(self.stats),
+                    "/metrics": metrics_page(self.stats, self._durations, self._metrics),
+                    **live,
+                },
                 self.faults.report,
+                self._page if declared else None,
             ),
             figures=settings.figures,
             origins=settings.allowed_origins,
             hosts=(settings.host, *settings.allowed_hosts),
             closing=lambda: settings.restart_s if self.draining else None,
         )
-        self.gateway = Gateway(game, self.admission, self.faults)
+        self.gateway = Gateway(game, self.admission, self.faults, self._route if declared else None)
         self.ticker: Ticker | None = None
         self.watchdog: Watchdog | None = None
         self.draining = False
@@ -172,7 +219,7 @@ class Server:
         loop = asyncio.get_running_loop()
         loop.set_exception_handler(self._loop_failed)
         self._stop = loop.create_future()
-        with on_signals(loop, lambda name: self._end(name, 0)):
+        with on_signals(loop, self._signal):
             address, port = await self._listen(tls_context(self.settings))
             rate = self.game.scene.tick_rate
             if self.store is not None:
@@ -182,6 +229,8 @@ class Server:
             tasks = Tasks(loop, self.settings.limits.load_s)
             self.game.joining.run = tasks.run
             freeze()
+            if self._declared is not None:
+                self._host(self._declared, tasks)
             kind = type(loop).__module__.partition(".")[0]
             scene, auth, form = self.game.scene.name, self.settings.auth, self.game.world.kernel.form
             logger.info("started", scene=scene, tick_rate=rate, loop=kind, auth=auth, kernel=form)
@@ -197,24 +246,46 @@ class Server:
         logger.info("stopped", after_s=round(time.monotonic() - self.started))
         return code
 
+    def _host(self, declared: Declared, tasks: Tasks) -> None:
+        """Begins the worlds besides the default one."""
+        from server.hosting.hosting import Hosting
+
+        self.hosting = Hosting(
+            self.settings,
+            declared.kinds,
+            declared.terrain,
+            self.game,
+            tasks,
+            token=declared.token,
+            faults=self.faults,
+            stop=lambda reason: self._end(reason, 0),
+        )
+        self.hosting.start()
+
     async def _drain(self) -> None:
         """Sends every client the order to reconnect later, and waits at most `STOP_S` until all have closed."""
         self.draining = True
         if self.ticker is not None:
             self.ticker.stop()
+        if self.hosting is not None:
+            self.hosting.shut_down("the server is going down", self.settings.restart_s)
         self.game.shut_down("the server is going down", self.settings.restart_s)
         with contextlib.suppress(TimeoutError):
             await asyncio.wait_for(self.gateway.drained(), STOP_S)
         self.gateway.stop_listening()  # last, so that `/readyz` answers "draining" until the end
+        if self.hosting is not None:
+            self.hosting.host.close()
 
     def unready(self) -> str:
         """Returns the reason why this server should get no new players; empty if it is ready."""
-        if self.draining:
+        if self.draining or (self.hosting is not None and self.hosting.worlds.draining):
             return "draining"
         if self.ticker is None:
             return "starting"
         if self.store is not None and self.store.trouble:
             return f"cannot save: {self.store.trouble}"
+        if self.hosting is not None and (trouble := self.hosting.host.trouble()):
+            return trouble
         age = time.monotonic() - self.ticker.latest
         return f"the last tick began {age:.1f} s ago" if age > READY_S else ""
 
@@ -225,6 +296,7 @@ class Server:
             **self.game.stats(),
             **figures,
             **({} if self.store is None else self.store.stats()),
+            **({} if self.hosting is None else self.hosting.stats()),
             "connections": len(self.gateway.connections),
             "refused_at_door": dict(self.admission.refused),
             "internal_errors": self.faults.total + (0 if self.store is None else self.store.faults.total),
@@ -241,6 +313,16 @@ class Server:
             return {}
         return {"tick_lateness_seconds": self.ticker.lateness, "tick_work_seconds": self.ticker.work}
 
+    def _metrics(self) -> Iterator[Metric]:
+        if self.hosting is not None:
+            yield from self.hosting.pages.metrics()
+
+    def _page(self, request: PageRequest) -> Page | None:
+        return None if self.hosting is None else self.hosting.page(request)
+
+    def _route(self, target: str, address: str) -> Events | Page:
+        return STARTING if self.hosting is None else self.hosting.route(target, address)
+
     async def _listen(self, tls: ssl.SSLContext | None) -> tuple[str, int]:
         host, port = self.settings.host, self.settings.port
         try:
@@ -250,6 +332,13 @@ class Server:
             if getattr(error, "errno", None) == errno.EADDRINUSE:
                 reason = "in use by another program; end that one or choose another --port (0: any free one)"
             raise SettingsError(f"host = {host!r}, port = {port}: {reason}") from error
+
+    def _signal(self, name: str) -> None:
+        """Ends the server at a signal. Worlds go on for a while if the settings say so."""
+        if self.hosting is not None and self.settings.drain_s and not self.hosting.worlds.draining:
+            self.hosting.drain()
+        else:
+            self._end(name, 0)
 
     def _end(self, reason: str, code: int) -> None:
         if self._stop is not None and not self._stop.done():
@@ -263,51 +352,3 @@ class Server:
         error = context.get("exception")
         self.faults.total += 1
         logger.error(context["message"], error=repr(error), exc_info=None if isinstance(error, OSError) else error)
-
-
-@contextlib.contextmanager
-def saved(scene: Scene, settings: Settings) -> Iterator[Store]:
-    """Opens the store in the directory `settings.data`. Its world is saved completely at the end of the context.
-
-    Raises:
-        StoreError: the directory or the world in it cannot be used.
-    """
-    assert settings.data is not None
-    power = settings.durability == "power"
-    store = Store(settings.data, scene, game=settings.game or "", power=power, checkpoint_s=settings.checkpoint_s)
-    tick, state_hash = store.restored
-    found = tick > 0 or store.kept is not None
-    logger.info("restored" if found else "a new world", directory=settings.data, tick=tick, state_hash=state_hash)
-    try:
-        yield store
-    finally:
-        store.close()
-
-
-@contextlib.contextmanager
-def recorded(scene: Scene, path: str, world: RecordedWorld | None = None) -> Iterator[RecordedWorld]:
-    """Records the changes of a world into a new file. The recording ends with the context.
-
-    Args:
-        path: of the file.
-        world: the world to record; None: a new one with the terrain of the scene.
-
-    Raises:
-        SettingsError: the file exists or cannot be written.
-    """
-    try:
-        file = Path(path).open("xb")  # noqa: SIM115 - closing may fail on a full disk, which has been logged by then
-    except FileExistsError:
-        raise SettingsError(f"record = {path!r}: exists already, and a recording is never overwritten") from None
-    except OSError as error:
-        raise SettingsError(f"record = {path!r}: cannot be written ({error.strerror or error})") from error
-    if world is None:
-        world = RecordedWorld(scene)
-        world.load_terrain()
-    try:
-        world.record(file, lambda error: logger.error("recording has ended", path=path, error=str(error)))
-        yield world
-        world.end_recording()
-    finally:
-        with contextlib.suppress(OSError):
-            file.close()

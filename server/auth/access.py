@@ -3,12 +3,17 @@
 import importlib
 import os
 import ssl
+from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 from server.auth.identity import Authenticator
 from server.config.options import SettingsError
-from server.config.settings import Settings
+from server.config.settings import OPERATOR_VARIABLE, Settings
 from server.rules import RulesError, checked_function
+
+TOKEN_MIN = 16
+"""Minimum length of the token of operators, in characters."""
 
 
 def authenticator(settings: Settings) -> Authenticator | None:
@@ -36,6 +41,33 @@ def authenticator(settings: Settings) -> Authenticator | None:
         raise SettingsError(str(error)) from error
     checked: Authenticator = found
     return checked
+
+
+def operator_token(path: str | None, environment: Mapping[str, str]) -> str:
+    """Returns the token of operators; empty if there is none.
+
+    Args:
+        path: a file with the token, of which leading and trailing spaces are ignored; None: read `OPERATOR_VARIABLE`.
+        environment: the environment variables.
+
+    Raises:
+        SettingsError: the token cannot be read, is too short, or has other characters than visible ones of ASCII.
+    """
+    if path is None:
+        origin, token = OPERATOR_VARIABLE, environment.get(OPERATOR_VARIABLE, "")
+        if not token:
+            return ""
+    else:
+        origin = f"operator_token_file = {path!r}"
+        try:
+            token = Path(path).read_text("utf-8").strip()
+        except (OSError, ValueError) as error:
+            raise SettingsError(f"{origin}: cannot be read ({getattr(error, 'strerror', None) or error})") from error
+    if len(token) < TOKEN_MIN or not token.isascii() or not token.isprintable() or " " in token:
+        raise SettingsError(
+            f"{origin}: must have at least {TOKEN_MIN} visible characters of ASCII, as made by: openssl rand -hex 32"
+        )
+    return token
 
 
 def tls_context(settings: Settings) -> ssl.SSLContext | None:

@@ -213,12 +213,12 @@ def _shown(value: Any) -> Any:
 
 
 @cache
-def html_page() -> Page:
-    """Returns the page itself.
+def html_page(name: str = "live.html") -> Page:
+    """Returns a page of this folder: the live page, or another one.
 
     Its content security policy allows only its own script, its own style, and requests to this server.
     """
-    text = Path(__file__).with_name("live.html").read_text("utf-8")
+    text = Path(__file__).with_name(name).read_text("utf-8")
     hashes = {
         tag: base64.b64encode(hashlib.sha256(inside.encode()).digest()).decode()
         for tag, inside in re.findall(r"<(style|script)>(.*?)</\1>", text, re.DOTALL)

@@ -64,10 +64,14 @@ class _Collector:
     """A collector that computes all metrics from figures at each scrape, and leaves out those without a figure."""
 
     def __init__(
-        self, figures: Callable[[], Mapping[str, Any]], durations: Callable[[], Mapping[str, Histogram]]
+        self,
+        figures: Callable[[], Mapping[str, Any]],
+        durations: Callable[[], Mapping[str, Histogram]],
+        more: Callable[[], Iterable[Metric]],
     ) -> None:
         self._figures = figures
         self._durations = durations
+        self._more = more
 
     def describe(self) -> Iterable[Metric]:
         """Returns nothing, so that the registry computes no figures before the first scrape."""
@@ -97,19 +101,23 @@ class _Collector:
             counts = zip(map(str, BOUNDS_S), histogram.below(BOUNDS_S), strict=True)
             buckets = [*counts, ("+Inf", histogram.count)]
             yield HistogramMetricFamily(PREFIX + name, "Seconds, in buckets.", buckets, histogram.sum_s)
+        yield from self._more()
 
 
 def metrics_page(
-    figures: Callable[[], Mapping[str, Any]], durations: Callable[[], Mapping[str, Histogram]]
+    figures: Callable[[], Mapping[str, Any]],
+    durations: Callable[[], Mapping[str, Histogram]],
+    more: Callable[[], Iterable[Metric]] = tuple,
 ) -> Callable[[], Page]:
     """Returns a function that makes the page.
 
     Args:
         figures: returns the figures of `/stats`.
         durations: returns histograms by the name of their metric.
+        more: returns further metrics.
     """
     registry = CollectorRegistry(auto_describe=False)
-    registry.register(_Collector(figures, durations))
+    registry.register(_Collector(figures, durations, more))
     ProcessCollector(registry=registry)
     GCCollector(registry=registry)
     return lambda: Page(HTTPStatus.OK, generate_latest(registry), CONTENT_TYPE_PLAIN_0_0_4)

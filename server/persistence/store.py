@@ -31,8 +31,8 @@ a new checkpoint, and repeats this until it works. That saves everything, the un
 
 Rejected: a transaction in the tick (a slow disk would delay every client); a log of states instead of inputs (100 times
 the bytes); a file per segment (no transaction spans several files); a copy of the world by fork (not with threads, not
-on Windows); a replica that replays the log in the thread (twice the CPU time, always). Not promised: ticks that clients
-saw in snapshots without a verdict. A crash loses those that the next transaction would have saved.
+on Windows); a replica that replays the log in the thread (twice the CPU time). A crash loses ticks that clients saw in
+snapshots without a verdict, if they were to be in the next transaction.
 """
 
 import logging
@@ -59,18 +59,13 @@ from shared.world_state import WorldState
 
 LOG_BYTES_MAX = 32 << 20
 """Size of the log in bytes that triggers a checkpoint ahead of time."""
-HASHED_MAX = 1000
-"""Number of entities up to which ticks have hashes of the whole world. In larger worlds only checkpoints have them."""
-STALE_MAX = 16
-"""Number of segments without a present digest up to which a tick gets a hash; each would take 40 us."""
-QUIET_S = 1.0
-"""Seconds that quiet ticks may wait to be written."""
-BEHIND_S = 10.0
-"""Seconds that the disk may be behind the world before records are dropped."""
-RETRY_S = 2.0
-"""Seconds until the next attempt after a failure. The time doubles with each further failure."""
-RETRY_MAX_S = 30.0
-"""Maximum time between two attempts, in seconds; long, so that a disk that stays full gets few log lines."""
+HASHED_MAX, STALE_MAX = 1000, 16
+"""Numbers of entities, and of segments without a present digest (40 us each), up to which ticks have hashes of the
+whole world. Otherwise only checkpoints have them."""
+QUIET_S, BEHIND_S = 1.0, 10.0
+"""Seconds that quiet ticks may wait to be written, and that the disk may be behind before records are dropped."""
+RETRY_S, RETRY_MAX_S = 2.0, 30.0
+"""Seconds until the next attempt after a failure, doubled with each further one, and the longest time between two."""
 GAME_MAX = 1024
 """Maximum length of the name of a game, in characters."""
 CLOSE_S = 2.5
@@ -89,7 +84,7 @@ class Store(Observer):
         power: whether a durable tick survives a power cut (by an fsync), or only the end of the process.
         checkpoint_s: seconds of the world's time between two checkpoints.
         compiled: whether the kernel is compiled, as for `World`.
-        terrain: a world of the scene as it was generated, for `World.restore`; None: it is generated anew.
+        terrain: a world of the scene as generated, for `World.restore`; None: it is generated anew.
 
     Attributes:
         world: the saved world, or a new one.
@@ -207,19 +202,24 @@ class Store(Observer):
                 self._copy, self._copied, self._copy_due, self._gap = copy, tick, False, False
             if len(self._records) > BEHIND_S * world.scene.tick_rate:
                 self._drop(f"the disk is more than {BEHIND_S:g} s behind")
-            if loud or copy is not None:
-                self._urgent = True
+            self._urgent = self._urgent or loud or copy is not None
+            if self._urgent or len(self._records) == 1:
                 self._wake.notify()
+
+    def end(self, *, save: bool = True) -> None:
+        """Lets the thread save everything, unless `save` is false, and end. The world must not change any more."""
+        self.world.detach(self)
+        with self._wake:  # if the copy fails, the log has everything
+            self._copy = self._copied_world() if save and self._thread.is_alive() else None
+            self._records = self._records if save else []
+            self._closing = self._urgent = True
+            self._wake.notify()
 
     def close(self) -> bool:
         """Saves everything and releases the directory. Returns whether everything was saved."""
-        self.world.detach(self)
-        if self._thread.is_alive():
-            copy = self._copied_world()  # if that fails, the log has everything
-            with self._wake:
-                self._copy = copy
-                self._closing = self._urgent = True
-                self._wake.notify()
+        if not self._closing:
+            self.end()
+        if self._thread.ident is not None:
             self._thread.join(CLOSE_S)
             if self._thread.is_alive():
                 logger.error("the disk does not respond: changes since tick %d may be lost", self._written)
@@ -228,9 +228,7 @@ class Store(Observer):
             self._file.close()
         self._claim.close()
         if self.trouble:
-            logger.error(
-                "the last changes could not be saved: %s; changes since tick %d are lost", self.trouble, self._written
-            )
+            logger.error("not saved: %s; the changes since tick %d are lost", self.trouble, self._written)
         return not self.trouble
 
     def stats(self) -> dict[str, Any]:
@@ -287,6 +285,7 @@ class Store(Observer):
         """Writes the records that have come, and packs one piece of the checkpoint that is being made."""
         with self._wake:
             if self._copy is None:
+                self._wake.wait_for(lambda: self._urgent or self._gap or bool(self._records))
                 self._wake.wait_for(lambda: self._urgent, QUIET_S)
             self._urgent = False
             records, self._records = self._records, []
@@ -395,6 +394,7 @@ class Store(Observer):
         if not self.trouble:
             logger.error("cannot save: %s; commands are refused until it works again", reason)
         self.trouble, self._gap = reason, True
+        self._wake.notify()
         if not self._closing or self._copy is self._copying:  # otherwise it is the last copy, which has not been tried
             self._copy = None
         self._records.clear()

@@ -6,6 +6,7 @@ the names of secrets, and everything in a finished line that looks like a JSON W
 
 import logging
 import re
+from contextvars import ContextVar
 from typing import TextIO
 
 import structlog
@@ -17,6 +18,8 @@ JWT = re.compile(r"eyJ[\w-]+\.[\w-]+\.[\w-]*")
 """Pattern of a JSON Web Token."""
 HIDDEN = "[hidden]"
 """Text in place of a hidden value."""
+WORLD: ContextVar[str] = ContextVar("world", default="")
+"""Name of the world, one of many, whose tick runs; lines of the log have it. Empty: none."""
 
 
 def set_up(level: str, form: str, stream: TextIO) -> None:
@@ -30,6 +33,7 @@ def set_up(level: str, form: str, stream: TextIO) -> None:
     first: list[Processor] = [
         structlog.stdlib.add_log_level,
         structlog.stdlib.add_logger_name,
+        _with_world,
         structlog.processors.TimeStamper(fmt="iso", utc=True),
         structlog.processors.StackInfoRenderer(),
         structlog.processors.format_exc_info,  # a richer format would show local variables, which may be secrets
@@ -59,6 +63,12 @@ def set_up(level: str, form: str, stream: TextIO) -> None:
     root.handlers[:] = [handler]
     root.setLevel(level.upper())
     logging.captureWarnings(capture=True)
+
+
+def _with_world(logger: WrappedLogger, method: str, event: EventDict) -> EventDict:
+    if name := WORLD.get():
+        event.setdefault("world", name)
+    return event
 
 
 def _without_secrets(logger: WrappedLogger, method: str, event: EventDict) -> EventDict:

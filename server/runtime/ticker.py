@@ -222,6 +222,11 @@ class Ticker:
         self._alarm = self._make_alarm(self._ring)
         self._alarm.set(self._schedule.deadline)
 
+    @property
+    def skipped_s(self) -> float:
+        """Seconds of all dropped ticks."""
+        return self._schedule.skipped_s
+
     def stats(self) -> dict[str, Any]:
         """Returns the figures of the ticker since the start. `histogram.between` computes those of a period."""
         return {

@@ -32,17 +32,23 @@ class _Void:
     def close(self, code: int, reason: str) -> None: ...
 
 
-def warm_up(scene: Scene) -> RecordedWorld:
+def warm_up(scene: Scene, fresh: RecordedWorld | None = None) -> RecordedWorld:
     """Plays a short game in a scratch world: clients join, walk, jump, build, dig, fall out, shoot and leave.
 
+    Args:
+        scene: the scene.
+        fresh: a new world of the scene with its terrain; None: it is made, which is half of the work.
+
     Returns:
-        A new, unused world of the scene. Generating its terrain is half of the work.
+        The new world, unused.
 
     Raises:
         SceneError: there is no room for a player at any spawn point, so no client could ever join.
     """
-    fresh, scratch = RecordedWorld(scene), RecordedWorld(scene)
-    fresh.load_terrain()
+    scratch = RecordedWorld(scene)
+    if fresh is None:
+        fresh = RecordedWorld(scene)
+        fresh.load_terrain()
     scratch.restore(fresh)
     game, now = Game(scene, limits=Limits(edits_per_s=10_000), world=scratch), 0.0
 

@@ -131,6 +131,12 @@ class Directory:
             self.wake(world)
         return world
 
+    def remember(self, name: str, kind: Kind, properties: dict[str, Property], code: str) -> None:
+        """Takes note of a world that has ended and comes back when a player joins it."""
+        self.asleep[name] = (kind, properties, code)
+        if code:
+            self._codes[code] = name
+
     def end(self, name: str, reason: str, *, keep: bool = False) -> None:
         """Ends a world: its players get the reason, and its place is free.
 
@@ -153,7 +159,7 @@ class Directory:
         self._of_kind[world.kind.name] -= 1
         self.seats.ended(name)
         if keep:
-            self.asleep[name] = (world.kind, world.properties, world.code)
+            self.remember(name, world.kind, world.properties, world.code)
         else:
             self._codes.pop(world.code, None)
         self.counts["ended"] += 1
@@ -249,7 +255,7 @@ class Directory:
             return
         if world.ticking and not world.kind.runs_empty:
             self.rest(world)
-        if now - world.used_at >= world.kind.empty_s:
+        if now - world.used_at >= world.kind.empty_s and not world.stays:
             self.end(world.name, "the world was empty", keep=world.kind.keep)
 
     def _new_code(self) -> str:

@@ -37,6 +37,8 @@ class HostedWorld:
         self.name, self.kind, self.properties, self.code = name, kind, properties, code
         self.locked = False
         """Whether only players with a seat may join. The rules lock a match when it begins."""
+        self.stays = False
+        """Whether the world never ends because it is empty."""
         self.made_at = self.used_at = now
         """Times in seconds at which the world was made, and at which it was last seen with players or seats."""
         self.ticking = False

@@ -12,7 +12,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from server import app
 from server.config.options import SettingsError
 from server.journal import former
 from server.journal.recorded_world import Observer, RecordedWorld
@@ -31,6 +30,7 @@ from server.journal.records import (
     redo,
     replay,
 )
+from server.runtime import keeping
 from shared.aim import NO_AIM, make_aim
 from shared.inputs import Input
 from shared.world import OverlapError, World
@@ -404,15 +404,15 @@ def test_a_replay_that_comes_out_otherwise_names_the_tick(tmp_path: Path, monkey
 
 def test_the_server_records_into_a_new_file_only(tmp_path: Path) -> None:
     scene, path = worlds.scene(FLOOR), tmp_path / "run"
-    with app.recorded(scene, str(path)) as world:
+    with keeping.recorded(scene, str(path)) as world:
         world.spawn("box", (0, 0, 3))
         worlds.steps(world, 40)
     moments = list(replay(path))
     assert moments[-1].ended
     assert moments[-1].world.state_hash() == world.state_hash()
     before = path.read_bytes()
-    with pytest.raises(SettingsError, match="never overwritten"), app.recorded(scene, str(path)):
+    with pytest.raises(SettingsError, match="never overwritten"), keeping.recorded(scene, str(path)):
         raise AssertionError
     assert path.read_bytes() == before
-    with pytest.raises(SettingsError, match="cannot be written"), app.recorded(scene, str(tmp_path / "no" / "run")):
+    with pytest.raises(SettingsError, match="cannot be written"), keeping.recorded(scene, str(tmp_path / "no" / "run")):
         raise AssertionError

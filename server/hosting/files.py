@@ -1,0 +1,123 @@
+"""The directories of saved worlds: DATA/worlds/NAME has `world.json` and the store of one world.
+
+`world.json` is written before a world begins, so a directory with it is a world, whatever ended the process. A world
+that ends is renamed before its files are removed, and the rest is removed at the next start.
+"""
+
+import json
+import logging
+import os
+import shutil
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from server.players.ticket import Property
+from server.worlds.kinds import WorldsError, checked_name, checked_properties
+
+FORMAT = 1
+"""Version of the format of `world.json`."""
+ENDED = ".ended-"
+"""Beginning of the name of a directory whose world has ended."""
+
+logger = logging.getLogger(__name__)
+
+
+class SavedWorld(NamedTuple):
+    """The state of a saved world beside its store.
+
+    `kind` is the name of its kind. `asleep` says whether it has ended and comes back when a player joins.
+    """
+
+    kind: str
+    properties: dict[str, Property]
+    code: str
+    locked: bool
+    asleep: bool
+    stays: bool
+
+
+class WorldFiles:
+    """The directories of all saved worlds.
+
+    Args:
+        data: the directory of the server's data.
+        durable: whether `world.json` survives a power cut.
+
+    Raises:
+        OSError: the directory cannot be made.
+    """
+
+    def __init__(self, data: Path, *, durable: bool) -> None:
+        self._folder, self._failed, self._durable = data / "worlds", data / "failed-worlds", durable
+        self._folder.mkdir(parents=True, exist_ok=True)
+        for path in self._folder.glob(f"{ENDED}*"):
+            shutil.rmtree(path, ignore_errors=True)
+
+    def of(self, name: str) -> Path:
+        """Returns the directory of a world."""
+        return self._folder / name
+
+    def write(self, name: str, world: SavedWorld) -> None:
+        """Writes `world.json` of a world.
+
+        Raises:
+            OSError: it cannot be written.
+        """
+        folder = self.of(name)
+        folder.mkdir(exist_ok=True)
+        new = folder / "world.json-new"
+        with new.open("w", encoding="utf-8") as file:
+            json.dump({"format": FORMAT, **world._asdict()}, file)
+            if self._durable:
+                file.flush()
+                os.fsync(file.fileno())
+        new.replace(folder / "world.json")
+
+    def saved(self) -> Iterator[tuple[str, SavedWorld]]:
+        """Yields all saved worlds: their names, and what `world.json` has. Logs those that cannot be used."""
+        for path in sorted(self._folder.iterdir(), key=lambda path: (len(path.name), path.name)):
+            try:
+                yield checked_name(path.name, "world"), _read(path / "world.json")
+            except (OSError, ValueError, TypeError) as error:
+                logger.error("the saved world in %s cannot be used: %s", path, error)
+
+    def remove(self, name: str) -> None:
+        """Removes the directory of a world that has ended, if there is one."""
+        ended = self._free(self._folder / f"{ENDED}{name}")
+        try:
+            self.of(name).rename(ended)
+        except FileNotFoundError:
+            return
+        shutil.rmtree(ended, ignore_errors=True)
+
+    def set_aside(self, name: str) -> Path:
+        """Moves the directory of a world that has failed out of the way. Returns its new place."""
+        self._failed.mkdir(exist_ok=True)
+        return self.of(name).rename(self._free(self._failed / name))
+
+    def _free(self, path: Path) -> Path:
+        """Returns the path, or one with a number behind it that does not exist."""
+        number, found = 1, path
+        while found.exists():
+            number += 1
+            found = path.with_name(f"{path.name}-{number}")
+        return found
+
+
+def _read(path: Path) -> SavedWorld:
+    """Reads a `world.json`.
+
+    Raises:
+        OSError: it cannot be read.
+        ValueError: it has another format, or is damaged.
+    """
+    table: Any = json.loads(path.read_text("utf-8"))
+    if not isinstance(table, Mapping) or table.get("format") != FORMAT:
+        raise WorldsError(f"{path.name} is not of format {FORMAT}")
+    values: dict[str, Any] = {name: table.get(name) for name in SavedWorld._fields}
+    for name, kind in SavedWorld.__annotations__.items():
+        wanted = {"properties": dict}.get(name, kind)
+        if type(values[name]) is not wanted:
+            raise WorldsError(f"{path.name}: {name} = {values[name]!r} is of another type")
+    return SavedWorld(**values)._replace(properties=checked_properties(values["properties"]))
