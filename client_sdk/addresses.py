@@ -1,4 +1,4 @@
-"""The addresses of worlds on a server: of one that is asked for, of one with a name, a code or a reserved seat."""
+"""The addresses of worlds on a server: one that is asked for, or one with a name, a code or a reserved seat."""
 
 import inspect
 from collections.abc import Callable, Mapping
@@ -14,11 +14,10 @@ TEXT_MAX, WHOLE_MAX = 64, (1 << 53) - 1
 """Longest name or text of a property, and largest whole number in one."""
 
 
-def matching(url: str, kind: str, seats: int, properties: Mapping[str, Any]) -> str:
-    """Returns the address at which a server finds or makes a world.
+def matching(kind: str, seats: int, properties: Mapping[str, Any]) -> str:
+    """Returns the path at which a server finds or makes a world.
 
     Args:
-        url: address of the server.
         kind: the kind of world.
         seats: number of seats to reserve, with the client's own.
         properties: the properties of the world.
@@ -29,14 +28,13 @@ def matching(url: str, kind: str, seats: int, properties: Mapping[str, Any]) -> 
     query = _query(kind, properties)
     if whole(seats, "seats", 1, fields.SEATS_MAX) > 1:
         query["seats"] = str(seats)
-    return _at(url, "/match?" + urlencode(query))
+    return _short("/match?" + urlencode(query))
 
 
-def creating(url: str, kind: str, private: bool, properties: Mapping[str, Any]) -> str:
-    """Returns the address at which a server makes a world.
+def creating(kind: str, private: bool, properties: Mapping[str, Any]) -> str:
+    """Returns the path at which a server makes a world.
 
     Args:
-        url: address of the server.
         kind: the kind of world.
         private: whether only those with the world's code may join.
         properties: the properties of the world.
@@ -47,14 +45,13 @@ def creating(url: str, kind: str, private: bool, properties: Mapping[str, Any]) 
     query = _query(kind, properties)
     if boolean(private, "private"):
         query["private"] = "1"
-    return _at(url, "/create?" + urlencode(query))
+    return _short("/create?" + urlencode(query))
 
 
-def joining(url: str, *, code: str, seat: str, world: str) -> str:
-    """Returns the address of a world.
+def joining(code: str, seat: str, world: str) -> str:
+    """Returns the path of a world.
 
     Args:
-        url: address of the server.
         code: the code of a private world.
         seat: the path of a reserved seat.
         world: the name of a world.
@@ -66,15 +63,24 @@ def joining(url: str, *, code: str, seat: str, world: str) -> str:
     if len(given) != 1:
         raise ValueError(f"{', '.join(given) or 'no argument'}: must be exactly one of code, seat and world")
     if code != "":
-        return _at(url, "/join?" + urlencode({"code": text(code, "code", fields.CODE_MAX)}))
+        return "/join?" + urlencode({"code": text(code, "code", fields.CODE_MAX)})
     if seat != "":
         if not fields.path(seat):
             raise ValueError(f"seat = {shown(seat)}: must be a path like /arena-1?seat=...")
-        return _at(url, seat)
+        return seat
     path = "/" + text(world, "world", fields.PATH_MAX - 1)
     if not fields.path(path) or "?" in path or "/" in world:
         raise ValueError(f"world = {shown(world)}: must be the name of a world")
-    return _at(url, path)
+    return path
+
+
+def at(url: str, path: str) -> str:
+    """Returns the address of a path on the server of an address."""
+    try:
+        parts = urlsplit(url)
+        return f"{parts.scheme}://{parts.netloc}{path}" if parts.netloc else url
+    except (ValueError, TypeError, AttributeError):
+        return url  # it is no address; the connection raises the error
 
 
 def options_of(connect: Callable[..., Any], given: dict[str, Any]) -> dict[str, Any]:
@@ -83,15 +89,15 @@ def options_of(connect: Callable[..., Any], given: dict[str, Any]) -> dict[str, 
     return {name: given.pop(name) for name in tuple(given) if name in names}
 
 
-def _at(url: str, path: str) -> str:
-    """Returns the address of a path on the server of an address."""
+def _short(path: str) -> str:
+    """Returns a path.
+
+    Raises:
+        ValueError: it is too long.
+    """
     if len(path) > fields.PATH_MAX:
         raise ValueError(f"{path[:40]}...: a path of {len(path)} characters; at most {fields.PATH_MAX}")
-    try:
-        parts = urlsplit(url)
-        return f"{parts.scheme}://{parts.netloc}{path}" if parts.netloc else url
-    except (ValueError, TypeError, AttributeError):
-        return url  # it is no address; the connection raises the error
+    return path
 
 
 def _query(kind: str, properties: Mapping[str, Any]) -> dict[str, str]:

@@ -145,7 +145,7 @@ class AsyncClient(BaseClient):
         The arguments are those of `Client.match`.
         """
         own = addresses.options_of(cls.connect, options)
-        return await cls.connect(addresses.matching(url, kind, seats, options), **own)
+        return await cls.connect(addresses.at(url, addresses.matching(kind, seats, options)), **own)
 
     @classmethod
     async def create(cls, url: str, kind: str, *, private: bool = False, **options: Any) -> "AsyncClient":
@@ -154,7 +154,7 @@ class AsyncClient(BaseClient):
         The arguments are those of `Client.create`.
         """
         own = addresses.options_of(cls.connect, options)
-        return await cls.connect(addresses.creating(url, kind, private, options), **own)
+        return await cls.connect(addresses.at(url, addresses.creating(kind, private, options)), **own)
 
     @classmethod
     async def join(cls, url: str, *, code: str = "", seat: str = "", world: str = "", **options: Any) -> "AsyncClient":
@@ -162,7 +162,7 @@ class AsyncClient(BaseClient):
 
         The arguments are those of `Client.join`.
         """
-        return await cls.connect(addresses.joining(url, code=code, seat=seat, world=world), **options)
+        return await cls.connect(addresses.at(url, addresses.joining(code, seat, world)), **options)
 
     @staticmethod
     async def list_worlds(

@@ -125,7 +125,7 @@ class Client(BaseClient):
             ConnectError: there is no connection; the text says why, and what to do.
         """
         own = addresses.options_of(cls.connect, options)
-        return cls.connect(addresses.matching(url, kind, seats, options), **own)
+        return cls.connect(addresses.at(url, addresses.matching(kind, seats, options)), **own)
 
     @classmethod
     def create(cls, url: str, kind: str, *, private: bool = False, **options: Any) -> "Client":
@@ -142,7 +142,7 @@ class Client(BaseClient):
             ConnectError: there is no connection; the text says why, and what to do.
         """
         own = addresses.options_of(cls.connect, options)
-        return cls.connect(addresses.creating(url, kind, private, options), **own)
+        return cls.connect(addresses.at(url, addresses.creating(kind, private, options)), **own)
 
     @classmethod
     def join(cls, url: str, *, code: str = "", seat: str = "", world: str = "", **options: Any) -> "Client":
@@ -160,7 +160,7 @@ class Client(BaseClient):
             TypeError: `connect` has no such argument.
             ConnectError: there is no connection; the text says why, and what to do.
         """
-        return cls.connect(addresses.joining(url, code=code, seat=seat, world=world), **options)
+        return cls.connect(addresses.at(url, addresses.joining(code, seat, world)), **options)
 
     def poll(self, now: float | None = None) -> list[Event]:
         """Reads what has arrived. Returns the events since the last call, oldest first. Never blocks."""

@@ -129,7 +129,7 @@ class Core(ProgramSide):
             self.reconnect.plan(now + self.travel.left())
         elif not self._open and self.reconnect.retry_at < math.inf:  # a `Bye` has already announced it
             return
-        elif self.state in ("playing", "reconnecting"):
+        elif self._comes_back:
             self._cut_off(Left(code, reason, 0.0), now)
         elif self._worlds.filled is None and self.travel.again():
             self._open = False
@@ -223,6 +223,11 @@ class Core(ProgramSide):
         """Whether the client waits for `Joined` or `Resumed` after a welcome."""
         return self._worlds.filled is not None and self.state != "playing"
 
+    @property
+    def _comes_back(self) -> bool:
+        """Whether the client reconnects after a lost connection: it has played, or was sent to a world that took it."""
+        return self.state in ("playing", "reconnecting") or (self._worlds.filled is not None and self.travel.sent)
+
     def _welcome(self, welcome: messages.Welcome, now: float) -> None:
         worlds = self._worlds
         if worlds.filled:
@@ -261,7 +266,7 @@ class Core(ProgramSide):
 
     def _bye(self, bye: messages.Bye, now: float) -> None:
         left = Left(bye.code, advised(bye.code, bye.reason), bye.wait)
-        if self.state in ("playing", "reconnecting") and (bye.wait >= 0 or bye.code in COME_AGAIN):
+        if self._comes_back and (bye.wait >= 0 or bye.code in COME_AGAIN):
             self._cut_off(left, now)
         elif self.state == "joining" and not self._worlds.filled and self.travel.again(bye):
             self._depart()

@@ -39,6 +39,8 @@ class Travel:
         """The code of the world if it is a private one."""
         self.seats: tuple[str, ...] = ()
         """The paths of the seats that were reserved for others."""
+        self.sent = False
+        """Whether a `Go` has led to the world."""
         self.leaving = False
         """Whether the old connection is being closed, because the next one leads elsewhere."""
         self._wait_s = 0.0
@@ -80,7 +82,8 @@ class Travel:
         else:
             self._lobby, self._failed = "", 0
         self.path, self.code, self.seats = go.path, go.code, tuple(go.seats)
-        self.leaving, self._arriving, self._wait_s = True, True, 0.0
+        self.sent = self.leaving = self._arriving = True
+        self._wait_s = 0.0
         return Matched(self.world, self.code, self.seats) if lobby else Moved(self.world, go.reason)
 
     def left(self) -> float:

@@ -7,12 +7,14 @@ Nothing sleeps, and the result does not depend on the machine. A seed reproduces
 
 from client_sdk.netsim.links import PRESETS, Link
 from sovereign_netcode.playtest.checking import BehaviourCheckError, RandomPlayer, check_behaviours
+from sovereign_netcode.playtest.local_worlds import LocalWorlds
 from sovereign_netcode.playtest.match import Match, Player, Policy, bot, wander
 
 __all__ = [
     "PRESETS",
     "BehaviourCheckError",
     "Link",
+    "LocalWorlds",
     "Match",
     "Player",
     "Policy",

@@ -7,9 +7,10 @@ reordered.
 
 import math
 import random
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from heapq import heappop, heappush
 from itertools import count
+from typing import Any
 
 from client_sdk import bots
 from client_sdk.core import Core
@@ -18,10 +19,12 @@ from client_sdk.netsim.links import Link as Link
 from client_sdk.netsim.links import LinkEvents, TcpStream
 from server.config.limits import Limits
 from server.game import Game
-from server.game.session import Session
 from server.rules import Rules, prepared
+from server.worlds.host import Way
+from server.worlds.kinds import Kind
 from shared.inputs import Input
 from shared.scene import Scene
+from sovereign_netcode.playtest.local_worlds import LocalWorlds
 
 Policy = Callable[[Core, random.Random], Input]
 
@@ -35,8 +38,9 @@ class Player:
         self.drift = self.rng.uniform(-200e-6, 200e-6)
         self.clock_start = self.rng.uniform(0, 1e5)
         self.events: list[Event] = []
+        self._way: Way
         self.closed: tuple[int, str] | None = None
-        self.session: Session | None = None
+        self.session: Any = None
         self.link_events = LinkEvents(path, seed + 3)
         self._seed = seed
         self._connect_wires()
@@ -57,22 +61,30 @@ class Player:
         self._seed += 10
 
     def connect(self) -> None:
-        """Opens the connection."""
-        self.session = self.match.game.open(self, self.match.now)
-        self.core.port.open(self.local)
+        """Opens the connection to the path that the core names."""
+        way = self.match.route(self.core.travel.path)
+        if isinstance(way, str):
+            self.core.port.lost(1006, way, self.local)
+        else:
+            self._way, self.closed = way, None
+            self.session = way.open(self, self.match.now)
+            self.core.port.open(self.local)
         self._update()
 
     def disconnect(self) -> None:
         """Breaks the connection. Messages in transit are lost. The client reconnects if its core has `patience_s`."""
         assert self.session is not None
-        self.match.game.lost(self.session, self.match.now)
-        self.session = None
+        self._way.lost(self.session, self.match.now)
         self._inbox.clear()
+        self._cut(1006, "gone")
+        self._update()
+
+    def _cut(self, code: int, reason: str) -> None:
+        self.session = None
         self.up.cut()
         self.down.cut()
         self._connect_wires()
-        self.core.port.lost(1006, "gone", self.local)
-        self._update()
+        self.core.port.lost(code, reason, self.local)
 
     def suspend(self, seconds: float) -> None:
         """Suspends the client's program. Messages that arrive meanwhile wait until it continues."""
@@ -95,11 +107,11 @@ class Player:
     def close(self, code: int, reason: str) -> None:
         self.closed = (code, reason)
         assert self.session is not None
-        self.match.game.lost(self.session, self.match.now)
+        self._way.lost(self.session, self.match.now)
 
     def _at_server(self, message: bytes) -> None:
         if self.session is not None:
-            self.match.game.receive(self.session, message, self.match.now)
+            self._way.receive(self.session, message, self.match.now)
 
     def _at_client(self, message: bytes) -> None:
         self._inbox.append(message)
@@ -128,7 +140,7 @@ class Player:
             core.set_input(self.policy(core, self.rng))
         now = self.local
         core.port.update(now)
-        if self.session is None and core.state == "reconnecting" and now >= core.reconnect.retry_at:
+        if self.session is None and core.dials(now):
             core.reconnect.trying()
             self.connect()
             return
@@ -148,6 +160,9 @@ class Player:
         self.events += core.events()
         if core.close_request and self.closed is None:
             self.close(*core.close_request)
+        if core.travel.leaving:  # for another world, over a new connection
+            self._cut(1000, "")
+            self.match.at(self.match.now, self._update, key=self)
 
 
 class Match:
@@ -158,10 +173,21 @@ class Match:
         seed: source of everything random.
         limits: the server's limits; None: the defaults.
         rules: rules of the game, which may change the scene (`Rules.prepare`); None: players only walk and edit.
+        worlds: the kinds of further worlds on the server. `game` is then the default world.
     """
 
-    def __init__(self, scene: Scene, seed: int, *, limits: Limits | None = None, rules: Rules | None = None) -> None:
+    def __init__(
+        self,
+        scene: Scene,
+        seed: int,
+        *,
+        limits: Limits | None = None,
+        rules: Rules | None = None,
+        worlds: Sequence[Kind] = (),
+    ) -> None:
         self.game = Game(scene if rules is None else prepared(rules, scene), limits=limits, rules=rules, seed=seed)
+        self.worlds = LocalWorlds(*worlds, default=self.game, limits=limits, seed=seed) if worlds else None
+        """The worlds of the server; None: there is only the default one."""
         self.seed = seed
         self.now = 0.0
         self.players: list[Player] = []
@@ -173,18 +199,22 @@ class Match:
         self.on_tick: list[Callable[[], None]] = []
         self.at(0.0, self._tick)
 
-    def join(self, policy: Policy, path: Link | None = None, core: Core | None = None) -> Player:
+    def join(self, policy: Policy, path: Link | None = None, core: Core | None = None, *, to: str = "/") -> Player:
         """Adds a player. Its client connects at once.
 
         Args:
             policy: called once per predicted tick; returns the input.
             path: properties of its link; None: no latency.
             core: its client; None: a new one.
+            to: the path that the client connects to, like "/match?kind=arena".
         """
         seed = self.seed * 1_000_003 + len(self.players) * 7919
         if core is None:
             classes = [entry.code for entry in self.game.scene.behaviours if entry.code is not None]
-            core = Core(f"player {len(self.players)}", behaviours=classes)
+            core = Core(
+                f"player {len(self.players)}", behaviours=classes if self.worlds is None else self.worlds.behaviours
+            )
+        core.travel.path = to
         player = Player(self, core, path or Link(), policy, seed)
         self.players.append(player)
         self.at(self.now, player.connect)
@@ -225,12 +255,22 @@ class Match:
                     return True
         return False
 
+    def route(self, path: str) -> Way | str:
+        """Returns what a path leads to, or the reason why it leads nowhere."""
+        return self.game if self.worlds is None else self.worlds.route(path, self.now)
+
     def _tick(self) -> None:
-        self.game.tick(self.now, self.now)
-        for act in self.on_tick:
-            act()
-        self._started += 1
-        self.at(self._started * self._tick_s, self._tick)
+        before = self.game.world.tick
+        if self.worlds is None:
+            self.game.tick(self.now, self.now)
+            self._started += 1
+            self.at(self._started * self._tick_s, self._tick)
+        else:
+            self.worlds.advance(self.now)
+            self.at(self.worlds.due, self._tick)
+        if self.game.world.tick != before:
+            for act in self.on_tick:
+                act()
 
 
 def bot(policy: bots.Policy) -> Policy:

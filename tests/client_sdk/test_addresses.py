@@ -5,33 +5,33 @@ from typing import Any
 import pytest
 
 from client_sdk import AsyncClient, Client
-from client_sdk.addresses import creating, joining, matching, options_of
-
-URL = "ws://localhost:8765"
+from client_sdk.addresses import at, creating, joining, matching, options_of
 
 
 @pytest.mark.parametrize(
-    ("address", "made"),
+    ("path", "made"),
     [
-        (matching(URL, "arena", 1, {}), "/match?kind=arena"),
-        (matching(URL + "/", "arena", 2, {"mode": "2v2"}), "/match?kind=arena&mode=2v2&seats=2"),
-        (matching(URL, "arena", 1, {"a": True, "b": False, "c": -3}), "/match?kind=arena&a=true&b=false&c=-3"),
-        (matching(URL, "a b&c", 1, {"ä": "1=2&kind=x"}), "/match?kind=a+b%26c&%C3%A4=1%3D2%26kind%3Dx"),
-        (matching(URL + "/old?seat=1", "arena", 1, {}), "/match?kind=arena"),
-        (creating(URL, "arena", False, {"map": ""}), "/create?kind=arena&map="),
-        (creating(URL, "arena", True, {}), "/create?kind=arena&private=1"),
-        (joining(URL, code="K7 ?&", seat="", world=""), "/join?code=K7+%3F%26"),
-        (joining(URL, code="", seat="/arena-1?seat=a.b", world=""), "/arena-1?seat=a.b"),
-        (joining(URL, code="", seat="", world="arena-1"), "/arena-1"),
+        (matching("arena", 1, {}), "/match?kind=arena"),
+        (matching("arena", 2, {"mode": "2v2"}), "/match?kind=arena&mode=2v2&seats=2"),
+        (matching("arena", 1, {"a": True, "b": False, "c": -3}), "/match?kind=arena&a=true&b=false&c=-3"),
+        (matching("a b&c", 1, {"ä": "1=2&kind=x"}), "/match?kind=a+b%26c&%C3%A4=1%3D2%26kind%3Dx"),
+        (creating("arena", False, {"map": ""}), "/create?kind=arena&map="),
+        (creating("arena", True, {}), "/create?kind=arena&private=1"),
+        (joining("K7 ?&", "", ""), "/join?code=K7+%3F%26"),
+        (joining("", "/arena-1?seat=a.b", ""), "/arena-1?seat=a.b"),
+        (joining("", "", "arena-1"), "/arena-1"),
     ],
 )
-def test_addresses(address: str, made: str) -> None:
-    assert address == URL + made
+def test_paths(path: str, made: str) -> None:
+    assert path == made
 
 
-def test_what_is_no_address_is_left_to_the_connection() -> None:
-    for url in ("localhost:8765", "", "ws://[::1", 5, None):
-        assert matching(url, "arena", 1, {}) == url  # type: ignore[arg-type]
+def test_addresses() -> None:
+    for url in ("ws://localhost:8765", "ws://localhost:8765/", "ws://localhost:8765/old?seat=1"):
+        assert at(url, "/match?kind=arena") == "ws://localhost:8765/match?kind=arena"
+    assert at("wss://ann:x@[::1]:1", "/") == "wss://ann:x@[::1]:1/"
+    for wrong in ("localhost:8765", "", "ws://[::1", 5, None):  # the connection raises the error
+        assert at(wrong, "/") == wrong  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("client", [Client, AsyncClient])

@@ -115,7 +115,7 @@ def test_messages_on_a_lost_line_are_gone() -> None:
     match.run_until(lambda: core.state == "playing", 10)
     set_link(core, FAR)
     match.run(1)
-    match.game.lost(player.session, match.now)  # type: ignore[arg-type]
+    match.game.lost(player.session, match.now)
     now = player.local
     core.port.lost(1006, "gone", now)
     assert core.state == "playing", "the client does not know of the loss yet"

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from client_sdk.core import Core
-from client_sdk.events import Answered, Event, Joined, Left, Matched, Moved, SegmentLoaded, Waiting
+from client_sdk.events import Answered, Disconnected, Event, Joined, Left, Matched, Moved, SegmentLoaded, Waiting
 from client_sdk.timing.server_clock import PINGS
 from client_sdk.travel import ATTEMPTS_MAX, PLAYED_S, WORLDS_MAX, Travel, without_seat
 from client_sdk.view import NOTHING
@@ -327,6 +327,27 @@ def test_a_lost_way_from_world_to_world_is_tried_again_and_a_refusal_is_not() ->
     server.taken()
     server.send(Bye(messages.FULL, "this world is full", -1.0))
     assert server.taken() == [Left(messages.FULL, "this world is full", -1.0)]
+
+
+def test_a_connection_that_breaks_after_the_welcome_is_made_anew() -> None:
+    welcome = Welcome(messages.VERSION, 10, 1, SCENE.to_table(), KEY)
+    server = Server(patience_s=5.0)
+    server.send(GO)
+    server.follow()
+    server.send(welcome)
+    server.taken()
+    server.close(1006, "gone")
+    (event,) = server.taken()
+    assert isinstance(event, Disconnected)
+    server.now = server.core.reconnect.retry_at
+    server.dial()
+    assert (server.dialled[-1], server.hello.resume) == ("/arena-1", KEY)
+    server.welcome()
+    assert [type(event) for event in server.taken()] == [Joined]
+    server = Server("/", patience_s=5.0)  # without a `Go`, a first join that breaks is the end, as ever
+    server.send(welcome)
+    server.close(1006, "gone")
+    assert server.taken() == [Left(1006, "gone")]
 
 
 def test_a_lobby_that_refuses_or_breaks_off_is_the_end() -> None:
