@@ -23,13 +23,13 @@ Box = tuple[list[Fraction], list[Fraction]]
 STEP = Fraction(1, 1 << 24)
 SPEED_STEP = Fraction(1, 1 << 16)
 SEGMENT = 32
-HALF = Fraction(1, 2)
 
 
 def nearest(value: Fraction, width: Fraction) -> Fraction:
     """Returns the nearest multiple of `width`; halves are rounded away from zero."""
-    whole = math.floor(abs(value) / width + HALF)
-    return whole * width if value >= 0 else -whole * width
+    count, each = abs(value.numerator) * width.denominator, value.denominator * width.numerator
+    whole = (2 * count + each) // (2 * each)
+    return Fraction((whole if value >= 0 else -whole) * width.numerator, width.denominator)
 
 
 @dataclass
@@ -90,7 +90,6 @@ class Oracle:
     ) -> None:
         self.kinds = kinds
         self.dt = Fraction(1, rate)
-        self.gravity = gravity
         self.terminal = nearest(terminal, SPEED_STEP)
         self.mean = mean
         self.pairs = pairs
@@ -100,12 +99,13 @@ class Oracle:
         self.bodies: dict[int, Body] = {}
         self.fell: list[int] = []
         self._corners = [self._rounded(kind) for kind in kinds]
+        own = [gravity if kind.gravity is None else kind.gravity for kind in kinds]
+        self._falls = [nearest(each * self.dt, SPEED_STEP) for each in own]
         self._reach = 2 + max(math.ceil(abs(part)) for low, high in self._corners for part in (*low, *high))
 
     def fall(self, kind: int) -> Fraction:
         """The change of the speed by gravity in a tick."""
-        own = self.kinds[kind].gravity
-        return nearest((self.gravity if own is None else own) * self.dt, SPEED_STEP)
+        return self._falls[kind]
 
     def is_solid(self, block: Block) -> bool:
         """Returns whether a block stops things. A place that is not loaded stops them; the void does not."""

@@ -368,8 +368,8 @@ def _kind(template: Template) -> Kind:
 
 def _state(entity: int, body: Body) -> tuple[int, ...]:
     """Returns the 12 whole numbers of `World.state`."""
-    place = [_whole(part * BLOCK) for part in body.position]
-    speed = [_whole(part * SPEED) for part in body.velocity]
+    place = [_whole(part, BLOCK) for part in body.position]
+    speed = [_whole(part, SPEED) for part in body.velocity]
     return (entity, body.kind, int(body.falling), *place, *speed, *body.move, body.buttons)
 
 
@@ -377,6 +377,8 @@ def _overlap(a: tuple[Sequence[Fraction], ...], b: tuple[Sequence[int], ...]) ->
     return all(p < s and q > r for p, q, r, s in zip(*a, *b, strict=True))
 
 
-def _whole(value: Fraction) -> int:
-    assert value.denominator == 1, f"{value} is off the grid"
-    return value.numerator
+def _whole(value: Fraction, parts: int) -> int:
+    """Returns a value as a number of these parts of 1."""
+    whole, rest = divmod(value.numerator * parts, value.denominator)
+    assert rest == 0, f"{value} is off the grid"
+    return whole

@@ -107,9 +107,9 @@ def box(world: World, entity: int) -> tuple[int, ...]:
 
 
 def grid(blocks: float | Fraction) -> int:
-    """Returns blocks in grid steps, rounded by exact rationals; halves go away from zero."""
-    steps = abs(Fraction(blocks)) * BLOCK
-    whole = int(steps + Fraction(1, 2))
+    """Returns blocks in grid steps, rounded by exact whole numbers; halves go away from zero."""
+    count, parts = blocks.as_integer_ratio()
+    whole = (2 * abs(count) * BLOCK + parts) // (2 * parts)
     return whole if blocks >= 0 else -whole
 
 

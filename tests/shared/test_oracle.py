@@ -18,8 +18,8 @@ def test_a_few_random_worlds(compiled: bool, seeds: range) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("block", range(BLOCKS))
-def test_thousands_of_small_worlds(compiled: bool, block: int) -> None:
-    count = 160 if compiled else 40
+def test_many_small_worlds(compiled: bool, block: int) -> None:
+    count = 120 if compiled else 30
     start = (10_000 if compiled else 20_000) + block * count
     for seed in range(start, start + count):
         Twins(seed, compiled=compiled).run()

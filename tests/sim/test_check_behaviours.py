@@ -109,10 +109,10 @@ def test_an_offender_is_found_with_tick_entity_field_and_behaviour(code: type[Be
         (Playground, lambda: playground(()), 30, 0),
         *long(
             (lambda: game(Honest), None, 60, 3),
-            (Playground, lambda: playground(()), 2_000, 3),
+            (Playground, lambda: playground(()), 800, 3),
             (Rules, lambda: load_scene("hills"), 100, 3),
-            (Dodge, None, 600, 3),
-            (Race, None, 600, 3),
+            (Dodge, None, 300, 1),
+            (Race, None, 300, 1),
         ),
     ],
 )

@@ -69,7 +69,7 @@ def ages(preset: str, seconds: float) -> list[float]:
     [
         ("regional", 8),
         *long(("outage", 8)),
-        *long(*((preset, 120) for preset in ("lan", "regional", "typical", "far", "wifi", "outage"))),
+        *long(*((preset, 60) for preset in ("lan", "regional", "typical", "far", "wifi", "outage"))),
     ],
 )
 def test_snapshots_are_as_fresh_as_the_link_delivers(
