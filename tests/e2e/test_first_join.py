@@ -1,4 +1,7 @@
-"""The first join of a client without a prebuilt kernel: it plays at once, while its kernel is compiled."""
+"""The first join of a client without a prebuilt kernel: it plays at once, while its kernel is compiled.
+
+A kernel takes long to compile, so the same one is compared with the prebuilt one, too.
+"""
 
 import os
 import subprocess
@@ -9,6 +12,7 @@ import pytest
 
 from shared import kernels
 from tests.e2e.processes import ROOT, running
+from tests.kernels import chains
 
 pytestmark = [
     pytest.mark.e2e,
@@ -37,7 +41,9 @@ with Client.connect(sys.argv[1], name="Ann") as client:
 """
 
 
-def test_a_client_plays_while_its_kernel_is_compiled(tmp_path: Path) -> None:
+def test_a_client_plays_while_its_kernel_is_compiled_which_agrees_with_the_prebuilt_one_at_every_tick(
+    tmp_path: Path,
+) -> None:
     with running("--port", "0", "--scene", "flat") as server:
         host, port = server.address()
         environment = os.environ | {kernels.VARIABLE: kernels.NUMBA, "NUMBA_CACHE_DIR": str(tmp_path)}
@@ -45,3 +51,5 @@ def test_a_client_plays_while_its_kernel_is_compiled(tmp_path: Path) -> None:
         done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, check=False)
     assert done.stderr == ""
     assert done.stdout == "['plain for now', 'numba'] 0 0 True\n"
+    other = chains.elsewhere("hills", chains.TICKS, kernels.NUMBA, NUMBA_CACHE_DIR=str(tmp_path))
+    assert other == f"{kernels.NUMBA} {chains.chain('hills', chains.TICKS, compiled=True)}"

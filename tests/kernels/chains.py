@@ -1,9 +1,12 @@
 """Long runs of one world whose states all go into one hash: `python -m tests.kernels.chains SCENE TICKS`."""
 
 import hashlib
+import os
 import random
+import subprocess
 import sys
 from collections.abc import Iterator
+from pathlib import Path
 
 from shared import kernels
 from shared.inputs import Input
@@ -11,6 +14,7 @@ from shared.scene import load_scene
 from shared.units import SEGMENT
 from shared.world import OverlapError, World
 
+ROOT = Path(__file__).parent.parent.parent
 TICKS = 20_000
 SCENES = ("arena", "hills", "topdown")
 PLAYERS = 6
@@ -36,6 +40,13 @@ def chain(scene_name: str, ticks: int, *, compiled: bool) -> str:
             _dig(world, rng.choice(players), rng)
     total.update(world.state_hash())
     return total.hexdigest()
+
+
+def elsewhere(scene_name: str, ticks: int, form: str, **environment: str) -> str:
+    """Returns the form of the kernel in another process, and the hash of the same run there."""
+    command = (sys.executable, "-m", "tests.kernels.chains", scene_name, str(ticks))
+    variables = os.environ | {kernels.VARIABLE: form} | environment
+    return subprocess.run(command, cwd=ROOT, env=variables, capture_output=True, text=True, check=True).stdout.strip()
 
 
 def _players(world: World, rng: random.Random) -> Iterator[int]:

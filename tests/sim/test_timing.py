@@ -19,7 +19,7 @@ from shared.scene import load_scene
 from sovereign_netcode.playtest import Match
 from tests.lengths import long, long_but
 
-MINUTES = 10.0
+MINUTES = 5.0
 TICK_MS = lead_trial.TICK_MS
 
 

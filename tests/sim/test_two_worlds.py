@@ -1,11 +1,7 @@
 """Two worlds with the same inputs are equal at every tick: in two processes, compiled and plain, and after copies."""
 
-import os
 import random
-import subprocess
-import sys
 from collections.abc import Iterator
-from pathlib import Path
 
 import pytest
 
@@ -16,7 +12,6 @@ from shared.world import World
 from tests.kernels import chains
 from tests.lengths import long
 
-ROOT = Path(__file__).parent.parent.parent
 TICKS = chains.TICKS
 PLAYERS = 6
 
@@ -45,22 +40,8 @@ def inputs(seed: int) -> Iterator[dict[int, Input]]:
     ("scene", "ticks"), [(chains.SCENES[0], 2_000), *long(*((scene, TICKS) for scene in chains.SCENES))]
 )
 def test_two_processes_compiled_and_plain_agree_at_every_tick(scene: str, ticks: int) -> None:
-    other = other_chain(scene, kernels.PLAIN, ticks)
+    other = chains.elsewhere(scene, ticks, kernels.PLAIN)
     assert f"{kernels.PLAIN} {chains.chain(scene, ticks, compiled=True)}" == other
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(not kernels.numba_installed(), reason="Numba is not installed")
-def test_two_processes_of_which_numba_compiles_one_agree_at_every_tick() -> None:
-    other = other_chain("hills", kernels.NUMBA, TICKS)
-    assert f"{kernels.NUMBA} {chains.chain('hills', TICKS, compiled=True)}" == other
-
-
-def other_chain(scene: str, form: str, ticks: int) -> str:
-    """Returns the form of the kernel in another process, and the hash of that process's run of a scene."""
-    command = (sys.executable, "-m", "tests.kernels.chains", scene, str(ticks))
-    environment = os.environ | {kernels.VARIABLE: form}
-    return subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, check=True).stdout.strip()
 
 
 @pytest.mark.parametrize("ticks", [2_000, *long(TICKS)])
