@@ -30,6 +30,7 @@ import msgpack
 from server import app
 from server.config.settings import Settings
 from server.game import Game
+from server.game.sequencer import Sequencer
 from server.game.session import Session
 from server.net.websocket import Connection
 from server.observability.errors import FaultReporter
@@ -107,7 +108,7 @@ DOORS: list[tuple[FunctionType, str]] = [
         (Connection.data_received, "receive"),
         (decode_from_client, "decode"),
         (Game.receive, "inputs"),
-        (Game._take_inputs, "inputs"),
+        (Sequencer.take_inputs, "inputs"),
         (World.step, "step"),
         (ChangeLog.record, "encode"),
         (ChangeLog.encode, "encode"),

@@ -1,8 +1,4 @@
-"""Commands of players: queued when they arrive, carried out in their tick, answered when no crash can undo them."""
-
-from collections import deque
-from collections.abc import Iterator
-from typing import Any
+"""Commands of players: queued when they arrive, and carried out in their tick. `server.game.answers` answers them."""
 
 from server.config.limits import Limits
 from server.game_api.api import GameApi
@@ -31,8 +27,6 @@ class Commands:
     ) -> None:
         self._world, self._api, self._limits, self._faults, self._saves = world, api, limits, faults, saves
         self._ahead = bounds(world.scene.tick_rate).ahead
-        self._unanswered: deque[tuple[int, Player, tuple[Any, ...]]] = deque()
-        """Verdicts that are not durable yet: tick, player, and the arguments of `Player.settle`."""
 
     @property
     def trouble(self) -> bool:
@@ -77,22 +71,8 @@ class Commands:
                     self._faults.report("a command")
                     verdict = messages.FAILED
                 reason = self._api.hooks.reason
-                answer = (command.number, verdict, reason) if reason else (command.number, verdict)
-                self._unanswered.append((tick, player, answer))
-                self._world.note([persisted_state.ANSWERED, player.entity, *answer])
-
-    def answer(self) -> None:
-        """Queues the verdicts that are durable now to be sent to the players."""
-        durable = self.durable_tick
-        while self._unanswered and self._unanswered[0][0] <= durable:
-            _, player, answer = self._unanswered.popleft()
-            player.settle(*answer)
-
-    def notes(self) -> Iterator[list[Any]]:
-        """Yields the verdicts that are not durable yet, as notes for a checkpoint."""
-        for _, player, answer in self._unanswered:
-            if player.entity in self._api.players:
-                yield [persisted_state.ANSWERED, player.entity, *answer]
+                self._api.outcome.verdicts.append((player.entity, command.number, verdict, reason))
+                self._world.note(persisted_state.note_of_answer(player.entity, command.number, verdict, reason))
 
     def _verdict(self, player: Player, command: Command) -> int:
         if command.name != edits.NAME:

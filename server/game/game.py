@@ -1,7 +1,8 @@
 """The authoritative game: it queues external events, and changes the world in a tick only.
 
 Theory of operation. A message that arrives is checked and queued with its session. The world changes only in `tick`, in
-the order of that function's lines. A tick never waits for a client: it sends the newest snapshot to each client whose
+the sequencer half of it (`server.game.sequencer`); the edge half (`server.game.edge`) and the sending follow. Both
+halves share one world here. A tick never waits for a client: it sends the newest snapshot to each client whose
 connection has room for one. A client that was left out gets the union of what it missed with its next snapshot. An
 error of a peer closes its connection with a code and a reason; no message of a peer raises an exception here.
 """
@@ -14,8 +15,10 @@ from server.config.limits import Limits
 from server.game.clocks import Clocks
 from server.game.commands import Commands
 from server.game.connections import Connections
+from server.game.edge import Edge
 from server.game.joining import Joining
 from server.game.roster import Roster
+from server.game.sequencer import Sequencer
 from server.game.session import Session
 from server.game_api.api import GameApi
 from server.journal.recorded_world import RecordedWorld, Saves
@@ -24,12 +27,10 @@ from server.observability.errors import FaultReporter
 from server.players import persisted_state
 from server.players.player import Player
 from server.replication.client_stream import Transport
-from server.replication.sender import Sender
 from server.rewind import Rewind
 from server.rules import Rules, checked_function, equipped
 from shared import messages
 from shared.checks import SceneError, shown, whole
-from shared.inputs import Input
 from shared.messages import (
     Bye,
     Command,
@@ -103,11 +104,11 @@ class Game:
             kept = persisted_state.restored([*(saves.kept or ()), *(value for _, value in saves.notes)])
         self.api = GameApi(self.world, self.rewind, self.counters, rules or Rules(), kept=kept, seed=seed)
         self.faults = FaultReporter()
-        self.log = self.api.log
-        self.log.faults = self.faults
-        self.sender = Sender(self.world, self.log, self.limits, self.counters)
         self.roster = Roster(self.world, self.api, self.limits, self.counters)
         self.commands = Commands(self.world, self.api, self.limits, self.faults, saves)
+        self.edge = Edge(self.world, self.api.kept, self.limits, self.counters, lambda: self.commands.durable_tick)
+        self.log, self.sender = self.edge.log, self.edge.sender
+        self.log.faults = self.faults
         self.connections = Connections(self.roster, self.counters, self.faults)
         self.clocks = Clocks(scene.tick_rate, self.limits, self.connections, self.roster)
         self.joining = Joining(
@@ -120,6 +121,9 @@ class Game:
             self.commands,
             authenticate,
             rules or Rules(),
+        )
+        self.sequencer = Sequencer(
+            self.world, self.api, self.rewind, self.roster, self.joining, self.commands, self.connections
         )
 
     @property
@@ -204,7 +208,7 @@ class Game:
 
     def keep(self) -> list[list[Any]]:
         """Returns the persisted state and the unanswered commands as notes, for a checkpoint."""
-        return [*persisted_state.whole(self.api.kept), *self.commands.notes()]
+        return [*persisted_state.whole(self.api.kept), *self.edge.answers.notes()]
 
     # -- the tick: the only place where the world changes --------------------------------------------------
 
@@ -217,46 +221,11 @@ class Game:
             now: the current time in seconds.
         """
         self.clocks.begin(deadline, now)
-        with self.api.turn:
-            self.api.hooks.start()
-            self.roster.leave(now)
-            self.joining.join(now)
-            self.roster.revive()
-            self.commands.carry_out()
-            self.api.hooks.act()
-        inputs = self._take_inputs()
-        self.world.step(inputs)
-        for entity in self.api.turn_results.removals():
-            if entity in self.players:
-                reason = "the game has removed this player's entity"
-                self.connections.remove(self.players[entity], messages.GOING_AWAY, reason)
-        self.api.hooks.stepped()
-        self.log.record()
-        self.rewind.record()
-        self.roster.fell_out()
-        self.commands.answer()
-        self.api.outgoing.deliver(self.players, self.world.tick, self.limits.outbox_max)
-        self.api.turn_results.others(self.players, self.limits.outbox_max)
+        self.edge.follow(self.sequencer.advance(now))
         self.clocks.refill()
         self._send(now)
-        self._kick()
+        self.sequencer.finish()
         self.clocks.check(now)
-
-    def _take_inputs(self) -> dict[int, Input]:
-        tick = self.world.tick + 1
-        inputs = {entity: player.inputs.take(tick) for entity, player in self.players.items()}
-        inputs.update(self.api.steered)
-        self.api.steered.clear()
-        return inputs
-
-    def _kick(self) -> None:
-        """Removes the players whom the rules have kicked or sent to another world in this tick."""
-        for player, go in self.api.sent_away:
-            self.connections.send_away(player, go)
-        self.api.sent_away.clear()
-        for player, reason in self.api.kicked:
-            self.connections.remove(player, messages.KICKED, reason or "kicked by the game")
-        self.api.kicked.clear()
 
     def _send(self, now: float) -> None:
         """Sends each client that has joined what is due: its welcome, or the newest snapshot and events."""

@@ -103,7 +103,7 @@ class Roster:
 
     def private_of(self, player: Player) -> bytes:
         """Returns the message with the values that only this player gets; empty if there have never been any."""
-        return self._api.private_of(player.entity)
+        return self._api.kept.private_of(player.entity)
 
     def expel(self, player: Player) -> None:
         """Undoes a join that has failed."""

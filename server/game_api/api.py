@@ -26,7 +26,7 @@ from server.journal.recorded_world import RecordedWorld
 from server.observability.counters import Counters
 from server.players.persisted_state import LEFT, PersistedState
 from server.players.player import Player
-from server.replication.change_log import ChangeLog
+from server.replication.outcome import Outcome
 from server.rewind import Rewind
 from server.rewind.history import Past
 from server.rules import Rules, check_rules
@@ -67,15 +67,15 @@ class GameApi(InputApi, PlayersApi, TimersApi, ValuesApi, ZonesApi):
         self.kept = kept or PersistedState()
         super().__init__(world, self.kept.players, Turn())
         self._init_players()
-        self.log = ChangeLog(world, self.kept.attributes)
+        self.outcome = Outcome()
         self.shared_values = SharedValues(world, self.kept.shared)
-        self.outgoing = Outgoing(counters)
+        self.outgoing = Outgoing(self.outcome.events)
         self._rules, self._timers = rules, Timers(Entries(world, self.kept, "timers"))
         self._private, self._subjects = Entries(world, self.kept, "private"), Entries(world, self.kept, "subjects")
         self._zones = Zones(world, Entries(world, self.kept, "zones"))
         self.hooks = Hooks(self, world, rules, counters, self._zones, self._timers, goes_on=kept is not None)
-        self._attributes = Attributes(world, self.log, self.kept.attributes)
-        self.turn_results = TurnResults(world, self.log, self._forget, counters)
+        self._attributes = Attributes(world, self.outcome.attributes, self.kept.attributes)
+        self.turn_results = TurnResults(world, self.outcome, self._forget, counters)
         self._rewind, self._seed = rewind, seed
         self._random = (-1, Random())
         rules.game = self
@@ -162,7 +162,7 @@ class GameApi(InputApi, PlayersApi, TimersApi, ValuesApi, ZonesApi):
         self.turn.check("set_field")
         entity = self._known(entity)
         self._world.set_field(entity, text(name, "name"), value)
-        self.log.note_act(entity)
+        self.outcome.acted.add(entity)
 
     def spawn(self, template: str, position: Vec, velocity: Vec = (0.0, 0.0, 0.0), **attributes: Any) -> int:
         """Adds an entity and returns its number.
@@ -214,7 +214,7 @@ class GameApi(InputApi, PlayersApi, TimersApi, ValuesApi, ZonesApi):
         self.turn.check("throw")
         entity = self._known(entity)
         self._world.set_velocity(entity, velocity)
-        self.log.note_act(entity)
+        self.outcome.acted.add(entity)
 
     def push(self, entity: int, velocity: Vec) -> None:
         """Adds to the velocity of an entity in blocks/s: knockback, an explosion, a jump pad, a dash.
@@ -224,7 +224,7 @@ class GameApi(InputApi, PlayersApi, TimersApi, ValuesApi, ZonesApi):
         self.turn.check("push")
         entity = self._known(entity)
         self._world.add_velocity(entity, velocity)
-        self.log.note_act(entity)
+        self.outcome.acted.add(entity)
 
     def change(self, entity: int, template: str) -> None:
         """Changes the template of an entity. Position and velocity stay.
@@ -235,7 +235,7 @@ class GameApi(InputApi, PlayersApi, TimersApi, ValuesApi, ZonesApi):
         self.turn.check("change")
         entity = self._known(entity)
         self._world.set_template(entity, template)
-        self.log.note_act(entity)
+        self.outcome.acted.add(entity)
 
     def block(self, x: int, y: int, z: int) -> int:
         """Returns the kind of a block: 1 to 255, or 0 for air and for places that are not loaded."""
@@ -361,4 +361,4 @@ class GameApi(InputApi, PlayersApi, TimersApi, ValuesApi, ZonesApi):
         self._world.remove(entity)
         self._world.note([LEFT, entity])
         self._forget(entity)
-        self.log.note_removal(entity)
+        self.outcome.removed.append(entity)

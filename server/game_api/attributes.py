@@ -6,7 +6,6 @@ from typing import Any
 from server.game_api import values
 from server.journal.recorded_world import RecordedWorld
 from server.players.persisted_state import ATTRIBUTES
-from server.replication.change_log import ChangeLog
 from shared.checks import text
 from shared.fields import NAME_MAX
 
@@ -16,12 +15,12 @@ class Attributes:
 
     Args:
         world: notes each change, for a recording and for the saved world.
-        log: the change log, from which clients get each change.
+        changed: where entities are added whose attributes change (`Outcome.attributes`).
         table: attributes by entity, as part of the persisted state.
     """
 
-    def __init__(self, world: RecordedWorld, log: ChangeLog, table: dict[int, dict[str, Any]]) -> None:
-        self._world, self._log, self._table = world, log, table
+    def __init__(self, world: RecordedWorld, changed: set[int], table: dict[int, dict[str, Any]]) -> None:
+        self._world, self._changed, self._table = world, changed, table
 
     def get(self, entity: int, name: str, default: Any) -> Any:
         """Returns an attribute, or `default` if it is not set. A list or a table is a copy."""
@@ -41,7 +40,7 @@ class Attributes:
     def put(self, entity: int, attributes: Mapping[str, Any]) -> None:
         """Replaces all attributes of an existing entity by checked ones."""
         self._table[entity] = dict(attributes)
-        self._log.note_attributes(entity)
+        self._changed.add(entity)
         self._world.note([ATTRIBUTES, entity, attributes])
 
     def forget(self, entity: int) -> None:

@@ -1,9 +1,8 @@
-"""The game events of one tick: they wait here for the end of the tick, and then go into the players' outboxes."""
+"""The game events that the rules send: they are checked and encoded here, and become part of the tick's outcome."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from typing import Any
 
-from server.observability.counters import Counters
 from server.players.player import Player
 from shared.checks import SceneError, shown, text
 from shared.fields import NAME_MAX
@@ -15,13 +14,11 @@ class Outgoing:
     """The game events of the present tick.
 
     Args:
-        counters: where dropped events are counted.
+        events: where they are added (`Outcome.events`).
     """
 
-    def __init__(self, counters: Counters) -> None:
-        self._counters = counters
-        self._events: list[tuple[frozenset[int] | None, bytes]] = []
-        """Events in order: the entities of the players to send it to (None: all), and the message."""
+    def __init__(self, events: list[tuple[frozenset[int] | None, bytes]]) -> None:
+        self._events = events
 
     def __len__(self) -> int:
         return len(self._events)
@@ -43,21 +40,6 @@ class Outgoing:
             raise SceneError(f"send {name!r}: data = {error}") from error
         entities = None if to is None else _entities_of(to)
         self._events.append((entities, encode(Happened(tick, name, payload))))
-
-    def deliver(self, players: Mapping[int, Player], tick: int, most: int) -> None:
-        """Puts the events into the players' outboxes, also of players without a connection.
-
-        Args:
-            players: the players by entity.
-            tick: the tick that was computed.
-            most: maximum number of events in one outbox.
-        """
-        for entities, message in self._events:
-            for entity in players if entities is None else entities & players.keys():
-                player = players[entity]
-                if player.inputs.override is None:  # an in-process player has no client to send to
-                    self._counters.events_dropped += player.outbox.add(tick, message, most)
-        self._events.clear()
 
 
 def _entities_of(to: object) -> frozenset[int]:

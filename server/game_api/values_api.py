@@ -13,9 +13,9 @@ from server.game_api.entries import Entries
 from server.game_api.turn import Turn
 from server.players.persisted_state import PersistedState
 from server.players.player import SUBJECT_MAX, Player
+from server.replication.outcome import Outcome
 from shared.checks import SceneError, shown, text
 from shared.fields import NAME_MAX
-from shared.messages import Private, encode
 
 SUBJECTS_MAX = 10_000
 """Maximum number of subjects with remembered values."""
@@ -26,6 +26,7 @@ class ValuesApi:
 
     turn: Turn
     kept: PersistedState
+    outcome: Outcome
     _private: Entries
     _subjects: Entries
 
@@ -50,13 +51,7 @@ class ValuesApi:
             return
         after = values.with_value(before, name, payload, f"player {entity}")
         self._private.put(entity, after)
-        if player.session is not None:
-            player.session.stream.private_due = encode(Private(after))
-
-    def private_of(self, entity: int) -> bytes:
-        """Returns the message with the values that only one player gets; empty if there have never been any."""
-        known = self._private.table.get(entity)
-        return b"" if known is None else encode(Private(known))
+        self.outcome.private.add(entity)
 
     def forget_private(self, entity: int) -> None:
         """Forgets the values that only a player got who has left."""

@@ -20,6 +20,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from server.players.player import Player
+from shared.messages import Private, encode
 
 PLAYER, ANSWERED, SETTLED, LEFT, ATTRIBUTES, SHARED = "player", "answered", "settled", "left", "said", "shared"
 REASONS, ENTRY = "reasons", "entry"
@@ -37,10 +38,20 @@ class PersistedState:
     shared: dict[str, Any] = field(default_factory=dict)
     tables: dict[str, dict[Any, Any]] = field(default_factory=dict)
 
+    def private_of(self, entity: int) -> bytes:
+        """Returns the message with the values that only one player gets; empty if there have never been any."""
+        known = self.tables.get("private", {}).get(entity)
+        return b"" if known is None else encode(Private(known))
+
 
 def note_of(player: Player) -> list[Any]:
     """Returns the note of a player who has joined or reconnected."""
     return [PLAYER, player.entity, player.name, player.subject, player.tokens]
+
+
+def note_of_answer(entity: int, number: int, verdict: int, reason: str) -> list[Any]:
+    """Returns the note of a command that was carried out; an empty reason is left out."""
+    return [ANSWERED, entity, number, verdict, reason] if reason else [ANSWERED, entity, number, verdict]
 
 
 def whole(kept: PersistedState) -> list[list[Any]]:

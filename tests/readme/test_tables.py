@@ -13,7 +13,7 @@ from tests.readme.pages import ROOT, section
 
 README = ROOT / "README.md"
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
-CALLED_BY_THE_GAME = {"banned", "discard", "forget_private", "private_of", "turn_results", "hosting", "sent_away"}
+CALLED_BY_THE_GAME = {"banned", "discard", "forget_private", "turn_results", "hosting", "sent_away"}
 """Methods of the game API's class that hooks do not call."""
 
 

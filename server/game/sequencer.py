@@ -1,0 +1,84 @@
+"""The sequencer half of a game: the only place where the world changes.
+
+Theory of operation. A tick of a game has two halves. The sequencer half lets players leave and join, carries out their
+commands, runs the rules and steps the world. It needs no connections: requests wait with the sessions and players, and
+its results are the world, the persisted state and the `Outcome` of the tick. The edge half (`server.game.edge`) makes
+of these what each client gets.
+"""
+
+from server.game.commands import Commands
+from server.game.connections import Connections
+from server.game.joining import Joining
+from server.game.roster import Roster
+from server.game_api.api import GameApi
+from server.journal.recorded_world import RecordedWorld
+from server.replication.outcome import Outcome
+from server.rewind import Rewind
+from shared import messages
+from shared.inputs import Input
+
+
+class Sequencer:
+    """The sequencer half of one game.
+
+    Args:
+        world: the world.
+        api: the game API, which calls the rules.
+        rewind: the recent past of the world.
+        roster: the players.
+        joining: the clients that wait to join.
+        commands: the commands of the players.
+        connections: ends the connections of players that are removed.
+    """
+
+    def __init__(
+        self,
+        world: RecordedWorld,
+        api: GameApi,
+        rewind: Rewind,
+        roster: Roster,
+        joining: Joining,
+        commands: Commands,
+        connections: Connections,
+    ) -> None:
+        self._world, self._api, self._rewind, self._roster = world, api, rewind, roster
+        self._joining, self._commands, self._connections = joining, commands, connections
+
+    def advance(self, now: float) -> Outcome:
+        """Computes the next tick. Returns its outcome, which is valid until the next call."""
+        api, world = self._api, self._world
+        with api.turn:
+            api.hooks.start()
+            self._roster.leave(now)
+            self._joining.join(now)
+            self._roster.revive()
+            self._commands.carry_out()
+            api.hooks.act()
+        world.step(self.take_inputs())
+        for entity in api.turn_results.take():
+            if entity in api.players:
+                reason = "the game has removed this player's entity"
+                self._connections.remove(api.players[entity], messages.GOING_AWAY, reason)
+        api.hooks.stepped()
+        self._rewind.record()
+        self._roster.fell_out()
+        return api.outcome
+
+    def finish(self) -> None:
+        """Ends the tick once its outcome was used: removes players whom the rules have kicked or sent away."""
+        api = self._api
+        api.outcome.clear()
+        for player, go in api.sent_away:
+            self._connections.send_away(player, go)
+        api.sent_away.clear()
+        for player, reason in api.kicked:
+            self._connections.remove(player, messages.KICKED, reason or "kicked by the game")
+        api.kicked.clear()
+
+    def take_inputs(self) -> dict[int, Input]:
+        """Takes the input of each player for the coming step, and the inputs that the rules have set."""
+        tick, api = self._world.tick + 1, self._api
+        inputs = {entity: player.inputs.take(tick) for entity, player in api.players.items()}
+        inputs.update(api.steered)
+        api.steered.clear()
+        return inputs
