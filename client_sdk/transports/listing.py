@@ -107,7 +107,7 @@ def _entries(url: str, body: bytes) -> list[WorldEntry]:
         table = json.loads(body)
     except (ValueError, RecursionError):
         table = None
-    listed = table.get("worlds") if isinstance(table, dict) else table
+    listed = table.get("worlds") if isinstance(table, dict) else None
     if not isinstance(listed, list) or not all(map(_good, listed)):
         raise ConnectError(f"{url}: no list of worlds (its answer is something else)")
     return [WorldEntry(**{name: entry[name] for name in FIELDS}) for entry in listed]

@@ -1,7 +1,9 @@
 // A client in plain Node.js, written from docs/protocol.md alone: joins, walks in squares, and prints all positions.
 //
 //     npm ci && node bot.mjs ws://127.0.0.1:8765 [seconds]
+//     npm ci && node bot.mjs "ws://127.0.0.1:8765/match?kind=arena" [seconds]
 //
+// It goes where the server sends it (`Go`), and reconnects to its world after a lost connection.
 // Its timeline is ahead of the server, and it sends an input per tick. It does not predict, and ignores the terrain:
 // the snapshots contain the effects of both on every entity.
 
@@ -9,16 +11,18 @@ import { decode, encode } from "@msgpack/msgpack";
 import WebSocket from "ws";
 
 const [url = "ws://127.0.0.1:8765", seconds = 10] = process.argv.slice(2);
-const HELLO = 1, INPUTS = 2, PING = 3, BYE = 4, WELCOME = 17, SNAPSHOT = 18, PONG = 20, GOING_AWAY = 1001;
+const HELLO = 1, INPUTS = 2, PING = 3, BYE = 4, WELCOME = 17, SNAPSHOT = 18, PONG = 20, GOTO = 27, WAITING = 28;
+const GOING_AWAY = 1001, TRIES = 3, HOPS = 8, NOTHING = new Uint8Array(0);
 const STOP = [1, 2, 4], GO = [8, 16], FALL = 32, LAUNCH = 64, TOLD = 128; // events in an entity's turn
 const BLOCK = 2 ** 24, SIDE = 32 * BLOCK, SPEED = 2 ** 16, KEYFRAME = -1, USED = 0, REFUSED = -32768;
 const SQUARE = [[127, 0], [0, 127], [-127, 0], [0, -127]]; // east, north, west, south
 
 const entities = new Map(); // id -> { tick, template, falls, at: [x, y, z], v: [x, y, z], move: [x, y] }, as on the wire
 const said = new Map(); // id -> attributes
-let me, scene, acked = -1, sent = -1, used = 0, pongs = [], margins = [], phase, lead;
+let me, scene, acked, sent, used = 0, pongs, margins, phase, lead; // of the world that it plays in
+let socket, path = new URL(url).pathname + new URL(url).search, lobby = path, resume = NOTHING, timers = [];
+let joined, going, leaving, ends, tries = 0, hops = 0, wait = 0; // `wait`: seconds to the next attempt; negative: none
 
-const socket = new WebSocket(url, { perMessageDeflate: false });
 const send = (...message) => socket.send(encode(message));
 const now = () => performance.now() / 1000;
 const rounded = value => Math.sign(value) * Math.round(Math.abs(value)); // halves away from zero
@@ -27,22 +31,59 @@ const ints = (bin, ...offsets) => offsets.map(offset => bin.readInt32LE(offset))
 const reader = (bin, at = 0) => ({ i8: () => bin.readInt8(at++), i32: () => bin.readInt32LE((at += 4) - 4) });
 function* records(size, bin = []) { for (let at = 0; at < bin.length; at += size) yield bin.subarray(at, at + size); }
 
-socket.on("open", () => send(HELLO, 3, {}, "node", "", new Uint8Array(0)));
-socket.on("message", data => {
-  const [kind, ...fields] = decode(data); // each bin in it is a Buffer, as `data` is
-  if (kind === WELCOME) welcome(...fields);
-  else if (kind === PONG) pong(...fields);
-  else if (kind === SNAPSHOT) snapshot(...fields);
-  else if (kind === BYE) console.error(`the server says goodbye: ${fields[0]} ${fields[1]}`);
-});
-socket.on("close", code => { tell(); process.exit(code === GOING_AWAY ? 0 : 1); });
-socket.on("error", error => { console.error(error.message); process.exit(1); });
+function connect() { // to a path of the server; host and port stay those of the URL
+  [acked, sent, pongs, margins, lead, joined, going] = [-1, -1, [], [], undefined, false, false];
+  entities.clear();
+  said.clear();
+  const { protocol, host } = new URL(url);
+  socket = new WebSocket(`${protocol}//${host}${path}`, { perMessageDeflate: false });
+  socket.on("open", () => send(HELLO, 3, {}, "node", "", resume));
+  socket.on("message", data => {
+    const [kind, ...fields] = decode(data); // each bin in it is a Buffer, as `data` is
+    if (going) return;
+    if (kind === WELCOME) welcome(...fields);
+    else if (kind === PONG) pong(...fields);
+    else if (kind === SNAPSHOT) snapshot(...fields);
+    else if (kind === GOTO) go(...fields);
+    else if (kind === WAITING) console.error("waits for a world", JSON.stringify(decode(fields[0])));
+    else if (kind === BYE) {
+      if (joined) wait = fields[2];
+      console.error(`the server says goodbye: ${fields[0]} ${fields[1]}`);
+    }
+  });
+  socket.on("close", closed);
+  socket.on("error", error => console.error(error.message)); // "close" follows
+}
 
-function welcome(version, tick, entity, rules) {
-  [me, scene] = [entity, rules];
-  for (let i = 0; i < 5; i++) setTimeout(() => send(PING, now(), 0), 100 * i);
-  setInterval(() => { send(PING, now(), 0); tell(); }, 1000);
-  setTimeout(() => send(BYE, GOING_AWAY, "", -1), 1000 * seconds);
+function go(to, code, seats, reason) {
+  console.error(`goes to ${to.split("?")[0]}: ${reason}`);
+  if (!joined) lobby = path; // it asks there again if the world does not take it
+  [path, resume, going] = [to, NOTHING, true];
+  socket.close(1000);
+}
+
+function closed() {
+  timers.forEach(clearInterval);
+  timers = [];
+  if (joined) tell();
+  if (leaving) process.exit(0);
+  if (going ? ++hops > HOPS : ++tries > TRIES || wait < 0 || (!resume.length && path === lobby)) process.exit(1);
+  if (!going && !resume.length) path = lobby;
+  setTimeout(connect, going ? 0 : 1000 * (wait + 0.25 * 2 ** tries));
+}
+
+function leave() {
+  leaving = true;
+  if (socket.readyState === WebSocket.OPEN) send(BYE, GOING_AWAY, "", -1);
+  else process.exit(0);
+}
+
+function welcome(version, tick, entity, rules, key) {
+  [me, scene, resume, joined, tries, wait] = [entity, rules, key, true, 0, 0];
+  path = path.replace(/\?seat=.*/, ""); // the seat counts once
+  for (let i = 0; i < 5; i++) timers.push(setTimeout(() => send(PING, now(), 0), 100 * i));
+  timers.push(setInterval(() => { send(PING, now(), 0); tell(); hops = 0; }, 1000));
+  ends ??= setTimeout(leave, 1000 * seconds);
 }
 
 function tell() {
@@ -57,7 +98,7 @@ function pong(at, tick) { // the server's time is tick_rate * now + phase; the q
   phase = best.map(each => each.phase).sort((a, b) => a - b)[best.length >> 1];
   if (lead !== undefined || pongs.length < 5) return;
   lead = best[0].trip / 2 * tick_rate + 2;
-  setInterval(walk, 250 / tick_rate);
+  timers.push(setInterval(walk, 250 / tick_rate));
 }
 
 function walk() { // sends a row for each tick that our timeline has reached; jumps at each corner
@@ -116,3 +157,5 @@ function snapshot(tick, newest, early, first, statuses, verdicts, drops, ...part
   margins = margins.slice(-2 * scene.tick_rate);
   if (margins.length) lead += Math.max(-0.02, Math.min(0.5 - Math.min(...margins) * scene.tick_rate / 8192, 0.1)); // half a tick to spare
 }
+
+connect();

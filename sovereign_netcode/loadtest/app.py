@@ -61,7 +61,11 @@ def arguments(argv: list[str] | None = None) -> argparse.Namespace:
     parser.add_argument(
         "--seconds", type=_duration, default=10.0, metavar="S", help="length of the window (default: %(default)g)"
     )
-    parser.add_argument("--url", help="URL of a running server, like ws://localhost:8765 (default: starts one)")
+    parser.add_argument(
+        "--url",
+        help="URL of a running server, like ws://localhost:8765; with /match?kind=NAME each bot finds a world "
+        "(default: starts one)",
+    )
     parser.add_argument(
         "--game",
         metavar="MODULE:CLASS",

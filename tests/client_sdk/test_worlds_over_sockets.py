@@ -170,7 +170,7 @@ def listing(body: bytes, status: str = "200 OK") -> Iterator[str]:
 
 def test_the_list_of_worlds() -> None:
     race = {**ENTRY, "name": "race-1", "kind": "race", "more": "of a later version"}
-    body = json.dumps([ENTRY, race]).encode()
+    body = json.dumps({"worlds": [ENTRY, race]}).encode()
     entry = WorldEntry("arena-1", "arena", 1, 16, False, False, {"mode": "2v2", "level": 3}, 1.5)
     with listing(body) as url:
         assert [each.name for each in list_worlds(url)] == ["arena-1", "race-1"]
@@ -182,7 +182,11 @@ def test_the_list_of_worlds() -> None:
 
 @pytest.mark.parametrize(
     "body",
-    [b"", b"{}", b"[1]", b"not json", b"[" * 100_000, json.dumps([{**ENTRY, "players": "1"}]).encode(), b'["\xff"]'],
+    [
+        *(b"", b"{}", b"[]", b'{"worlds": [1]}', b'{"worlds": {}}', b"not json", b"[" * 100_000, b'["\xff"]'),
+        json.dumps({"worlds": [{**ENTRY, "players": "1"}]}).encode(),
+        json.dumps({"worlds": [{**ENTRY, "full": 1}]}).encode(),
+    ],
 )
 def test_a_list_of_something_else(body: bytes) -> None:
     with listing(body) as url, pytest.raises(ConnectError, match=r"no list of worlds \(its answer is something else\)"):

@@ -3,6 +3,7 @@
 The positions that it was sent are compared with a recording of that server.
 """
 
+import asyncio
 import json
 import math
 import re
@@ -14,10 +15,12 @@ from pathlib import Path
 
 import pytest
 
+from client_sdk.netsim.links import Link
 from sovereign_netcode.examples.tag import Tag
 from sovereign_netcode.server.journal.records import replay
 from sovereign_netcode.shared.layout import ID
 from tests.e2e.processes import running, stats, until
+from tests.proxy import Proxy
 
 EXAMPLES = Path(__file__).resolve().parents[2] / "scripts" / "examples"
 FILES = ("bot.mjs", "package.json", "package-lock.json")
@@ -84,3 +87,29 @@ def test_it_joins_walks_and_knows_exactly_where_everybody_is(installed: Path) ->
     assert figures["inputs_used"] >= last["used"] > 16
     assert (figures["malformed"], figures["kicked"], figures["inputs_refused"], figures["closed"]) == (0, 0, 0, {})
     assert figures["internal_errors"] == 0
+
+
+@pytest.mark.e2e
+async def test_it_finds_a_world_and_reconnects_to_it(installed: Path) -> None:
+    settings = installed / "worlds.toml"
+    settings.write_text('scene = "flat"\n[worlds.arena]\nscene = "flat"\n', "utf-8")
+    with running("--port", "0", "--host", "127.0.0.1", "--config", str(settings)) as server:
+        address = server.address()
+        async with Proxy(address, Link()) as proxy, asyncio.timeout(60):
+            bot = await asyncio.create_subprocess_exec(
+                *("node", "bot.mjs", f"{proxy.url}/match?kind=arena", str(PLAYED_S)),
+                cwd=installed,
+                stdout=asyncio.subprocess.PIPE,
+                stderr=asyncio.subprocess.PIPE,
+            )
+            assert bot.stdout is not None
+            before = json.loads(await bot.stdout.readline())
+            await proxy.cut()
+            out, errors = await bot.communicate()
+        *_, after = map(json.loads, out.splitlines())
+        assert bot.returncode == 0
+        assert errors.decode().splitlines()[0] == "goes to /arena-1: matched"
+        assert after["me"] == before["me"], "the same entity: it has resumed"
+        assert after["used"] > before["used"]
+        counts = stats(address)["worlds_counts"]
+    assert (counts["match"], counts["created"]) == (1, 1)
