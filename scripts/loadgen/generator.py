@@ -1,6 +1,7 @@
 """A generator of load for `bench.py server`: a thousand players in one process, without prediction and world.
 
-argument  {"port", "seed", "rate", "joins_per_s"}, as JSON
+argument  {"port", "seed", "rate", "joins_per_s", "paths"}, as JSON. The players join the paths in turn, each of
+          which is a world; without "paths" they join the default one
 stdin     a command per line: "clients N": connect or disconnect until there are N; "leaving N": the oldest client
           leaves N times per second and is replaced; "begin": the window begins; "end": the window ends, report its
           figures. The end of the pipe: stop
@@ -24,7 +25,7 @@ import sys
 import time
 from typing import Any
 
-from scripts.loadgen.player import Player, frame
+from scripts.loadgen.player import PING_S, Player, WorldTime, frame
 from server.observability.histogram import between
 from shared import fields, messages
 from shared.messages import Bye, Hello, Inputs, Ping, decode_from_server, encode
@@ -32,7 +33,6 @@ from shared.messages import Bye, Hello, Inputs, Ping, decode_from_server, encode
 LEAD_TICKS = 2
 """Ticks from sending an input to the deadline of its tick, at most. An input is sent up to a tick later than that."""
 REPORT_S = 0.2
-PING_S = 1.0
 SLOT_S = 0.001
 """Length of a slot in seconds. Each client sends in one slot of every tick."""
 CATCH_UP_SLOTS = 16
@@ -53,8 +53,7 @@ class Swarm:
         self.by_slot: list[list[Player]] = [[] for _ in range(self.slots)]
         self.made = self.gone = self.wanted = 0
         self.leaving_per_s = 0.0
-        self.server_tick_0 = self.best = self.asked = -math.inf
-        """Server time, in ticks, at time 0 of the local clock, by the quickest pong of the last second."""
+        self.worlds = [(path, WorldTime()) for path in order.get("paths", ["/"])]
         self.reset()
 
     def reset(self) -> None:
@@ -121,17 +120,13 @@ class Swarm:
                 tick = data[start + 5] if form == 0xCC else form
             player.acked = tick
             player.snapshots += 1
-            if self.server_tick_0 > -math.inf:
-                age_ms = int((now * self.rate + self.server_tick_0 - tick) / self.rate * 1e3)
+            if player.time.tick_0 > -math.inf:
+                age_ms = int((now * self.rate + player.time.tick_0 - tick) / self.rate * 1e3)
                 self.ages_ms[min(max(age_ms, 0), 2047)] += 1
         elif data[start + 1] == PONG:
             pong = decode_from_server(data[start:end])
             assert isinstance(pong, messages.Pong)
-            # A later pong gives a lower value, so the highest of a second is taken. A server that drops ticks falls
-            # behind, so each second is measured anew.
-            if now - self.asked >= PING_S:
-                self.asked, self.server_tick_0, self.best = now, max(self.best, pong.tick - now * self.rate), -math.inf
-            self.best = max(self.best, pong.tick - now * self.rate)
+            player.time.learn(pong.tick - now * self.rate, now)
         elif data[start + 1] == WELCOME:
             self.by_slot[int(player.phase * self.slots)].append(player)
         # Terrain is ignored, because these clients have no world.
@@ -143,9 +138,10 @@ class Swarm:
         if now - player.pinged >= PING_S:
             player.pinged = now
             self.out(player, frame(encode(Ping(time.monotonic()))))
-        if player.acked < 0 or self.server_tick_0 == -math.inf:
+        tick_0 = player.time.tick_0
+        if player.acked < 0 or tick_0 == -math.inf:
             return
-        due = int(now * self.rate + self.server_tick_0 + LEAD_TICKS)
+        due = int(now * self.rate + tick_0 + LEAD_TICKS)
         n = min(due - player.sent, fields.INPUT_ROWS_MAX) if player.sent >= 0 else 1
         if n <= 0:
             return
@@ -235,7 +231,8 @@ class Swarm:
                 say(self.figures())
 
     def join(self) -> None:
-        player = Player(self.made, self.order["port"], self.order["seed"])
+        path, time = self.worlds[self.made % len(self.worlds)]
+        player = Player(self.made, self.order["port"], self.order["seed"], path, time)
         self.made += 1
         self.players[player.sock.fileno()] = player
         self.poll.register(player.sock.fileno(), select.EPOLLIN)
