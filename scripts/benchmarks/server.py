@@ -19,7 +19,7 @@ import tempfile
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -71,19 +71,24 @@ class RigError(Exception):
 
 
 class Rig:
-    """A server process and a process that generates load."""
+    """A server process and a process that generates load.
 
-    def __init__(self, kind: str, scene: Path, *more: str, seed: int = 1) -> None:
-        child = ("benchmarks.echo_picows",) if kind == ECHO_PICOWS else ("benchmarks.busy_server", kind)
-        self._server, errors = self._start(*child, str(scene), *more)
+    Args:
+        command: module and arguments of the server.
+        seed: source of the players' chance.
+        paths: paths that the players join in turn.
+    """
+
+    def __init__(self, *command: str, seed: int = 1, paths: Sequence[str] = ("/",)) -> None:
+        self._server, errors = self._start(*command)
         assert self._server.stdout is not None
         line = self._server.stdout.readline()
         if not line.startswith("listening on "):
             self._end(self._server)
             raise RigError(f"the server did not start: {errors.cause(self._server.returncode)}")
         self.port = int(line.rpartition(":")[2])
-        order = {"port": self.port, "seed": seed, "rate": RATE, "joins_per_s": JOINS_PER_S}
-        self._generator, self._errors = self._start("loadgen.generator", json.dumps(order))
+        order = {"port": self.port, "seed": seed, "rate": RATE, "joins_per_s": JOINS_PER_S, "paths": paths}
+        self._generator, self._errors = self._start("scripts.loadgen.generator", json.dumps(order))
         self._said: queue.Queue[Figures] = queue.Queue()
         threading.Thread(target=self._listen, daemon=True).start()
 
@@ -156,10 +161,10 @@ class Rig:
             time.sleep(0.05)
         return float(taken)
 
-    def stats(self) -> Figures:
+    def stats(self, path: str = "/stats") -> Figures:
         connection = http.client.HTTPConnection("127.0.0.1", self.port, timeout=PATIENCE_S)
         with contextlib.closing(connection):
-            connection.request("GET", "/stats")
+            connection.request("GET", path)
             return dict(json.loads(connection.getresponse().read()))
 
     def close(self) -> None:
@@ -183,7 +188,7 @@ class Rig:
 
     @staticmethod
     def _start(module: str, *arguments: str) -> tuple[subprocess.Popen[str], Stderr]:
-        command, errors = (sys.executable, "-m", f"scripts.{module}", *arguments), Stderr()
+        command, errors = (sys.executable, "-m", module, *arguments), Stderr()
         try:
             process = subprocess.Popen(
                 command, cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=errors.pipe, text=True
@@ -229,7 +234,9 @@ def rig(
     with tempfile.TemporaryDirectory() as folder:
         scene = Path(folder) / "wide.toml"
         scene.write_text(scene_toml(capacity, per_segment, margin), "utf-8")
-        running = Rig(kind, scene, *more, seed=seed)
+        child = [] if kind == ECHO_PICOWS else [kind]
+        module = "scripts.benchmarks.echo_picows" if kind == ECHO_PICOWS else "scripts.benchmarks.busy_server"
+        running = Rig(module, *child, str(scene), *more, seed=seed)
         try:
             yield running
         finally:
