@@ -111,7 +111,7 @@ class Prediction:
 
     def begin(self, tick: int) -> None:
         """Starts the prediction at `tick`, or starts it again: replays the filed inputs from the confirmed world."""
-        self._replay(tick)
+        self.replay(tick)
         self.begun = True
 
     def adopt(self, old: "Prediction") -> None:
@@ -200,7 +200,7 @@ class Prediction:
         if not self.begun:
             return NOTHING
         if tick > self.predicted.tick:  # the snapshot overtook the prediction: nothing to compare
-            self._replay(tick)
+            self.replay(tick)
             return Reconciled(None, False, 0, {}, acted, placed) if placed else NOTHING
         predicted_states, confirmed_states = self._states.get(tick), self._confirmed_states()
         changed = confirmed_copy.terrain_changed or self._refused
@@ -220,7 +220,7 @@ class Prediction:
             cause = next((cause for holds, cause in causes if holds), NONDETERMINISM)
             correction = Corrected(tick, *mine, self.predicted.tick - tick, cause)
         before, now = self.predicted.states(), self.predicted.tick
-        self._replay(now)
+        self.replay(now)
         offsets = _offsets(before, self.predicted.states())
         return Reconciled(correction, correction is None, now - tick, offsets, acted, placed)
 
@@ -284,7 +284,7 @@ class Prediction:
             and predicted_states.tobytes() == self._confirmed_states().tobytes()
         )
         before = [(tick, self._states.get(tick)) for tick in ticks] if comparable else []
-        self._replay(self.predicted.tick)
+        self.replay(self.predicted.tick)
         for tick, was in before:
             now = self._states.get(tick)
             if was is not None and now is not None and was.tobytes() != now.tobytes():
@@ -295,7 +295,8 @@ class Prediction:
         states = self.confirmed_copy.states
         return states if self.neighbours else states[self._mine(states[:, ID])]
 
-    def _replay(self, to: int) -> None:
+    def replay(self, to: int) -> None:
+        """Predicts again from the confirmed world on, up to the tick `to`."""
         tick = self.confirmed.tick
         self.learn()
         self.announcements.begin(tick, final=not self._acts_differ)

@@ -6,6 +6,7 @@ time at 60 frames a second, and press the button about every three seconds.
 
 import random
 import statistics
+import time
 from collections import Counter
 from collections.abc import Sequence
 from typing import Any
@@ -24,6 +25,10 @@ FRAME_S = 1 / 60
 DASH_TICKS, REST_TICKS = 8, 48
 EVERY_FRAMES = 180
 """Average number of frames between two dashes, more than `REST_TICKS` ticks take."""
+
+
+REPLAY_RTT_S, REPLAYS = 0.3, 300
+"""Round trip in seconds at which about ten ticks are predicted, and number of replays in a round."""
 
 
 class Dash(Behaviour):
@@ -160,6 +165,33 @@ def run(commands: bool, rtt_ms: float, players: int, seconds: float, seed: int) 
         "bytes_down_per_s": down,
         "bytes_up_per_s": up,
     }
+
+
+def replay_us(commands: bool, rounds: int, seed: int) -> list[float]:
+    """Returns the time of a replay of a lone player, in microseconds for 10 ticks: the median of each round.
+
+    Args:
+        commands: whether the game is the one without behaviours.
+        rounds: number of rounds, of `REPLAYS` replays each.
+        seed: source of everything random.
+    """
+    rules = Commanded() if commands else Predicted()
+    match = Match(load_scene("meadow"), seed, rules=rules)
+    core = Core("lone", behaviours=rules.behaviours)
+    match.join(_walks, Link(REPLAY_RTT_S / 2), core)
+    match.run(8)
+    prediction = core.prediction
+    assert prediction is not None
+    ticks = prediction.predicted.tick - prediction.confirmed.tick
+    medians = []
+    for _ in range(rounds):
+        samples = []
+        for _ in range(REPLAYS):
+            begun = time.perf_counter()
+            prediction.replay(prediction.predicted.tick)
+            samples.append(time.perf_counter() - begun)
+        medians.append(statistics.median(samples) * 1e6 * 10 / ticks)
+    return medians
 
 
 def _walks(core: Core, rng: random.Random) -> Input:

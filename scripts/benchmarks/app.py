@@ -23,7 +23,7 @@ clients join.
 
 `abilities` plays one game with a dash that clients predict (a behaviour), and with one that waits for the server (a
 command that changes the template), in simulated time. It counts the frames until a player sees its dash, corrections,
-and bytes.
+and bytes. It also measures a replay of ten ticks of a lone player, with a behaviour and without.
 
 `worlds` searches for the most worlds of four players each that one server process holds at 30 Hz, and measures what an
 empty world costs (memory, CPU time), and the time from asking for a match to playing in a new world.
@@ -211,7 +211,13 @@ def run_abilities(args: argparse.Namespace, console: Console) -> tuple[Report, i
     for run in runs:
         made.add_row(f"{run['rtt_ms']}", run["way"], *(form.format(run[name]) for name, form in forms.items()))
     console.print(made)
-    return {"runs": runs}, 0
+    replays = {
+        way: abilities.replay_us(commands, 5, args.seed) for way, commands in (("behaviour", False), ("none", True))
+    }
+    for way, samples in replays.items():
+        scatter = f"{min(samples):.0f} - {max(samples):.0f}"
+        console.print(f"replay of 10 ticks of a lone player, {way}: {statistics.median(samples):.0f} us ({scatter})")
+    return {"runs": runs, "replay_us": replays}, 0
 
 
 def table(rows: list[Row]) -> Table:
