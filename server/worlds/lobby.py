@@ -77,6 +77,8 @@ class LobbySession:
         """The client's ticket; None: it has not said hello yet, or its data are being loaded."""
         self.greeted = self.closed = False
         self.allowance, self.received_at = MESSAGES_BURST, now
+        self.reached_at = now
+        """Time in seconds at which the client was seen to have everything that was sent."""
 
 
 class Matchmaker(Protocol):
@@ -152,8 +154,12 @@ class Lobby:
         self._matchmaker.gone(session)
 
     def tick(self, now: float) -> None:
-        """Closes connections without a hello, and tells those who wait that the server is there."""
+        """Closes connections without a hello or to clients that are gone, and tells the others how it goes."""
         for session in tuple(self.sessions):
+            if not session.link.outstanding():
+                session.reached_at = now
+            elif now - session.reached_at > self._limits.silence_s:
+                self.refuse(session, messages.TOO_SLOW, f"nothing reached the client for {self._limits.silence_s:g} s")
             if not session.greeted and now - session.opened > self._limits.hello_s:
                 self.refuse(session, messages.NO_HELLO, f"no hello within {self._limits.hello_s:g} s")
             elif session.greeted and now - session.told_at >= TELL_S and not session.closed:

@@ -46,6 +46,8 @@ class Peer:
         self.server, self.path, self.name, self.token = server, path, name, token
         self.got: list[Message] = []
         self.over: tuple[int, str] | None = None
+        self.unread = 0
+        """Bytes that have not reached the client, as the server sees it."""
         self.refused = ""
         way = server.worlds.route(path, "")
         self.way: Any = None
@@ -64,7 +66,7 @@ class Peer:
             self.way.receive(self.session, encode(message), self.server.now)
 
     def outstanding(self) -> int:
-        return 0
+        return self.unread
 
     def close(self, code: int, reason: str) -> None:
         self.over = code, reason

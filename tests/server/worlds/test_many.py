@@ -224,6 +224,22 @@ def test_bytes_in_the_lobby() -> None:
     assert not server.worlds.lobby.sessions
 
 
+def test_a_client_that_is_gone_waits_no_longer() -> None:
+    server = Server(kind(players_max=1, worlds_max=1))
+    first = server.play("/match?kind=arena")
+    server.run(0.3)
+    gone, slow = server.peer("/match?kind=arena"), server.peer("/match?kind=arena")
+    gone.unread = 60
+    for k in range(8):
+        first.send(messages.Ping(float(k)))  # it goes on playing
+        slow.unread = 60
+        server.run(2)
+        slow.unread = 0
+        server.run(0.2)
+    assert gone.over == (messages.TOO_SLOW, "nothing reached the client for 15 s")
+    assert slow.over is None
+
+
 def test_a_kept_world_comes_back_and_others_do_not() -> None:
     server = Server(kind("home", keep=True, empty_s=1), kind("arena", empty_s=1))
     server.worlds.create("home", {"owner": "ann"}, private=True, name="anns")
