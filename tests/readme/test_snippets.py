@@ -30,12 +30,14 @@ from tests.client_sdk.test_worlds_over_sockets import Told
 from tests.lengths import long
 from tests.readme.pages import programs
 from tests.readme.run_snippet import LOOPS, URL
+from tests.server.worlds.hosts import Server, kind
 
 ENGINES = ["pygame-ce", "pyglet", "arcade", "Panda3D", "ursina"]
 ON_A_SERVER = ["asyncio", "A bot"]
 WORLDS = "Worlds and matches"
 WAITS = "Threads, timers and asyncio"
-GAMES = ["Buttons and aim", "Behaviours", "Declared commands", "Before a join", "Options"]
+QUEUE = "A queue with a rule of its own"
+GAMES = [QUEUE, "Buttons and aim", "Behaviours", "Declared commands", "Before a join", "Options"]
 ALONE = ["A game", "Without a socket", "Testing it", "Agents that learn", WAITS, *GAMES]
 A_FILE = "Your own game"
 
@@ -82,6 +84,17 @@ def test_worlds_and_matches(capsys: pytest.CaptureFixture[str]) -> None:
     assert told.paths[0] == "/match?kind=arena&mode=2v2&seats=2"
     found = "found arena-1 - a friend joins with Client.join(url, seat=...): ('/arena-1?seat=b',)"
     assert capsys.readouterr().out.splitlines() == [found, "over: that was it"]
+
+
+def test_a_queue_with_a_rule_of_its_own() -> None:
+    ranked = alone(QUEUE)["Ranked"]
+    server = Server(kind("duel", ranked, players_max=2), authenticate=lambda token: token)
+    ann, bob, cleo = (server.peer("/match?kind=duel", name=name, token=name) for name in ("ann", "bob", "cleo"))
+    server.run(5)
+    assert ann.go.path.partition("?")[0] == bob.go.path.partition("?")[0] == "/duel-1"
+    server.run(5)
+    assert cleo.over is None
+    assert server.worlds.faults.total == 0
 
 
 def alone(name: str) -> dict[str, Any]:
@@ -215,7 +228,7 @@ def test_a_game() -> None:
 
 def test_a_scene(tmp_path: Path) -> None:
     found = programs("toml")
-    assert found.keys() == {"Scenes", "Kinds of blocks"}
+    assert found.keys() == {"Scenes", "Kinds of blocks", "Kinds"}
     (file := tmp_path / "island.toml").write_text(found["Scenes"] + found["Kinds of blocks"], "utf-8")
     scene = load_scene(str(file))
     assert repr(scene) == "<Scene 'island', 96 x 64 x 32 blocks, 32 ticks/s>"
