@@ -21,7 +21,7 @@ MISSING = "import no_such_library"
 
 @contextlib.contextmanager
 def rig(scene: Path) -> Iterator[bench.Rig]:
-    running = bench.Rig("game", scene)
+    running = bench.Rig("scripts.benchmarks.busy_server", "game", str(scene))
     try:
         yield running
     finally:
