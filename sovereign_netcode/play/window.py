@@ -8,7 +8,18 @@ from typing import NamedTuple, Protocol
 import pygame
 
 from client_sdk.client import Client
-from client_sdk.events import Answered, Disconnected, Diverged, Event, Happened, Left, Resumed
+from client_sdk.events import (
+    Answered,
+    Disconnected,
+    Diverged,
+    Event,
+    Happened,
+    Joined,
+    Left,
+    Moved,
+    Resumed,
+    Waiting,
+)
 from client_sdk.netsim.links import Link
 from client_sdk.view import EntityView, View
 from server.declared import Value
@@ -50,6 +61,7 @@ SIZE = 1280, 800
 SKY = (122, 184, 232), (222, 240, 250)
 LAG_STEP_S, LAG_MAX_S = 0.05, 1.0
 CLOSED = "closed by the player"
+FETCHES, WAITS = "fetching the world ...", "waiting for a world ..."
 """Reason of the end (`Window.over`) when the player has closed the window."""
 DIG, PLACE = -1, -3
 """Numbers of the mouse buttons that remove and place blocks, unless the game has them for its own buttons."""
@@ -125,6 +137,7 @@ class Window:
         self._screen = pygame.display.set_mode(SIZE, pygame.RESIZABLE)
         self._ground, self._hud = Ground(), Hud(LAG_MAX_S)
         self._camera: Point | None = None
+        self._fetching = FETCHES
         self._headings: dict[int, Point] = {}
         self._tones: dict[int, int] = {}
         self._at = 0.0
@@ -189,6 +202,12 @@ class Window:
                 self._hud.say(f"rejected: {verdict}", now)
             case Disconnected(reason=reason, wait_s=wait_s):
                 self._hud.say(f"connection lost ({reason}): reconnecting in {wait_s:.0f} s", now)
+            case Waiting(position=position, waiting=waiting):
+                self._fetching = f"waiting for a world: {position} of {waiting} ..." if waiting else WAITS
+            case Moved(reason=reason):
+                self._hud.say(reason or "to another world", now)
+            case Joined():  # perhaps in another world than before
+                self._ground, self._camera, self._fetching = Ground(), None, FETCHES
             case Resumed(away_s=away_s):
                 self._hud.say(f"reconnected after {away_s:.1f} s", now)
             case Diverged(what=what):
@@ -261,7 +280,7 @@ class Window:
         target, prediction, scene = self._screen, self.core.prediction, self.core.scene
         target.blit(_sky(target.get_size()), (0, 0))
         if view.me is None or prediction is None or scene is None:
-            plate = label("fetching the world ...", INK, WHITE, 30)
+            plate = label(self._fetching, INK, WHITE, 30)
             target.blit(plate, plate.get_rect(center=target.get_rect().center))
             pygame.display.flip()
             return

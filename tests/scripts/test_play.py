@@ -15,14 +15,17 @@ import pytest
 
 from client_sdk.client import Client
 from client_sdk.core import Core
+from client_sdk.loopback import Loopback
+from server.game import Game
 from server.rules import Rules
+from server.worlds.kinds import kind_of
 from shared import kernels
 from shared.blocks import Blocks
 from shared.inputs import NEUTRAL, Input
 from shared.scene import SCENES, Scene, load_scene
 from shared.world import World
 from sovereign_netcode.playtest import Link as Line
-from sovereign_netcode.playtest import Match, Player
+from sovereign_netcode.playtest import LocalWorlds, Match, Player
 from tests.e2e.processes import END_S, START_S, until
 from tests.lengths import long, long_but
 
@@ -178,6 +181,39 @@ def test_all_players_are_drawn_and_the_keys_work() -> None:
     assert "closed" not in window.over
     session.press(pygame.K_ESCAPE)
     assert "closed" in window.over
+
+
+def test_the_window_goes_from_world_to_world() -> None:
+    class Gate(Rules):
+        def on_command(self, player: Any, name: str, data: Any) -> bool:
+            return self.game.send_away(player, self.game.worlds.create("pit"), reason="down you go")
+
+    pit = kind_of("pit", Rules, load_scene("flat"), players_max=1, worlds_max=1)
+    worlds = LocalWorlds(pit, default=Game(load_scene("meadow"), rules=Gate()))
+    loopback = Loopback(worlds)
+    client = loopback.join("Ann")
+    window = Window(client, keyboard, "worlds")
+    waiting = loopback.match("pit")
+    second = Window(waiting, keyboard, "worlds")
+    now = 0.0
+
+    def run(seconds: float) -> None:
+        nonlocal now
+        for _ in range(round(20 * seconds)):
+            now += 0.05
+            window.frame(now)
+
+    run(1)
+    meadow = len(window._ground.pictures)
+    client.command("down")
+    run(2)
+    assert client.world == "pit-1"
+    assert len(window._ground.pictures) > meadow, "the whole ground of the other scene is drawn"
+    for _ in range(80):
+        now += 0.05
+        second.frame(now)
+    assert second._fetching == "waiting for a world: 1 of 1 ..."
+    assert window.over == second.over == ""
 
 
 def test_the_mouse_places_and_digs(monkeypatch: pytest.MonkeyPatch) -> None:
