@@ -1,7 +1,8 @@
 """The directories of saved worlds: DATA/worlds/NAME has `world.json` and the store of one world.
 
-`world.json` is written before a world begins, so a directory with it is a world, whatever ended the process. A world
-that ends is renamed before its files are removed, and the rest is removed at the next start.
+`world.json` is written before the store, and before anything of a world is promised to a client. So a directory with it
+is a world, whatever ended the process, and one without it was not one yet. A world that ends is renamed before its
+files are removed, and the rest is removed at the next start.
 """
 
 import json
@@ -51,8 +52,10 @@ class WorldFiles:
     def __init__(self, data: Path, *, durable: bool) -> None:
         self._folder, self._failed, self._durable = data / "worlds", data / "failed-worlds", durable
         self._folder.mkdir(parents=True, exist_ok=True)
-        for path in self._folder.glob(f"{ENDED}*"):
-            shutil.rmtree(path, ignore_errors=True)
+        for path in self._folder.iterdir():
+            begun = path.is_dir() and not (path / "world.json").exists() and not (path / "world.db").exists()
+            if begun or path.name.startswith(ENDED):  # no client has been promised anything of a world that only begun
+                shutil.rmtree(path, ignore_errors=True)
 
     def of(self, name: str) -> Path:
         """Returns the directory of a world."""

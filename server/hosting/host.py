@@ -10,6 +10,7 @@ slow; only the beginning of a saved world waits for its disk.
 import asyncio
 import contextlib
 import logging
+import threading
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
@@ -22,6 +23,7 @@ from server.game.loading import Runner
 from server.hosting.files import SavedWorld, WorldFiles
 from server.hosting.phases import Phases
 from server.hosting.running import NamedTick, RunningWorld, new_recording
+from server.persistence.new_store import NewStore
 from server.persistence.store import Store
 from server.runtime.log import WORLD
 from server.runtime.terrain import TerrainPool
@@ -68,7 +70,8 @@ class WorldHost:
         self._phases = Phases()
         self._power = settings.durability == "power"
         self._files = None if settings.data is None else WorldFiles(Path(settings.data), durable=self._power)
-        self._saved: dict[str, SavedWorld] = {}  # what `world.json` has, by name
+        self._saved: dict[str, SavedWorld] = {}  # what `world.json` is to have, by name
+        self._writing = threading.Lock()  # held while a `world.json` is written or its directory is removed
         self._threads = ThreadPoolExecutor(THREADS, "files")
         self._closing: dict[str, Future[None]] = {}
         self._failed: set[str] = set()
@@ -151,10 +154,7 @@ class WorldHost:
             del self._closing[name]
         if self._files is not None:
             for running in self.running.values():
-                try:
-                    self._write(running.world)
-                except OSError as error:
-                    logger.error("cannot save the world %s: %s", running.world.name, error)
+                self._write(running.world)
 
     def trouble(self) -> str:
         """Returns the reason why worlds cannot be saved; empty if they can."""
@@ -189,19 +189,7 @@ class WorldHost:
         rules = kind.rules()
         store = None
         if self._files is not None:
-            if world.name not in self._saved:
-                undo.callback(self._discard, world.name)
-            self._write(world)
-            store = Store(
-                self._files.of(world.name),
-                kind.scene,
-                game=settings.worlds[kind.name].game or "",
-                power=self._power,
-                checkpoint_s=settings.checkpoint_s,
-                terrain=self._terrain.of(kind.scene),
-            )
-            undo.callback(store.close)
-            undo.callback(store.end, save=False)
+            store = self._opened(world, self._files, undo)
         game = Game(
             kind.scene,
             limits=settings.limits,
@@ -230,6 +218,30 @@ class WorldHost:
             running.store = store
         return running
 
+    def _opened(self, world: HostedWorld, files: WorldFiles, undo: contextlib.ExitStack) -> Store:
+        """Opens the store of a world."""
+        settings, scene, name = self._settings, world.kind.scene, world.name
+        folder, game = files.of(name), settings.worlds[world.kind.name].game or ""
+        terrain, checkpoint_s = self._terrain.of(scene), settings.checkpoint_s
+        if name in self._saved:
+            self._write(world)
+            store = Store(folder, scene, game=game, power=self._power, checkpoint_s=checkpoint_s, terrain=terrain)
+        else:
+            undo.callback(self._discard, name)
+            self._saved[name] = _state_of(world)
+            store = NewStore(
+                folder,
+                scene,
+                lambda: self._write_file(name),
+                game=game,
+                power=self._power,
+                checkpoint_s=checkpoint_s,
+                terrain=terrain,
+            )
+        undo.callback(store.close)
+        undo.callback(store.end, save=False)
+        return store
+
     def _broken(self, world: HostedWorld) -> None:
         """Ends a world whose ticks fail. Its data are set aside."""
         reason = f"{FAILURES_MAX} ticks in a row have failed"
@@ -238,12 +250,25 @@ class WorldHost:
         self.worlds.end(world.name, reason)
 
     def _write(self, world: HostedWorld, *, asleep: bool = False) -> None:
-        """Writes `world.json` if it has changed."""
-        assert self._files is not None
-        new = SavedWorld(world.kind.name, dict(world.properties), world.code, world.locked, asleep, world.stays)
+        """Writes `world.json` in another thread if it has changed."""
+        new = _state_of(world, asleep=asleep)
         if self._saved.get(world.name) != new:
-            self._files.write(world.name, new)
             self._saved[world.name] = new
+            self._threads.submit(self._write_in_thread, world.name)
+
+    def _write_in_thread(self, name: str) -> None:
+        try:
+            self._write_file(name)
+        except OSError as error:
+            logger.error("cannot save the world %s: %s", name, error)
+
+    def _write_file(self, name: str) -> None:
+        """Writes the newest state of a world into its `world.json`, unless it has ended meanwhile."""
+        assert self._files is not None
+        with self._writing:
+            saved = self._saved.get(name)
+            if saved is not None:
+                self._files.write(name, saved)
 
     def _discard(self, name: str) -> None:
         """Removes the files of a world that could not be made."""
@@ -259,6 +284,12 @@ class WorldHost:
             if failed:
                 logger.error("the data of the world %s are in %s now", name, self._files.set_aside(name))
             elif not keep:
-                self._files.remove(name)
+                with self._writing:
+                    self._files.remove(name)
         except Exception:
             logger.exception("closing the files of the world %s", name)
+
+
+def _state_of(world: HostedWorld, *, asleep: bool = False) -> SavedWorld:
+    """Returns what `world.json` of a world is to have."""
+    return SavedWorld(world.kind.name, dict(world.properties), world.code, world.locked, asleep, world.stays)

@@ -28,11 +28,6 @@ accepts nothing, or is more than `BEHIND_S` behind, a gap begins: `trouble` has 
 game refuses commands (`messages.UNSAVED`) while players can still move. Commands that were answered with "done" before
 are on disk; commands that were carried out and not answered stay unanswered. Then the thread reopens the file and saves
 a new checkpoint, and repeats this until it works. That saves everything, the unanswered commands too, and ends the gap.
-
-Rejected: a transaction in the tick (a slow disk would delay every client); a log of states instead of inputs (100 times
-the bytes); a file per segment (no transaction spans several files); a copy of the world by fork (not with threads, not
-on Windows); a replica that replays the log in the thread (twice the CPU time). A crash loses ticks that clients saw in
-snapshots without a verdict, if they were to be in the next transaction.
 """
 
 import logging
@@ -50,7 +45,7 @@ from server.observability.errors import FaultReporter
 from server.observability.histogram import Histogram
 from server.persistence.checkpoint import Checkpoint, Copy, Saved
 from server.persistence.database import Database, Record, StoreError, chained, seal_of
-from server.persistence.restore import claimed, load
+from server.persistence.restore import Loaded, claimed, load
 from shared.checks import Cell, text
 from shared.inputs import Input
 from shared.scene import Scene
@@ -112,9 +107,7 @@ class Store(Observer):
         self._path = Path(directory) / "world.db"
         self._rules, self._game = msgpack.packb(scene.to_table()), game
         self.faults = FaultReporter("the store has failed")
-        """Exceptions in our own code."""
-        self.checkpoints_failed = 0
-        self._power = power
+        self.checkpoints_failed, self._power = 0, power
         self._checkpoint_ticks = max(1, round(checkpoint_s * scene.tick_rate))
         self.trouble = ""
         """Reason why nothing can be saved at the moment, in one line; empty: saving works."""
@@ -130,17 +123,17 @@ class Store(Observer):
         self._copy: Copy | None = None
         self._urgent = self._closing = self._copy_due = self._gap = self._reopening = False
         self._claim = claimed(self._path.parent)
+        self._file: Database | None = None
+        self._seals: dict[bytes, Saved] = {}
         try:
-            loaded = load(self._path, scene, game, compiled=compiled, terrain=terrain)
-            self._file: Database | None = Database(self._path, power=power)
-            self._saved: Saved = loaded.saved
-            self._seals: dict[bytes, Saved] = {self._file.seal(): loaded.saved}
+            loaded = self._load(scene, compiled, terrain)
         except BaseException as error:
             self._claim.close()
             if isinstance(error, sqlite3.Error):
                 raise StoreError(f"{self._path}: cannot be written ({error})") from error
             raise
         self.world, self.kept = loaded.world, loaded.kept
+        self._saved: Saved = loaded.saved
         self.notes: Sequence[tuple[int, Any]] = loaded.notes
         self._chain, self._log_bytes, self._copied = loaded.chain, loaded.log_bytes, loaded.checkpoint_tick
         self.restored = (self.world.tick, self.world.state_hash().hex())
@@ -245,6 +238,13 @@ class Store(Observer):
             "checkpoints_failed": self.checkpoints_failed,
             "checkpoint_ms": self.checkpoint_s.summary(),
         }
+
+    def _load(self, scene: Scene, compiled: bool | None, terrain: World | None) -> Loaded:
+        """Returns the saved world, or a new one, and opens the file."""
+        loaded = load(self._path, scene, self._game, compiled=compiled, terrain=terrain)
+        self._file = Database(self._path, power=self._power)
+        self._seals = {self._file.seal(): loaded.saved}
+        return loaded
 
     def _copied_world(self) -> Copy | None:
         """Returns a copy of the world for a checkpoint; None if that failed, which is counted and tried again."""
