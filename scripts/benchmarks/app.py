@@ -27,6 +27,9 @@ and bytes. It also measures a replay of ten ticks of a lone player, with a behav
 
 `worlds` searches for the most worlds of four players each that one server process holds at 30 Hz, and measures what an
 empty world costs (memory, CPU time), and the time from asking for a match to playing in a new world.
+
+`peers` plays Colyseus 0.18 (installed from npm into build/) and this project in turn, with their own clients over the
+same line, and says where this project is behind. One run takes about ten minutes.
 """
 
 import argparse
@@ -44,6 +47,7 @@ from rich.table import Table
 
 from scripts.benchmarks import abilities, capacity, entities, jitter, memory, physics, rss, step_c, wire, worlds
 from scripts.benchmarks.crowds import Samples
+from scripts.benchmarks.peers import app as peers
 from scripts.benchmarks.server import RigError
 from shared import kernels
 
@@ -293,6 +297,15 @@ def parser() -> argparse.ArgumentParser:
     command = commands.add_parser("worlds", parents=[each], help="worlds per server process (Linux)")
     command.add_argument("--quick", action="store_true", help="one step of few worlds, within a minute")
     command.set_defaults(run=worlds.run)
+    command = commands.add_parser("peers", parents=[each], help="Colyseus and this project, in turn (Linux, npm)")
+    command.add_argument(
+        "--runs", type=int, default=1, metavar="N", help="runs of everything, for scatter (default: 1)"
+    )
+    command.add_argument("--seconds", type=float, default=10.0, metavar="S", help="measured seconds (default: 10)")
+    command.add_argument("--warm-up", type=float, default=8.0, metavar="S", help="seconds before that (default: 8)")
+    command.add_argument("--only", default="", metavar="TEXT", help="only scenarios with this text in their name")
+    command.add_argument("--quick", action="store_true", help="few players and seconds, to see that it works")
+    command.set_defaults(run=peers.run)
     return parser
 
 

@@ -1,7 +1,7 @@
 """A generator of load for `bench.py server`: a thousand players in one process, without prediction and world.
 
-argument  {"port", "seed", "rate", "joins_per_s", "paths"}, as JSON. The players join the paths in turn, each of
-          which is a world; without "paths" they join the default one
+argument  {"port", "seed", "rate", "joins_per_s", "paths", "lead_ticks", "jump_share"}, as JSON; the last three may be
+          left out. The players join the paths in turn, each of which is a world; without "paths" the default one
 stdin     a command per line: "clients N": connect or disconnect until there are N; "leaving N": the oldest client
           leaves N times per second and is replaced; "begin": the window begins; "end": the window ends, report its
           figures. The end of the pipe: stop
@@ -31,7 +31,10 @@ from shared import fields, messages
 from shared.messages import Bye, Hello, Inputs, Ping, decode_from_server, encode
 
 LEAD_TICKS = 2
-"""Ticks from sending an input to the deadline of its tick, at most. An input is sent up to a tick later than that."""
+"""Ticks from sending an input to the deadline of its tick, at most. An input is sent up to a tick later than that.
+Over a line with a delay it has to be longer."""
+JUMP_SHARE = 0.01
+"""Share of the inputs that jump."""
 REPORT_S = 0.2
 SLOT_S = 0.001
 """Length of a slot in seconds. Each client sends in one slot of every tick."""
@@ -47,6 +50,8 @@ class Swarm:
     def __init__(self, order: dict[str, Any]) -> None:
         self.order = order
         self.rate: int = order["rate"]
+        self.lead_ticks: int = order.get("lead_ticks", LEAD_TICKS)
+        self.jump_share: float = order.get("jump_share", JUMP_SHARE)
         self.slots = max(1, round(1 / self.rate / SLOT_S))
         self.poll = select.epoll()
         self.players: dict[int, Player] = {}
@@ -141,7 +146,7 @@ class Swarm:
         tick_0 = player.time.tick_0
         if player.acked < 0 or tick_0 == -math.inf:
             return
-        due = int(now * self.rate + tick_0 + LEAD_TICKS)
+        due = int(now * self.rate + tick_0 + self.lead_ticks)
         n = min(due - player.sent, fields.INPUT_ROWS_MAX) if player.sent >= 0 else 1
         if n <= 0:
             return
@@ -150,7 +155,7 @@ class Swarm:
             angle = rng.random() * math.tau
             player.move = bytes((int(127 * math.cos(angle)) & 0xFF, int(127 * math.sin(angle)) & 0xFF, 0))
         row = player.move
-        if rng.random() < 0.01:
+        if rng.random() < self.jump_share:
             row = row[:2] + b"\1"
         player.sent = due
         self.inputs += n

@@ -1,0 +1,1 @@
+"""`bench.py peers`: other netcode on the same machine, line and game, beside ours."""

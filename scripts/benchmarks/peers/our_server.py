@@ -1,0 +1,140 @@
+"""Our server of `bench.py peers`: the product with a log of the inputs.
+
+    python -m scripts.benchmarks.peers.our_server PORT [walked]
+
+Players walk on a plane at 3 blocks/s, and do not stop each other.
+
+stdout  a line when it listens, then a JSON object for each command
+stdin   a command per line: "mark": report the counters; "log": report the log of inputs. The end of the pipe: stop
+
+With `walked` it also measures the way of each player.
+"""
+
+import asyncio
+import json
+import math
+import sys
+import time
+import tomllib
+from typing import Any, cast
+
+from scripts.benchmarks.busy_server import in_view
+from scripts.environment import ROOT
+from server import app
+from server.config.settings import Settings
+from server.game import Game, roster
+from server.players.input_queue import InputQueue
+from server.runtime import event_loop, log
+from server.runtime.warmup import warm_up
+from shared.messages import Inputs
+from shared.scene import Scene
+
+RATE = 32
+
+
+def scene() -> Scene:
+    """Returns the scene `flat` without collisions between players, who all spawn in the middle of a segment."""
+    table = tomllib.loads((ROOT / "shared" / "scenes" / "flat.toml").read_text("utf-8"))
+    table |= {"name": "plane", "tick_rate": RATE, "size": [6, 6, 1], "spawns": [[80, 80, 8]]}
+    table["templates"][0]["solid"] = False
+    return Scene.from_table(table)
+
+
+class Logged(InputQueue):
+    """An input queue that notes when each input arrived, and in which tick it was used."""
+
+    def __init__(self, *args: Any) -> None:
+        super().__init__(*args)
+        self.arrived: dict[int, float] = {}
+        self.used_in: set[int] = set()
+
+    def file(self, message: Inputs, tick: int, ahead: float) -> None:
+        now, before = time.monotonic(), self._accepted
+        super().file(message, tick, ahead)
+        for at in range(before + 1 if before >= 0 else message.first, self._accepted + 1):
+            self.arrived[at] = now
+
+    def take(self, tick: int) -> Any:
+        if tick in self._waiting:
+            self.used_in.add(tick)
+        return super().take(tick)
+
+
+class Measured(Game):
+    """The game with a log: the time at which each tick began, and if `follow`, the way that each player walked."""
+
+    def __init__(self, rules: Scene, *, follow: bool) -> None:
+        super().__init__(rules)
+        self.follow = follow
+        self.began: list[float] = []
+        self.first = self.world.tick + 1
+        self._at: dict[int, tuple[float, float]] = {}
+        self.walked: dict[str, float] = {}
+
+    def tick(self, deadline: float, now: float) -> None:
+        self.began.append(time.monotonic())
+        super().tick(deadline, now)
+        for entity, player in self.players.items() if self.follow else ():
+            x, y, _ = self.world.position(entity)
+            was = self._at.get(entity, (x, y))
+            self._at[entity] = (x, y)
+            self.walked[player.name] = self.walked.get(player.name, 0.0) + math.hypot(x - was[0], y - was[1])
+
+    def mark(self) -> dict[str, Any]:
+        return {
+            "now": time.monotonic(),
+            "cpu_s": time.process_time(),
+            "ticks": len(self.began),
+            "rss_mb": event_loop.rss_mb(),
+            "in_view": in_view(self),
+            "walked": self.walked,
+        }
+
+    def input_log(self) -> dict[str, Any]:
+        inputs = {}
+        for player in self.players.values():
+            queue = player.inputs
+            assert isinstance(queue, Logged)
+            inputs[player.name] = [
+                [at, arrived, at - self.first if at in queue.used_in else -1] for at, arrived in queue.arrived.items()
+            ]
+        return {"first": self.first, "ticks": self.began, "inputs": inputs}
+
+
+class Reporting(app.Server):
+    """The product's server, which also answers commands on stdin."""
+
+    def __init__(self, settings: Settings, game: Measured) -> None:
+        super().__init__(settings, game)
+        self._measured = game
+
+    async def serve(self) -> int:
+        obeying = asyncio.create_task(self.obey())
+        try:
+            return await super().serve()
+        finally:
+            obeying.cancel()
+
+    async def obey(self) -> None:
+        """Answers commands, and stops the server when stdin ends."""
+        commands = asyncio.StreamReader()
+        loop = asyncio.get_running_loop()
+        await loop.connect_read_pipe(lambda: asyncio.StreamReaderProtocol(commands), sys.stdin)
+        while command := (await commands.readline()).decode().strip():
+            answer = self._measured.mark() if command == "mark" else self._measured.input_log()
+            print(json.dumps(answer), flush=True)
+        self._end("stdin has ended", 0)
+
+
+def main(argv: list[str]) -> int:
+    cast("Any", roster).InputQueue = Logged
+    rules = scene()
+    warm_up(rules)
+    settings = Settings(port=int(argv[0]), page=False, log_level="warning")
+    log.set_up(settings.log_level, settings.log_format, sys.stderr)
+    with asyncio.Runner(loop_factory=event_loop.loop_factory()) as runner:
+        return runner.run(Reporting(settings, Measured(rules, follow="walked" in argv)).serve())
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
