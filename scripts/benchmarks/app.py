@@ -297,15 +297,7 @@ def parser() -> argparse.ArgumentParser:
     command = commands.add_parser("worlds", parents=[each], help="worlds per server process (Linux)")
     command.add_argument("--quick", action="store_true", help="one step of few worlds, within a minute")
     command.set_defaults(run=worlds.run)
-    command = commands.add_parser("peers", parents=[each], help="Colyseus and this project, in turn (Linux, npm)")
-    command.add_argument(
-        "--runs", type=int, default=1, metavar="N", help="runs of everything, for scatter (default: 1)"
-    )
-    command.add_argument("--seconds", type=float, default=10.0, metavar="S", help="measured seconds (default: 10)")
-    command.add_argument("--warm-up", type=float, default=8.0, metavar="S", help="seconds before that (default: 8)")
-    command.add_argument("--only", default="", metavar="TEXT", help="only scenarios with this text in their name")
-    command.add_argument("--quick", action="store_true", help="few players and seconds, to see that it works")
-    command.set_defaults(run=peers.run)
+    peers.add(commands, each)
     return parser
 
 

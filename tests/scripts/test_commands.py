@@ -39,7 +39,7 @@ def test_each_package_says_what_it_is_for_and_is_in_the_architecture() -> None:
     page = (ROOT / "ARCHITECTURE.md").read_text("utf-8")
     for package in sorted({path.parent for path in SCRIPTS.rglob("*.py")} - {SCRIPTS}):
         assert ast.get_docstring(ast.parse((package / "__init__.py").read_text("utf-8")))
-        assert f"](scripts/{package.name})" in page
+        assert f"](scripts/{package.relative_to(SCRIPTS).as_posix()})" in page
 
 
 def test_no_module_is_private_or_searched_for_elsewhere() -> None:

@@ -98,6 +98,18 @@ def scenarios(lengths: Lengths, node: str) -> dict[str, Callable[[str, int], fig
     return made
 
 
+def add(commands: Any, each: argparse.ArgumentParser) -> None:
+    """Adds the command to a parser's `commands`. `each` has the options that all benchmarks share."""
+    command = commands.add_parser("peers", parents=[each], help="Colyseus and this project, in turn (Linux, npm)")
+    add_argument = command.add_argument
+    add_argument("--runs", type=int, default=1, metavar="N", help="runs of everything, for scatter (default: 1)")
+    add_argument("--seconds", type=float, default=10.0, metavar="S", help="measured seconds (default: 10)")
+    add_argument("--warm-up", type=float, default=8.0, metavar="S", help="seconds before that (default: 8)")
+    add_argument("--only", default="", metavar="TEXT", help="only scenarios with this text in their name")
+    add_argument("--quick", action="store_true", help="few players and seconds, to see that it works")
+    command.set_defaults(run=run)
+
+
 def run(args: argparse.Namespace, console: Console) -> tuple[dict[str, Any], int]:
     if sys.platform != "linux":
         console.print("error: `peers` needs Linux: its load generator polls with epoll")
