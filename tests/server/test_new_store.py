@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from server.persistence import new_store
-from server.persistence.database import StoreError
+from server.persistence.checkpoint import Checkpoint
+from server.persistence.database import Database, StoreError
 from server.persistence.new_store import NewStore
 from server.persistence.store import Store
 from server.runtime.terrain import TerrainPool
@@ -51,7 +51,7 @@ def test_nothing_is_durable_before_the_files_are_there(tmp_path: Path) -> None:
     state = store.world.state_hash()
     assert store.close()
     again = Store(tmp_path / "a", SCENE, terrain=POOL.of(SCENE))
-    assert (again.world.state_hash(), [note.value for note in again.notes]) == (state, [])
+    assert (again.world.state_hash(), again.notes) == (state, [])
     assert again.close()
 
 
@@ -74,17 +74,17 @@ def test_a_disk_that_fails_at_first_is_tried_again(tmp_path: Path, monkeypatch: 
             times.append(name)
             raise OSError("disk full")
 
-    class Failing(new_store.Database):
-        def __init__(self, *arguments: object, **options: object) -> None:
+    class Failing(Database):
+        def __init__(self, path: Path, *, power: bool = True) -> None:
             fail_twice("database")
-            super().__init__(*arguments, **options)  # type: ignore[arg-type]
+            super().__init__(path, power=power)
 
-        def save(self, *arguments: object) -> None:
+        def save(self, checkpoint: Checkpoint, scene: bytes, chain: int, game: str) -> None:
             fail_twice("save")
-            super().save(*arguments)  # type: ignore[arg-type]
+            super().save(checkpoint, scene, chain, game)
 
-    monkeypatch.setattr(new_store, "Database", Failing)
-    monkeypatch.setattr("server.persistence.store.Database", Failing)
+    for module in ("new_store", "store"):
+        monkeypatch.setattr(f"server.persistence.{module}.Database", Failing)
     announced: list[str] = []
 
     def created() -> None:
