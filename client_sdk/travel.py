@@ -3,8 +3,9 @@
 Theory of operation. A server names another path by `Go`. The client then ends its connection (`leaving`), and connects
 to that path as a new player as soon as the end of the old connection is known. Only the path changes: the transport
 keeps host and port. A `Go` ahead of a welcome came from a lobby. If the world that a lobby named does not take the
-client, the client asks the lobby again. If a world has sent the client away, it tries the new path again. Both are
-bounded, and so is the number of worlds without play in between.
+client, the client asks the lobby again. If a world has sent the client away and the connection breaks on the way, it
+tries the new path again, the last time without the seat. Both are bounded, and so is the number of worlds without play
+in between.
 """
 
 import math
@@ -104,6 +105,8 @@ class Travel:
         self._failed += 1
         if self._lobby:
             self.path, self.code, self.seats, self._arriving = self._lobby, "", (), False
+        elif self._failed == ATTEMPTS_MAX:  # the seat counts once, and a connection that broke off may have used it
+            self.path = without_seat(self.path)
         self.leaving, self._wait_s = True, wait_s
         return True
 

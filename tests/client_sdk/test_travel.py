@@ -1,6 +1,8 @@
 """The way of a core from world to world, with hand-made messages of a server: `Go` and `Waiting` in every state."""
 
+import itertools
 import math
+import random
 from typing import Any
 
 import msgpack
@@ -317,7 +319,7 @@ def test_a_lost_way_from_world_to_world_is_tried_again_and_a_refusal_is_not() ->
         server.close(1006, "no connection")
         server.now = server.core.reconnect.retry_at
         server.dial()
-    assert server.dialled == ["/"] + ["/final?seat=x"] * (1 + ATTEMPTS_MAX)
+    assert server.dialled == ["/", *["/final?seat=x"] * ATTEMPTS_MAX, "/final"], "the last time without the seat"
     server.taken()
     server.close(1006, "no connection")
     assert server.taken() == [Left(1006, "no connection")]
@@ -386,6 +388,50 @@ def test_play_in_between_counts_the_worlds_anew() -> None:
         server.welcome()
     server.send(Go("/next", "", [], ""))
     assert server.core.state == "closed"
+
+
+def hostile(server: Server, chance: random.Random) -> None:
+    """Does one thing that a server, a network or a program may do."""
+    core = server.core
+    paths = ("/", "/a", "/b?seat=x", "//else/x", "/match?kind=arena", "/" + "s" * 1023)
+    if core.dials(server.now) and chance.random() < 0.7:
+        server.dial()
+    elif core.connected and core.prediction is None and chance.random() < 0.4:
+        server.welcome()
+    elif chance.random() < 0.03:
+        server.send(chance.choice((b"\xc0", encode(Bye(4010, "no", -1.0)), encode(messages.Waiting(b"")))))
+    else:
+        act = chance.randrange(5)
+        if act == 0:
+            server.send(Go(chance.choice(paths), "CODE", ["/a?seat=y"], "go"))
+        elif act == 1:
+            server.send(Bye(chance.choice((1001, 4004, 4005)), "bye", chance.choice((-1.0, 0.0, 2.0))))
+        elif act == 2 and core.prediction is None:
+            server.send(messages.Waiting(msgpack.packb({"waiting": 1})))
+        elif act == 3:
+            server.close(chance.choice((1000, 1006)), "lost")
+        else:
+            server.live(chance.uniform(0, 2))
+
+
+@pytest.mark.parametrize("seed", range(40))
+def test_whatever_a_server_does_the_client_stays_in_order(seed: int) -> None:
+    chance = random.Random(seed)
+    server = Server(chance.choice(("/", LOBBY, "/a")), patience_s=5.0)
+    core = server.core
+    for _ in range(300):
+        hostile(server, chance)
+        assert core.state in ("joining", "playing", "reconnecting", "closed")
+        assert not (core.travel.leaving and core.connected)
+        assert core.state != "joining" or core.timeline is None
+        assert core.travel.path.startswith("/")
+        if core.state == "closed":
+            break
+    kinds = [type(event) for event in server.events if isinstance(event, Matched | Moved | Joined | Left)]
+    assert kinds.count(Left) == (core.state == "closed")
+    assert Left not in kinds[:-1], "nothing comes after the end"
+    runs = [len(list(run)) for sent, run in itertools.groupby(kinds, lambda kind: kind in (Matched, Moved)) if sent]
+    assert max(runs, default=0) <= WORLDS_MAX
 
 
 @pytest.mark.parametrize(
