@@ -1,14 +1,16 @@
 """The list of the public worlds of a server, which it serves over HTTP."""
 
-import http.client
 import json
 import ssl
 import time
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from client_sdk.transports.connection import ConnectError, checked_tls, parsed
 from shared.checks import duration, shown
+
+if TYPE_CHECKING:
+    import http.client
 
 LIST_BYTES_MAX = 16 * 1024 * 1024
 """Limit of the list, in bytes."""
@@ -57,6 +59,8 @@ def list_worlds(
         ValueError: an argument is not valid.
         ConnectError: the server cannot be reached, or has no list of worlds.
     """
+    import http.client  # here, because few programs need it, and it takes some ms
+
     uri, tls = parsed(url), checked_tls(tls)
     until = time.monotonic() + duration(timeout, "timeout")
     if kind is not None and not isinstance(kind, str):
@@ -81,7 +85,7 @@ def list_worlds(
     return [entry for entry in entries if kind in (None, entry.kind)]
 
 
-def _body(response: http.client.HTTPResponse, until: float) -> bytes:
+def _body(response: "http.client.HTTPResponse", until: float) -> bytes:
     """Returns the body of an answer.
 
     Raises:
