@@ -17,6 +17,7 @@ from server.worlds.hosted import HostedWorld
 from server.worlds.kinds import Kind
 from server.worlds.worlds import Worlds
 from shared.behaviours import Behaviour
+from shared.checks import SceneError
 
 LOOK_S = 0.1
 """Time between two looks at all worlds, in seconds."""
@@ -46,15 +47,16 @@ class LocalWorlds:
         authenticate: Callable[[str], str] | None = None,
         seed: int = 0,
     ) -> None:
+        by_name = {kind.name: kind for kind in kinds}
+        if len(by_name) < len(kinds):
+            raise SceneError(f"kinds = {', '.join(kind.name for kind in kinds)}: must have different names")
         self._limits, self._authenticate, self._seed = limits or Limits(), authenticate, seed
         self._began = count(1)
         self._order = count()
         self._now = 0.0
         self._rhythms: dict[str, _Rhythm] = {}
         self._queue: list[tuple[float, int, _Rhythm]] = []
-        self.core = Worlds(
-            {kind.name: kind for kind in kinds}, self._limits, self, default=default, authenticate=authenticate
-        )
+        self.core = Worlds(by_name, self._limits, self, default=default, authenticate=authenticate)
         """The worlds: `create`, `end` and `entries`, for example."""
         self._start("*", _Rhythm(lambda now: self.core.tick(now), LOOK_S, 0.0))
         if default is not None:

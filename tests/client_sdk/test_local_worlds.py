@@ -181,3 +181,8 @@ def test_what_is_no_game_is_refused() -> None:
     for wrong in (LocalWorlds, Game, None, 5):
         with pytest.raises(ValueError, match="must be a `Game` or `LocalWorlds`"):
             Loopback(wrong)  # type: ignore[arg-type]
+
+
+def test_two_kinds_have_two_names() -> None:
+    with pytest.raises(ValueError, match="kinds = arena, arena: must have different names"):
+        LocalWorlds(arena(), arena())

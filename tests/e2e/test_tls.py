@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 import trustme
 
+from client_sdk import Joined, list_worlds
 from client_sdk.async_client import AsyncClient
 from client_sdk.client import Client
 from client_sdk.transports.connection import ConnectError
@@ -34,7 +35,9 @@ def server(authority: trustme.CA, tmp_path_factory: pytest.TempPathFactory) -> I
     issued = authority.issue_cert("localhost", "127.0.0.1")
     issued.cert_chain_pems[0].write_to_path(folder / "cert.pem")
     issued.private_key_pem.write_to_path(folder / "key.pem")
-    files = ("--tls-cert", str(folder / "cert.pem"), "--tls-key", str(folder / "key.pem"))
+    settings = folder / "worlds.toml"
+    settings.write_text('[worlds.arena]\nscene = "flat"\n', "utf-8")
+    files = ("--tls-cert", str(folder / "cert.pem"), "--tls-key", str(folder / "key.pem"), "--config", str(settings))
     with running("--port", "0", "--scene", "flat", *files) as process:
         yield process
         process.process.terminate()
@@ -65,6 +68,21 @@ async def test_aio(url: str, trust: ssl.SSLContext) -> None:
         while client.core.state != "playing" or client.stats.snapshots <= 10:  # noqa: ASYNC110 - there is no event for it
             await asyncio.sleep(0.01)
         assert client.stats.divergences == 0
+
+
+async def test_a_match(url: str, trust: ssl.SSLContext) -> None:
+    by_name = url.replace("127.0.0.1", "localhost")
+    with Client.match(by_name, "arena", tls=trust) as client:
+        until(lambda: plays(client))
+        async with asyncio.timeout(END_S), await AsyncClient.match(by_name, "arena", tls=trust) as other:
+            async for event in other:
+                if isinstance(event, Joined):
+                    break
+            assert client.world == other.world == "arena-1"
+        (entry,) = list_worlds(url, tls=trust)
+        assert entry.name == "arena-1"
+    with pytest.raises(ConnectError, match="no list of worlds"):
+        list_worlds(url)
 
 
 async def test_a_client_that_does_not_trust_the_certificate_gets_the_reason(url: str) -> None:
