@@ -31,7 +31,16 @@ from server.persistence.database import StoreError
 from server.persistence.store import Store
 from server.rules import Rules, RulesError, load_rules, prepared
 from server.runtime import healthcheck, log, reload
-from server.runtime.event_loop import announce_compiling, freeze, leave, loop_factory, on_signals, rss_mb, signals
+from server.runtime.event_loop import (
+    announce_compiling,
+    freeze,
+    leave,
+    loop_factory,
+    on_signals,
+    raise_descriptors,
+    rss_mb,
+    signals,
+)
 from server.runtime.keeping import recorded, saved
 from server.runtime.tasks import Tasks
 from server.runtime.terrain import TerrainPool
@@ -250,6 +259,7 @@ class Server:
         """Begins the worlds besides the default one."""
         from server.hosting.hosting import Hosting
 
+        raise_descriptors()
         self.hosting = Hosting(
             self.settings,
             declared.kinds,

@@ -24,6 +24,8 @@ from server.worlds.worlds import Worlds
 
 LOOK_S = 0.1
 """Seconds between two looks at the worlds: who gets a seat, which rest, which end."""
+FILES_LOOKS = 10
+"""Number of such looks between two at what is to be saved beside the stores."""
 STOPPING = "the server is about to stop"
 
 logger = logging.getLogger(__name__)
@@ -79,6 +81,7 @@ class Hosting:
         self._operators = Operators(self.worlds, self.host, token, self.drain)
         self._timer: asyncio.TimerHandle | None = None
         self._drained_at: float | None = None
+        self._looks = 0
 
     def start(self) -> None:
         """Begins the saved worlds and those that the settings name, and looks after all worlds from now on."""
@@ -143,7 +146,9 @@ class Hosting:
         self._timer = self._loop.call_later(LOOK_S, self._look_after)
         try:
             self.worlds.tick(time.monotonic())
-            self.host.look_after()
+            self._looks += 1
+            if self._looks % FILES_LOOKS == 0:
+                self.host.look_after()
             if self._drained_at is not None:
                 self._look_whether_drained(self._drained_at)
         except Exception:

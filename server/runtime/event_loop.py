@@ -50,6 +50,17 @@ def rss_mb() -> float:
     return peak / 1e6 if sys.platform == "darwin" else peak / 1e3
 
 
+def raise_descriptors() -> None:
+    """Raises the limit of file descriptors to what the system allows this process: each world takes one to six."""
+    try:
+        import resource
+    except ImportError:  # Windows
+        return
+    _, most = resource.getrlimit(resource.RLIMIT_NOFILE)
+    with contextlib.suppress(OSError, ValueError):
+        resource.setrlimit(resource.RLIMIT_NOFILE, (most, most))
+
+
 def loop_factory() -> Callable[[], asyncio.AbstractEventLoop]:
     """Returns the function that makes the event loop: uvloop's if it is installed, otherwise asyncio's."""
     try:
