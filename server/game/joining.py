@@ -162,7 +162,7 @@ class Joining:
     def _welcome(self, session: Session) -> None:
         """Seats a session at its player, a known or a new one, and prepares the welcome; or refuses the client."""
         assert session.hello is not None
-        player, new = self._roster.find(session.hello.resume, session.subject), False
+        player, new = self._roster.find(session.hello.resume, session.subject) or self._roster.seated(session), False
         if player is not None:
             self._counters.resumed += 1
             player.outbox.reconnect()

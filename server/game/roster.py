@@ -72,7 +72,8 @@ class Roster:
         player = self._api.players[entity] = Player(entity, name, session.subject, self._queue())
         player.edits_left = 0.0  # otherwise each leave and new join would give another burst
         player.announced, player.loaded = False, loaded
-        player.handed = session.reserved.data if session.reserved is not None else None
+        if session.reserved is not None:
+            player.handed, session.reserved.player = session.reserved.data, player
         self._counters.joined += 1
         try:
             session.seat(player)
@@ -135,6 +136,12 @@ class Roster:
                 return player
         return None
 
+    def seated(self, session: Session) -> Player | None:
+        """Returns the player who has joined on a session's seat over a connection that was lost at once; None: none."""
+        player = session.reserved.player if session.reserved is not None else None
+        here = player is not None and self._api.players.get(player.entity) is player
+        return player if here and player is not None and player.subject == session.subject else None
+
     def lost(self, session: Session, now: float) -> None:
         """Handles a lost connection: starts the time in which its player can reconnect."""
         player = session.player
@@ -143,6 +150,8 @@ class Roster:
         known = session.stream.acked >= 0 or len(player.tokens) > 1
         if session.stream.acked >= 0:
             player.drop_older_tokens()
+            if session.reserved is not None:
+                session.reserved.settled = True
         player.session = None
         player.reconnect_until = now + (
             self._limits.resume_s if known else min(UNACKNOWLEDGED_S, self._limits.resume_s)

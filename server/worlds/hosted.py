@@ -46,16 +46,11 @@ class HostedWorld:
         self.ending: str | None = None
         """Reason for which the world ends; None: it goes on."""
         self._seats = seats
-        self._arriving: list[Session] = []  # with a seat, and perhaps not joined yet
 
     def begin(self, game: Game) -> None:
         """Takes the world's game."""
         self.game = game
         game.joining.door = self
-
-    def arrive(self, session: Session) -> None:
-        """Takes a new connection whose client has a seat."""
-        self._arriving.append(session)
 
     @property
     def players(self) -> int:
@@ -65,9 +60,7 @@ class HostedWorld:
     @property
     def free(self) -> int:
         """Number of seats that are neither taken nor reserved."""
-        if self._arriving:
-            self._arriving = [session for session in self._arriving if not (session.entity or session.closed)]
-        return self.kind.players_max - self.players - len(self._arriving) - self._seats.reserved(self.name)
+        return self.kind.players_max - self.players - self._seats.reserved(self.name)
 
     @property
     def empty(self) -> bool:
@@ -80,8 +73,9 @@ class HostedWorld:
         if self.ending is not None:
             return messages.ENDED, self.ending
         if seat is not None:
-            foreign = seat.subject and seat.subject != session.subject
-            return (messages.NOT_ADMITTED, "the seat is another player's") if foreign else None
+            if seat.subject and seat.subject != session.subject:
+                return messages.NOT_ADMITTED, "the seat is another player's"
+            return (messages.FULL, FULL) if seat not in self._seats and self.free < 1 else None
         if self.code:
             return messages.NOT_ADMITTED, PRIVATE
         if self.locked:

@@ -148,10 +148,10 @@ class Worlds(Directory):
     def _opened(self, world: HostedWorld | None, seat: Seat | None, session: Session) -> None:
         """Takes a new connection to a world."""
         session.reserved = seat
+        if seat is not None:
+            seat.session = session
         if world is not None:
             self.wake(world)
-            if seat is not None:
-                world.arrive(session)
 
     def _limit(self, address: str) -> Bucket:
         """Returns the limit of an address, and makes it the one that asked last."""

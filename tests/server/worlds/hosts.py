@@ -1,5 +1,6 @@
 """A host of worlds in simulated time, and clients made of bytes."""
 
+from collections.abc import Callable
 from typing import Any
 
 from server.config.limits import Limits
@@ -21,11 +22,12 @@ class SimpleHost:
     def __init__(self) -> None:
         self.done: list[tuple[str, str]] = []
         self.ticking: dict[str, HostedWorld] = {}
+        self.authenticate: Callable[[str], str] | None = None
 
     def begin(self, world: HostedWorld) -> Game:
         self.done.append(("begin", world.name))
         limits = Limits(clients_max=world.kind.players_max)
-        return Game(world.kind.scene, rules=world.kind.rules(), limits=limits)
+        return Game(world.kind.scene, rules=world.kind.rules(), limits=limits, authenticate=self.authenticate)
 
     def wake(self, world: HostedWorld) -> None:
         self.done.append(("wake", world.name))
@@ -93,6 +95,7 @@ class Server:
 
     def __init__(self, *kinds: Kind, limits: Limits | None = None, **more: Any) -> None:
         self.host = SimpleHost()
+        self.host.authenticate = more.get("authenticate")
         self.now = 100.0
         self.worlds = Worlds({kind.name: kind for kind in kinds}, limits or Limits(), self.host, **more)
         self.worlds.tick(self.now)

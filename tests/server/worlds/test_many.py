@@ -193,8 +193,40 @@ def test_seats_that_are_forged_foreign_or_another_player_s() -> None:
     bob = server.peer(anns, token="bob")
     server.run(0.3)
     assert bob.over == (messages.NOT_ADMITTED, "the seat is another player's")
-    assert server.peer(anns, token="ann").refused == "the seat has expired; ask for a match again"
-    assert server.worlds.counts["seats_refused"] == 6
+    ann = server.peer(anns, token="ann")
+    server.run(0.3)
+    assert ann.welcome is not None
+    ann.send(messages.Inputs(0, world.game.world.tick, b""))  # it has a snapshot
+    for path in (anns, anns):
+        assert server.peer(path, token="ann").refused == "the seat has expired; ask for a match again"
+        ann.lose()
+    assert server.worlds.counts["seats_refused"] == 7
+
+
+def test_a_seat_counts_again_if_the_welcome_is_lost() -> None:
+    server = Server(kind(players_max=1))
+    go = server.peer("/match?kind=arena").go
+    first = server.peer(go.path)
+    assert server.peer(go.path).refused == "the seat is in use"
+    first.lose()  # before it has joined
+    world = server.worlds.worlds["arena-1"]
+    assert world.free == 0
+    second = server.peer(go.path)
+    server.run(0.1)
+    second.lose()  # after it has joined
+    third = server.peer(go.path)
+    server.run(0.1)
+    assert second.welcome is not None
+    assert third.welcome is not None
+    assert third.welcome.entity == second.welcome.entity
+    assert len(world.game.players) == 1
+    third.lose()
+    server.run(15.5)  # the player leaves
+    assert not world.game.players
+    fourth = server.peer(go.path)
+    server.run(0.1)
+    assert fourth.welcome is not None
+    assert len(world.game.players) == 1
 
 
 def test_bytes_in_the_lobby() -> None:

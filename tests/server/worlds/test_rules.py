@@ -143,7 +143,7 @@ def test_a_player_is_sent_to_the_default_world() -> None:
     arrived = server.peer(peer.go.path)
     default.tick(server.now, server.now)
     assert arrived.welcome is not None
-    assert server.peer(peer.go.path).refused == "the seat has expired; ask for a match again"
+    assert server.peer(peer.go.path).refused == "the seat is in use"
 
 
 class Duel(Rules):

@@ -78,7 +78,7 @@ def test_friends_land_together_and_a_seat_counts_once() -> None:
     again = server.peer(paths[0])
     server.run(0.5)
     assert all(peer.welcome is not None for peer in peers)
-    assert again.refused == "the seat has expired; ask for a match again"
+    assert again.refused == "the seat is in use"
 
 
 def test_a_seat_is_given_back_when_nobody_takes_it() -> None:
