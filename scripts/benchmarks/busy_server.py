@@ -30,6 +30,7 @@ import msgpack
 from server import app
 from server.config.settings import Settings
 from server.game import Game
+from server.game.front import Front
 from server.game.sequencer import Sequencer
 from server.game.session import Session
 from server.net.websocket import Connection
@@ -107,7 +108,7 @@ DOORS: list[tuple[FunctionType, str]] = [
     for function, part in (
         (Connection.data_received, "receive"),
         (decode_from_client, "decode"),
-        (Game.receive, "inputs"),
+        (Front.receive, "inputs"),
         (Sequencer.take_inputs, "inputs"),
         (World.step, "step"),
         (ChangeLog.record, "encode"),

@@ -16,43 +16,27 @@ from server.game.clocks import Clocks
 from server.game.commands import Commands
 from server.game.connections import Connections
 from server.game.edge import Edge
+from server.game.front import Front
 from server.game.joining import Joining
 from server.game.roster import Roster
 from server.game.sequencer import Sequencer
-from server.game.session import Session
 from server.game_api.api import GameApi
 from server.journal.recorded_world import RecordedWorld, Saves
 from server.observability.counters import Counters
 from server.observability.errors import FaultReporter
 from server.players import persisted_state
 from server.players.player import Player
-from server.replication.client_stream import Transport
 from server.rewind import Rewind
 from server.rules import Rules, checked_function, equipped
 from shared import messages
 from shared.checks import SceneError, shown, whole
-from shared.messages import (
-    Bye,
-    Command,
-    Hello,
-    Inputs,
-    Ping,
-    Pong,
-    ProtocolError,
-    Restart,
-    Resync,
-    decode_from_client,
-    encode,
-)
 from shared.scene import Scene
 
-RESYNC_S = 1.0
-"""Minimum time between two resynchronisations that one client requests, in seconds."""
 SEED_MAX = (1 << 63) - 1
 """Largest seed of the random numbers."""
 
 
-class Game:
+class Game(Front):
     """One world, its players and their connections.
 
     Args:
@@ -67,6 +51,9 @@ class Game:
         authenticate: returns the subject of a client's token, or raises a `ValueError`, whose text is sent to the
             refused client. None: anyone may play.
     """
+
+    joining: Joining
+    commands: Commands
 
     def __init__(
         self,
@@ -127,72 +114,13 @@ class Game:
         )
 
     @property
-    def sessions(self) -> list[Session]:
-        """The sessions of all connections, joined or not; do not change the list."""
-        return self.connections.sessions
+    def newest(self) -> int:
+        return self.world.tick
 
     @property
     def players(self) -> dict[int, Player]:
         """Players by entity, in the order in which they joined; do not change the dictionary."""
         return self.api.kept.players
-
-    # -- external events: queued ---------------------------------------------------------------------------
-
-    def open(self, link: Transport, now: float) -> Session:
-        """Adds a new connection and returns its session. Its client has to send a Hello within `Limits.hello_s`."""
-        return self.connections.open(link, now)
-
-    def receive(self, session: Session, data: bytes, now: float) -> None:
-        """Checks one message of a client and queues it, or closes the connection if it is not allowed."""
-        if session.closed:
-            return
-        if not self.clocks.allow(session, now):
-            self.connections.kick(session, messages.MALFORMED, "too many messages")
-            return
-        if len(data) > self.limits.message_bytes_max:
-            reason = f"a message longer than {self.limits.message_bytes_max} bytes"
-            self.connections.kick(session, messages.TOO_BIG, reason)
-            return
-        try:
-            message = decode_from_client(data, self._row_bytes)
-        except ProtocolError as error:
-            self.counters.malformed += 1
-            self.connections.kick(session, messages.MALFORMED, str(error))
-            return
-        if isinstance(message, Inputs) and session.entity:
-            if len(message.rows) > self.limits.input_rows_max * self._row_bytes:
-                reason = f"more than {self.limits.input_rows_max} inputs in a message"
-                self.connections.kick(session, messages.MALFORMED, reason)
-                return
-            session.inputs.file(message, self.world.tick, self.clocks.ticks_left(now))
-            self.sender.acked(session.stream, message.acked, now)
-        elif isinstance(message, Ping):
-            tick = self.world.tick + 1 - self.clocks.ticks_left(now)
-            session.send(encode(Pong(message.sent, tick)))
-            if session.corrections >= 0:  # the first report of a connection includes those of the connection before
-                self.counters.corrections += max(message.corrections - session.corrections, 0)
-            session.corrections = max(message.corrections, session.corrections)
-        elif isinstance(message, Hello) and not session.entity and session.hello is None and not session.loading:
-            self.joining.hello(session, message, now)
-        elif isinstance(message, Command) and session.entity:
-            assert session.player is not None
-            self.commands.file(session.player, message)
-        elif isinstance(message, Resync) and session.entity:
-            if now - session.resynced_at >= RESYNC_S:
-                session.resynced_at = now
-                self.counters.resyncs += 1
-                self.sender.forget(session.stream)
-        elif isinstance(message, Restart) and session.entity:
-            session.inputs.restart(message.tick)
-        elif isinstance(message, Bye):
-            self.connections.leave(session)
-        else:
-            state = "after the join" if session.entity else "before the join"
-            self.connections.kick(session, messages.MALFORMED, f"unexpected {type(message).__name__} {state}")
-
-    def lost(self, session: Session, now: float) -> None:
-        """Removes a session whose connection is gone. Its player may reconnect."""
-        self.connections.lost(session, now)
 
     def shut_down(self, reason: str, wait: float, code: int = messages.GOING_AWAY) -> None:
         """Lets the rules finish (`on_stop`), and closes all connections.
@@ -223,23 +151,9 @@ class Game:
         self.clocks.begin(deadline, now)
         self.edge.follow(self.sequencer.advance(now))
         self.clocks.refill()
-        self._send(now)
+        self._send(self.api.shared_values, now)
         self.sequencer.finish()
         self.clocks.check(now)
-
-    def _send(self, now: float) -> None:
-        """Sends each client that has joined what is due: its welcome, or the newest snapshot and events."""
-        for session in tuple(self.sessions):
-            if session.entity and not session.closed:
-                try:
-                    self.api.shared_values.show(session.stream)
-                    if session.greeting is None or self.joining.greet(session, *session.greeting):
-                        assert session.player is not None
-                        self.sender.serve(session.stream, session.player, now)
-                    else:  # the welcome waits for the disk, which is not a stall of the client
-                        session.stream.sent_at = now
-                except Exception:
-                    self.connections.fail(session, "serving a client")
 
     def stats(self) -> dict[str, Any]:
         """Returns all counters, including the inputs of the present players, and the size of the game."""

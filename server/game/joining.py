@@ -14,6 +14,7 @@ from server.game.session import Session
 from server.journal.recorded_world import RecordedWorld
 from server.observability.counters import Counters
 from server.observability.errors import FaultReporter
+from server.players.player import Player
 from server.rules import Rules
 from shared import messages
 from shared.messages import Hello, Welcome, encode
@@ -187,11 +188,15 @@ class Joining:
                 self._connections.refuse(session, messages.FULL, "no room to spawn")
                 return
         try:
-            token = self._roster.issue(player)
-            welcome = encode(Welcome(messages.VERSION, self._world.tick, player.entity, self._rules, token))
+            self._admit(session, player)
         except Exception:
             if new:
                 self._roster.expel(player)
             raise
+
+    def _admit(self, session: Session, player: Player) -> None:
+        """Prepares the welcome of a client that has joined."""
+        token = self._roster.issue(player)
+        welcome = encode(Welcome(messages.VERSION, self._world.tick, player.entity, self._rules, token))
         session.stream.private_due = self._roster.private_of(player)
         session.greeting = (self._world.tick + 1, welcome)

@@ -98,9 +98,13 @@ class Roster:
     def issue(self, player: Player) -> bytes:
         """Makes a new resume token for a player and returns it."""
         token = secrets.token_bytes(RESUME_BYTES)
-        player.tokens.append(_digest(token))
-        self._world.note(persisted_state.note_of(player))
+        self.grant(player, digest_of(token))
         return token
+
+    def grant(self, player: Player, digest: bytes) -> None:
+        """Adds a resume token, given by its digest, to those of a player."""
+        player.tokens.append(digest)
+        self._world.note(persisted_state.note_of(player))
 
     def private_of(self, player: Player) -> bytes:
         """Returns the message with the values that only this player gets; empty if there have never been any."""
@@ -114,7 +118,7 @@ class Roster:
 
     def knows(self, token: bytes, subject: str) -> bool:
         """Returns whether a player has a resume token and a subject; unlike `find`, this changes nothing."""
-        wanted = _digest(token)
+        wanted = self._digest(token)
         players = self._api.players.values() if token else ()
         return any(wanted in player.tokens and player.subject == subject for player in players)
 
@@ -127,7 +131,7 @@ class Roster:
             token: the token from the client's hello; empty if it has none.
             subject: the subject of the client.
         """
-        wanted = _digest(token)
+        wanted = self._digest(token)
         for player in self._api.players.values() if token else ():
             if player.session is not None and player.session.stream.acked >= 0:
                 player.drop_older_tokens()
@@ -195,6 +199,10 @@ class Roster:
                     self._api.discard(entity)
         self._fallen.clear()
 
+    def _digest(self, token: bytes) -> bytes:
+        """Returns the digest that a player has of a token."""
+        return digest_of(token)
+
     def _make_room(self) -> None:
         """Removes players without a connection if the game is full; first the one with the least time left."""
         excess = len(self._api.players) + 1 - self._limits.clients_max
@@ -210,6 +218,6 @@ class Roster:
             self._api.hooks.left(player)
 
 
-def _digest(token: bytes) -> bytes:
+def digest_of(token: bytes) -> bytes:
     """Returns the digest of a token: it recognises the token, but cannot be used in its place."""
     return hashlib.sha256(token).digest()

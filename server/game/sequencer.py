@@ -6,9 +6,10 @@ its results are the world, the persisted state and the `Outcome` of the tick. Th
 of these what each client gets.
 """
 
+from typing import Protocol
+
 from server.game.commands import Commands
 from server.game.connections import Connections
-from server.game.joining import Joining
 from server.game.roster import Roster
 from server.game_api.api import GameApi
 from server.journal.recorded_world import RecordedWorld
@@ -16,6 +17,13 @@ from server.replication.outcome import Outcome
 from server.rewind import Rewind
 from shared import messages
 from shared.inputs import Input
+
+
+class Joins(Protocol):
+    """The clients that wait to join (`server.game.joining`)."""
+
+    def join(self, now: float) -> None:
+        """Lets clients that wait join."""
 
 
 class Sequencer:
@@ -37,7 +45,7 @@ class Sequencer:
         api: GameApi,
         rewind: Rewind,
         roster: Roster,
-        joining: Joining,
+        joining: Joins,
         commands: Commands,
         connections: Connections,
     ) -> None:

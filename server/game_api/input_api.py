@@ -17,6 +17,7 @@ from shared.fields import ENTITY_MAX
 from shared.inputs import MOVE_MAX, Input, make_input
 from shared.layout import BUTTONS, MOVE_X, MOVE_Y
 from shared.states import STATES
+from shared.world import World
 
 
 class InputApi:
@@ -125,9 +126,7 @@ class InputApi:
             return player.inputs.coming(self._world.tick + 1)
         if entity in self.steered:
             return self.steered[entity]
-        state = self._world.state(entity)
-        aim = (state[STATES], state[STATES + 1], state[STATES + 2]) if self._world.scene.aim else NO_AIM
-        return Input(state[MOVE_X], state[MOVE_Y], state[BUTTONS], aim)
+        return held_input(self._world, entity)
 
     def _whose(self, who: Player | int) -> int:
         """Returns the number of an existing entity, for a player or a number."""
@@ -153,3 +152,10 @@ class InputApi:
         number = self._number(entity)
         self._world.awake(number)  # raises MissingError if there is no such entity
         return number
+
+
+def held_input(world: World, entity: int) -> Input:
+    """Returns the input that an entity had in the latest step."""
+    state = world.state(entity)
+    aim = (state[STATES], state[STATES + 1], state[STATES + 2]) if world.scene.aim else NO_AIM
+    return Input(state[MOVE_X], state[MOVE_Y], state[BUTTONS], aim)

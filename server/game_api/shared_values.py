@@ -41,6 +41,10 @@ class SharedValues:
         self._table.clear()
         self._table.update(after)
         self._world.note([SHARED, after])
+        self.renew()
+
+    def renew(self) -> None:
+        """Takes note of a change of the table: all clients are sent the values again."""
         self._version += 1
         self._message = encode(Shared(self._table))
 

@@ -15,7 +15,7 @@ has the whole state, as the notes that lead to it:
 Variables of the rules' class are not persisted. State that must survive belongs in attributes or shared values.
 """
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -71,34 +71,43 @@ def restored(notes: Iterable[list[Any]]) -> PersistedState:
         ValueError: there is no such kind of note.
     """
     kept = PersistedState()
-    shared: Mapping[str, Any] = {}
-    for kind, *parts in notes:
-        match kind, parts:
-            case "player", (entity, name, subject, tokens):
-                player = kept.players.setdefault(entity, Player(entity, name, subject))
-                player.tokens = list(tokens)
-            case "answered", (entity, number, verdict, *reason):
-                kept.players[entity].settle(number, verdict, *reason)
-            case "settled", (entity, verdicts):
-                kept.players[entity].settled.update(verdicts)
-            case "reasons", (entity, reasons):
-                kept.players[entity].reasons.update(reasons)
-            case "left", (entity,):
-                kept.players.pop(entity, None)
-                kept.attributes.pop(entity, None)
-                kept.tables.get("private", {}).pop(entity, None)
-            case "said", (entity, attributes):
-                kept.attributes[entity] = attributes
-            case "shared", (shared,):
-                pass
-            case "entry", (name, key, None):
-                kept.tables.setdefault(name, {}).pop(key, None)
-            case "entry", (name, key, value):
-                kept.tables.setdefault(name, {})[key] = value
-            case _:
-                raise ValueError(f"{kind!r}: no such note")
+    for note in notes:
+        take(kept, note)
     for player in kept.players.values():
         player.verdicts.clear()  # a client that asks again gets them from `settled`
         player.command = max(player.settled, default=-1)
-    kept.shared.update(shared)
     return kept
+
+
+def take(kept: PersistedState, note: list[Any]) -> None:
+    """Changes a state as a note says.
+
+    Raises:
+        ValueError: there is no such kind of note.
+    """
+    kind, *parts = note
+    match kind, parts:
+        case "player", (entity, name, subject, tokens):
+            player = kept.players.setdefault(entity, Player(entity, name, subject))
+            player.tokens = list(tokens)
+        case "answered", (entity, number, verdict, *reason):
+            kept.players[entity].settle(number, verdict, *reason)
+        case "settled", (entity, verdicts):
+            kept.players[entity].settled.update(verdicts)
+        case "reasons", (entity, reasons):
+            kept.players[entity].reasons.update(reasons)
+        case "left", (entity,):
+            kept.players.pop(entity, None)
+            kept.attributes.pop(entity, None)
+            kept.tables.get("private", {}).pop(entity, None)
+        case "said", (entity, attributes):
+            kept.attributes[entity] = attributes
+        case "shared", (shared,):
+            kept.shared.clear()
+            kept.shared.update(shared)
+        case "entry", (name, key, None):
+            kept.tables.setdefault(name, {}).pop(key, None)
+        case "entry", (name, key, value):
+            kept.tables.setdefault(name, {})[key] = value
+        case _:
+            raise ValueError(f"{kind!r}: no such note")

@@ -32,7 +32,7 @@ Policy = Callable[[Core, random.Random], Input]
 class Player:
     """One client: its core, its clock, its policy and its two wires. It also serves as the server's `Link`."""
 
-    def __init__(self, match: "Match", core: Core, path: Link, policy: Policy, seed: int) -> None:
+    def __init__(self, match: "Simulation", core: Core, path: Link, policy: Policy, seed: int) -> None:
         self.match, self.core, self.policy = match, core, policy
         self.rng = random.Random(seed)
         self.drift = self.rng.uniform(-200e-6, 200e-6)
@@ -165,60 +165,20 @@ class Player:
             self.match.at(self.match.now, self._update, key=self)
 
 
-class Match:
-    """A server, its players and the simulated time.
+class Simulation:
+    """The simulated time: a queue of calls, each at its time.
 
     Args:
-        scene: the scene of the world.
         seed: source of everything random.
-        limits: the server's limits; None: the defaults.
-        rules: rules of the game, which may change the scene (`Rules.prepare`); None: players only walk and edit.
-        worlds: the kinds of further worlds on the server. `game` is then the default world.
     """
 
-    def __init__(
-        self,
-        scene: Scene,
-        seed: int,
-        *,
-        limits: Limits | None = None,
-        rules: Rules | None = None,
-        worlds: Sequence[Kind] = (),
-    ) -> None:
-        self.game = Game(scene if rules is None else prepared(rules, scene), limits=limits, rules=rules, seed=seed)
-        self.worlds = LocalWorlds(*worlds, default=self.game, limits=limits, seed=seed) if worlds else None
-        """The worlds of the server; None: there is only the default one."""
+    def __init__(self, seed: int) -> None:
         self.seed = seed
         self.now = 0.0
         self.players: list[Player] = []
         self._queue: list[tuple[float, int, Callable[[], None], object]] = []
         self._latest: dict[object, int] = {}
         self._number = count()
-        self._started = 0
-        self._tick_s = 1.0 / scene.tick_rate
-        self.on_tick: list[Callable[[], None]] = []
-        self.at(0.0, self._tick)
-
-    def join(self, policy: Policy, path: Link | None = None, core: Core | None = None, *, to: str = "/") -> Player:
-        """Adds a player. Its client connects at once.
-
-        Args:
-            policy: called once per predicted tick; returns the input.
-            path: properties of its link; None: no latency.
-            core: its client; None: a new one.
-            to: the path that the client connects to, like "/match?kind=arena".
-        """
-        seed = self.seed * 1_000_003 + len(self.players) * 7919
-        if core is None:
-            classes = [entry.code for entry in self.game.scene.behaviours if entry.code is not None]
-            core = Core(
-                f"player {len(self.players)}", behaviours=classes if self.worlds is None else self.worlds.behaviours
-            )
-        core.travel.path = to
-        player = Player(self, core, path or Link(), policy, seed)
-        self.players.append(player)
-        self.at(self.now, player.connect)
-        return player
 
     def at(self, when: float, act: Callable[[], None], key: object = None) -> None:
         """Schedules a call for a time. An entry with a key replaces the earlier entry with that key."""
@@ -257,6 +217,60 @@ class Match:
 
     def route(self, path: str) -> Way | str:
         """Returns what a path leads to, or the reason why it leads nowhere."""
+        raise NotImplementedError
+
+
+class Match(Simulation):
+    """A server, its players and the simulated time.
+
+    Args:
+        scene: the scene of the world.
+        seed: source of everything random.
+        limits: the server's limits; None: the defaults.
+        rules: rules of the game, which may change the scene (`Rules.prepare`); None: players only walk and edit.
+        worlds: the kinds of further worlds on the server. `game` is then the default world.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        seed: int,
+        *,
+        limits: Limits | None = None,
+        rules: Rules | None = None,
+        worlds: Sequence[Kind] = (),
+    ) -> None:
+        super().__init__(seed)
+        self.game = Game(scene if rules is None else prepared(rules, scene), limits=limits, rules=rules, seed=seed)
+        self.worlds = LocalWorlds(*worlds, default=self.game, limits=limits, seed=seed) if worlds else None
+        """The worlds of the server; None: there is only the default one."""
+        self._started = 0
+        self._tick_s = 1.0 / scene.tick_rate
+        self.on_tick: list[Callable[[], None]] = []
+        self.at(0.0, self._tick)
+
+    def join(self, policy: Policy, path: Link | None = None, core: Core | None = None, *, to: str = "/") -> Player:
+        """Adds a player. Its client connects at once.
+
+        Args:
+            policy: called once per predicted tick; returns the input.
+            path: properties of its link; None: no latency.
+            core: its client; None: a new one.
+            to: the path that the client connects to, like "/match?kind=arena".
+        """
+        seed = self.seed * 1_000_003 + len(self.players) * 7919
+        if core is None:
+            classes = [entry.code for entry in self.game.scene.behaviours if entry.code is not None]
+            core = Core(
+                f"player {len(self.players)}", behaviours=classes if self.worlds is None else self.worlds.behaviours
+            )
+        core.travel.path = to
+        player = Player(self, core, path or Link(), policy, seed)
+        self.players.append(player)
+        self.at(self.now, player.connect)
+        return player
+
+    def route(self, path: str) -> Way | str:
         return self.game if self.worlds is None else self.worlds.route(path, self.now)
 
     def _tick(self) -> None:

@@ -1,0 +1,308 @@
+"""An edge of a world on many processes: the connections of some clients, on a replica of the world.
+
+Theory of operation. `collect` is called at the edge's own deadline of a tick, a little ahead of the sequencer's: it
+takes one input per player, and makes the batch for the sequencer. `follow` is called with each record of the log: it
+advances the replica, and sends the clients what is due. What became of the inputs of a tick is decided by its record:
+if the edge's batch was not in it, they count as late. Batches that are in no record yet are sent again when an epoch
+begins. Clients steer by the edge's time: `collect` is the deadline that their arrival margins refer to.
+"""
+
+import secrets
+from collections import deque
+from typing import Any, cast
+
+from server.config.limits import Limits
+from server.game.clocks import Clocks
+from server.game.commands import Commands
+from server.game.connections import Connections
+from server.game.edge import Edge
+from server.game.front import Front
+from server.game.joining import Joining
+from server.game.roster import Roster, digest_of
+from server.game.session import Session
+from server.game_api.input_api import held_input
+from server.game_api.shared_values import SharedValues
+from server.journal.records import input_record
+from server.observability.counters import Counters
+from server.observability.errors import FaultReporter
+from server.players.input_queue import InputQueue
+from server.players.player import Player
+from server.rules import Rules
+from server.scale.replica import Replica
+from server.scale.wire import COMMAND, GONE, JOIN, KNOWS, LEAVE, LOST, Batch, Record, rows
+from shared import fields, messages
+from shared.bounds import Bounds, bounds
+from shared.inputs import Input
+from shared.messages import IDLE, NEUTRALISED, REPEATED, USED, Command, Welcome, encode
+
+AHEAD_MAX = 8
+"""Maximum number of batches that are in no record yet. An edge that hears nothing of the sequencer stops there."""
+
+
+class EdgeInputs(InputQueue):
+    """The inputs of one player at an edge. Their statuses wait for the records of their ticks.
+
+    Args:
+        bounds, row_bytes: as for `InputQueue`.
+        held: the input that the player's entity had before, which stands in for missing ones.
+        resumed: whether the player was in the world before, so that an input is expected for every tick.
+    """
+
+    def __init__(self, bounds: Bounds, row_bytes: int, held: Input, *, resumed: bool) -> None:
+        super().__init__(bounds, row_bytes)
+        self._held, self._idle = held, REPEATED if resumed else IDLE
+        if resumed:
+            self.statuses.append(REPEATED)  # for the tick of the seat
+        self._taken: dict[int, int] = {}
+        self.sent: Input | None = None
+        """The input in the latest batch that had one."""
+
+    def take(self, tick: int) -> Input:
+        input_ = super().take(tick)
+        self._taken[tick] = self.statuses.pop()
+        return input_
+
+    def confirm(self, tick: int, missing: int) -> None:
+        """Files the status of a tick whose record has come.
+
+        Args:
+            tick: the tick.
+            missing: ticks from the newest batch in the record to the tick; 0: the input was used.
+        """
+        status = self._taken.pop(tick, IDLE)
+        if status == IDLE:
+            status = self._idle
+        if missing and status != IDLE:
+            self.used -= status == USED
+            self.substituted += status == USED
+            status = REPEATED if self._bounds.stands_in(missing) else NEUTRALISED
+        self.statuses.append(status)
+        if len(self.statuses) > self._bounds.statuses:
+            del self.statuses[0]
+
+
+class EdgeRoster:
+    """The requests of the clients of an edge about their players, in the place of a roster."""
+
+    def __init__(self) -> None:
+        self.requests: list[list[Any]] = []
+        self.clients: dict[Session, int] = {}
+        """Clients that have asked to join, with their numbers."""
+
+    def lost(self, session: Session, now: float) -> None:
+        """Reports a lost connection."""
+        self._report(LOST, session)
+
+    def dismiss(self, session: Session) -> None:
+        """Reports a client that has left, or that may not come back."""
+        self._report(LEAVE, session)
+
+    def excuse(self, seconds: float, now: float) -> None:
+        """Does nothing: the sequencer has the times."""
+
+    def _report(self, kind: int, session: Session) -> None:
+        client = self.clients.pop(session, None)
+        if client is not None:
+            self.requests.append([kind, client])
+        if session.player is not None and session.player.session is session:
+            session.player.session = None
+
+
+class EdgeCommands:
+    """The commands of the clients of an edge, until their ticks."""
+
+    def __init__(self, limits: Limits, ahead: int) -> None:
+        self._limits, self._ahead = limits, ahead
+        self.newest = -1
+        """Newest tick whose inputs were taken."""
+
+    def file(self, player: Player, command: Command) -> None:
+        """Queues a command that has arrived. The verdict of an answered one is sent again."""
+        if command.number in player.settled:
+            player.verdicts.append((command.number, player.settled[command.number]))
+        elif len(player.commands) >= self._limits.commands_waiting_max or command.tick > self.newest + self._ahead:
+            player.verdicts.append((command.number, messages.TOO_MANY))
+        else:
+            player.commands.append(command)
+
+
+class EdgeServer(Front):
+    """An edge of one world.
+
+    Args:
+        name: name of the edge, which no other edge of the world has had.
+        replica: the replica of the world at some tick of the log.
+        limits: the limits.
+    """
+
+    commands: EdgeCommands
+    joining: Joining
+
+    def __init__(self, name: str, replica: Replica, limits: Limits | None = None) -> None:
+        world = replica.world
+        self.name, self.replica, self.world, self.scene = name, replica, world, world.scene
+        self.limits, self.counters, self.faults = limits or Limits(), Counters(), FaultReporter()
+        self._row_bytes, self._bounds = self.scene.input_row_bytes, bounds(self.scene.tick_rate)
+        self._roster, self.commands = EdgeRoster(), EdgeCommands(self.limits, self._bounds.ahead)
+        self._half = Edge(world, replica.kept, self.limits, self.counters, lambda: world.tick)
+        self.log, self.sender = self._half.log, self._half.sender
+        self.log.faults = self.faults
+        roster = cast("Roster", self._roster)
+        self.connections = Connections(roster, self.counters, self.faults)
+        self.clocks = Clocks(self.scene.tick_rate, self.limits, self.connections, roster)
+        self.joining = Joining(
+            world, self.limits, self.counters, self.faults, self.connections, roster, _Durable(world), None, Rules()
+        )
+        self._values = SharedValues(world, replica.kept.shared)
+        self.commands.newest = world.tick
+        self._unrecorded: deque[Batch] = deque()
+        self._next, self._before = 0, -1
+        self._tokens: dict[int, bytes] = {}
+        self._known: set[Session] = set()
+        self._scene_table = self.scene.to_table()
+
+    @property
+    def newest(self) -> int:
+        return self.commands.newest
+
+    @property
+    def players(self) -> dict[int, Player]:
+        """All players of the world by entity, also those of other edges."""
+        return self.replica.kept.players
+
+    # -- to the sequencer ----------------------------------------------------------------------------------
+
+    def collect(self, deadline: float, now: float) -> Batch | None:
+        """Takes the inputs and requests for the next tick. Returns the batch; None: the log is too far behind."""
+        if self.newest >= self.world.tick + AHEAD_MAX:
+            return None
+        self.clocks.begin(deadline, now)
+        tick = self.newest + 1
+        self.commands.newest = tick
+        self._ask_to_join(now)
+        inputs: list[int] = []
+        requests = self._roster.requests
+        for session, client in self._roster.clients.items():
+            player = session.player
+            if player is None or session.closed:
+                continue
+            queue = session.inputs
+            assert isinstance(queue, EdgeInputs)
+            input_ = queue.take(tick)
+            if input_ != queue.sent:
+                queue.sent = input_
+                inputs += input_record(player.entity, input_, aim=self.scene.aim)
+            if session.stream.acked >= 0 and session not in self._known:
+                self._known.add(session)
+                requests.append([KNOWS, client])
+            while player.commands and player.commands[0].tick <= tick:
+                requests.append([COMMAND, client, *player.commands.popleft(), session.stream.gaps])
+        batch = Batch(self.name, tick, self._before, inputs, list(requests))
+        self._before = tick
+        requests.clear()
+        self._unrecorded.append(batch)
+        return batch
+
+    def unrecorded(self) -> list[Batch]:
+        """Returns the batches that are in no record yet, to be sent again when an epoch begins."""
+        return list(self._unrecorded)
+
+    def _ask_to_join(self, now: float) -> None:
+        """Adds the requests of clients that wait to join."""
+        joining = [each for each in self.sessions if each.hello is not None and not each.closed]
+        for session in joining[: self.limits.joins_per_tick]:
+            hello, session.hello, session.loading = session.hello, None, True
+            assert hello is not None
+            session.received_at = session.stream.sent_at = now
+            self._next += 1
+            client = self._roster.clients[session] = self._next
+            token = self._tokens[client] = secrets.token_bytes(fields.RESUME_BYTES)
+            resume = digest_of(hello.resume) if hello.resume else b""
+            request = [JOIN, client, hello.name, session.subject, resume, digest_of(token)]
+            self._roster.requests.append(request)
+
+    # -- from the log --------------------------------------------------------------------------------------
+
+    def follow(self, record: Record, now: float) -> bool:
+        """Takes a record of the log. Returns whether it begins an epoch, so that `unrecorded` has to be sent again.
+
+        Raises:
+            GapError: a record before it is missing.
+            DivergedError: the replica differs from the sequencer's world.
+        """
+        replica = self.replica
+        known = set(self.players) if record.seated else set()
+        if not replica.take(record):
+            return False
+        if record.journal is None:
+            return True
+        newest = replica.batches.get(self.name, -1)
+        while self._unrecorded and self._unrecorded[0].number <= newest:
+            self._unrecorded.popleft()
+        for session in self._roster.clients:
+            if isinstance(session.inputs, EdgeInputs) and session.player is not None:
+                session.inputs.confirm(record.tick, record.tick - newest)
+        self.commands.newest = max(self.commands.newest, self.world.tick)
+        self._seat(record, known, now)
+        self._half.follow(replica.outcome)
+        replica.outcome.clear()
+        if replica.shared_changed:
+            replica.shared_changed = False
+            self._values.renew()
+        self._forget_others()
+        self.clocks.refill()
+        self._send(self._values, now)
+        for edge, client, code, reason in rows(record.ended, 4):
+            if edge == self.name and code != GONE:
+                self._end(client, code, reason)
+        self.clocks.check(now)
+        return False
+
+    def _seat(self, record: Record, known: set[int], now: float) -> None:
+        """Welcomes the clients of this edge that have joined.
+
+        Args:
+            record: the record.
+            known: the players before it.
+            now: the current time in seconds.
+        """
+        clients = {client: session for session, client in self._roster.clients.items()}
+        for edge, client, entity in rows(record.seated, 3):
+            player = self.players.get(entity)
+            if player is None:
+                continue
+            if edge != self.name:
+                player.session = None
+                continue
+            session, token = clients.get(client), self._tokens.pop(client, b"")
+            if session is None or session.closed:
+                continue
+            held = held_input(self.world, entity)
+            player.inputs = EdgeInputs(self._bounds, self._row_bytes, held, resumed=entity in known)
+            player.commands.clear()
+            player.outbox.reconnect()
+            session.loading = False
+            session.seat(player)
+            session.received_at = session.stream.sent_at = now
+            welcome = encode(Welcome(messages.VERSION, record.tick - 1, entity, self._scene_table, token))
+            session.stream.private_due = self.replica.kept.private_of(entity)
+            session.greeting = (record.tick, welcome)
+
+    def _forget_others(self) -> None:
+        """Drops verdicts for players without a client here; an edge that seats them later has them as settled."""
+        for player in self.players.values():
+            if player.session is None and player.verdicts:
+                player.verdicts.clear()
+
+    def _end(self, client: int, code: int, reason: str) -> None:
+        """Ends the connection of a client because the sequencer has ended it."""
+        for session in [session for session, number in self._roster.clients.items() if number == client]:
+            del self._roster.clients[session]
+            self.connections.end(session, code, reason)
+
+
+class _Durable(Commands):
+    """Says that every record that an edge gets is durable."""
+
+    def __init__(self, world: Any) -> None:
+        self._world, self._saves = world, None

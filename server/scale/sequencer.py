@@ -1,0 +1,205 @@
+"""The sequencer of a world on many processes: batches of the edges in, one record per tick out.
+
+Theory of operation. A tick never waits for an edge. It takes the batches for this tick and earlier ones that have
+arrived, in order. Nothing of a batch waits in the sequencer beyond the tick that takes it, so a batch that is in the
+log is carried out completely, and one that is not is sent again by its edge after a takeover. If an edge's batch is
+missing, the inputs of its players are repeated, and after `Bounds.repeats` ticks neutral; the record says which batches
+it has. An edge without a batch for `SILENT_S` has lost its clients.
+"""
+
+import dataclasses
+
+from server.config.limits import Limits
+from server.game.commands import Commands
+from server.game.connections import Connections
+from server.game.sequencer import Sequencer
+from server.game.session import Session
+from server.game_api.api import GameApi
+from server.game_api.input_api import held_input
+from server.journal.recorded_world import Observer, RecordedWorld
+from server.journal.records import recorded_inputs
+from server.observability.counters import Counters
+from server.observability.errors import FaultReporter
+from server.players.persisted_state import PersistedState
+from server.rewind import Rewind
+from server.rules import Rules
+from server.scale.remote import BatchInputs, RemoteJoining, RemoteLink, RemoteRoster
+from server.scale.replica import Replica
+from server.scale.wire import COMMAND, GONE, JOIN, KNOWS, LEAVE, LOST, Batch, Record, packed, rows
+from shared import messages
+from shared.bounds import in_ticks
+from shared.messages import Command, Hello
+from shared.world_state import WorldState
+
+SILENT_S = 1.0
+"""Seconds without a batch after which the clients of an edge count as lost."""
+
+GONE_S = 600.0
+"""Seconds without a batch after which an edge is forgotten. It has to start anew under another name."""
+
+
+class _Pen(Observer):
+    """Keeps the record of the latest tick."""
+
+    def __init__(self) -> None:
+        super().__init__(first=False)
+        self.record: list[object] = []
+
+    def tick(self, world: WorldState, inputs: object) -> None:
+        self.record = self.taken(world, inputs)  # type: ignore[arg-type]
+
+
+class WorldSequencer:
+    """The sequencer of one world.
+
+    Args:
+        world: the world.
+        rules: the rules; None: players only walk and edit.
+        limits: the limits.
+        seed: seed of the rules' random numbers.
+        replica: the replica of `world` from which a standby takes over; None: a new world.
+    """
+
+    def __init__(
+        self,
+        world: RecordedWorld,
+        rules: Rules | None = None,
+        limits: Limits | None = None,
+        *,
+        seed: int = 0,
+        replica: Replica | None = None,
+    ) -> None:
+        self.world, limits = world, limits or Limits()
+        self.counters, self.faults = Counters(), FaultReporter()
+        self.epoch = 1 if replica is None else replica.epoch + 1
+        self._ended: list[object] = []
+        self._waiting: dict[str, dict[int, Batch]] = {}
+        """Batches by edge and by the number of the batch before. Each waits for that one: none may be left out."""
+        self._newest: dict[str, int] = {} if replica is None else dict(replica.batches)
+        self._sessions: dict[tuple[str, int], Session] = {}
+        self._silent = in_ticks(SILENT_S, world.scene.tick_rate, 2)
+        self._gone = in_ticks(GONE_S, world.scene.tick_rate, 2)
+        self._pen = _Pen()
+        world.attach(self._pen)
+        rules = rules or Rules()
+        kept: PersistedState | None = None if replica is None else replica.kept
+        rewind = Rewind(world, limits.rewind_s)
+        self.api = GameApi(world, rewind, self.counters, rules, kept=kept, seed=seed)
+        self.roster = RemoteRoster(world, self.api, limits, self.counters)
+        self.commands = Commands(world, self.api, limits, self.faults)
+        self.connections = Connections(self.roster, self.counters, self.faults)
+        each = dataclasses.replace(limits, joins_per_tick=limits.clients_max)  # the edges limit them
+        self._joining = RemoteJoining(
+            world, each, self.counters, self.faults, self.connections, self.roster, self.commands, None, Rules()
+        )
+        self._joining.seated = []
+        self._half = Sequencer(world, self.api, rewind, self.roster, self._joining, self.commands, self.connections)
+        if replica is not None:
+            self._take_over(replica)
+
+    def begin(self) -> bytes:
+        """Returns the record that begins the epoch. It must be in the log before any other record of it."""
+        return packed(Record(self.epoch, self.world.tick, self._batches(), None, [], [], [], [], [], []))
+
+    def receive(self, batch: Batch) -> None:
+        """Keeps a batch for its tick. One that is in the log already is dropped."""
+        if batch.number > self._newest.get(batch.edge, -1):
+            self._waiting.setdefault(batch.edge, {})[batch.before] = batch
+
+    def tick(self, now: float) -> bytes:
+        """Computes the next tick. Returns its record."""
+        tick = self.world.tick + 1
+        for edge in sorted(self._waiting):
+            waiting = self._waiting[edge]
+            while (batch := waiting.get(self._newest.get(edge, -1))) is not None and batch.number <= tick:
+                self._take(waiting.pop(batch.before), now)
+        self._judge(tick, now)
+        outcome = self._half.advance(now)
+        journal = self._pen.record
+        events = [(None if to is None else sorted(to), message) for to, message in outcome.events]
+        acted, removed = sorted(outcome.acted), list(outcome.removed)
+        self._half.finish()
+        ended, self._ended[:] = list(self._ended), []
+        for edge, client, _, _ in rows(ended, 4):
+            session = self._sessions.pop((edge, client), None)
+            if session is not None:
+                self.connections.lost(session, now)
+        seated, self._joining.seated = self._joining.seated, []
+        placed = sorted(self.world.placed)
+        batches = self._batches()
+        return packed(Record(self.epoch, tick, batches, journal, placed, acted, removed, events, seated, ended))
+
+    # -- batches -------------------------------------------------------------------------------------------
+
+    def _batches(self) -> list[object]:
+        return [part for pair in sorted(self._newest.items()) for part in pair]
+
+    def _take(self, batch: Batch, now: float) -> None:
+        """Carries out the requests of a batch, and takes its inputs."""
+        self._newest[batch.edge] = batch.number
+        for kind, client, *parts in batch.requests:
+            key = (batch.edge, client)
+            session = self._sessions.get(key)
+            if kind == JOIN and session is None:
+                name, subject, resume, token = parts
+                session = self._sessions[key] = self._open(batch.edge, client, token, now)
+                session.subject = subject
+                session.hello = Hello(messages.VERSION, {}, name, "", resume)
+            elif session is None:
+                continue
+            elif kind == KNOWS:
+                session.stream.acked = max(session.stream.acked, 0)
+            elif kind in (LOST, LEAVE):
+                if kind == LEAVE:
+                    self.roster.dismiss(session)
+                self.connections.lost(session, now)
+                self._ended += (*key, GONE, "")
+                del self._sessions[key]
+            elif kind == COMMAND and session.player is not None and session.player.session is session:
+                number, tick, seen, name, payload, gaps = parts
+                session.stream.gaps = tuple((first, last) for first, last in gaps)
+                self.commands.file(session.player, Command(number, min(tick, batch.number), seen, name, payload))
+        for entity, input_ in recorded_inputs(batch.inputs, aim=self.world.scene.aim).items():
+            player = self.api.players.get(entity)
+            home = None if player is None or player.session is None else player.session.link
+            if player is not None and isinstance(home, RemoteLink) and home.edge == batch.edge:
+                assert isinstance(player.inputs, BatchInputs)
+                player.inputs.latest = input_
+
+    def _judge(self, tick: int, now: float) -> None:
+        """Notes for how many ticks the batch of each edge is missing, and gives up silent edges."""
+        missing = {edge: tick - number for edge, number in self._newest.items()}
+        for player in self.api.players.values():
+            inputs, session = player.inputs, player.session
+            if not isinstance(inputs, BatchInputs):
+                continue
+            if session is None:
+                inputs.missing += 1
+            elif isinstance(session.link, RemoteLink):
+                inputs.missing = max(missing.get(session.link.edge, 0), 0)
+        for edge in [edge for edge, ticks in missing.items() if ticks > self._gone]:
+            del self._newest[edge]
+            self._waiting.pop(edge, None)
+        silent = {edge for edge, ticks in missing.items() if ticks > self._silent}
+        if silent:
+            for key in [key for key in self._sessions if key[0] in silent]:
+                session = self._sessions.pop(key)
+                session.close(messages.TOO_SLOW, "the edge was silent")
+                self.connections.lost(session, now)
+
+    # -- sessions ------------------------------------------------------------------------------------------
+
+    def _open(self, edge: str, client: int, token: bytes, now: float) -> Session:
+        return self.connections.open(RemoteLink(edge, client, token, self._ended), now)
+
+    def _take_over(self, replica: Replica) -> None:
+        """Seats the players of a replica at their edges, as the log says."""
+        self.roster.fell_out()
+        for entity, (edge, client) in replica.homes.items():
+            player = self.api.players.get(entity)
+            if player is not None and edge in self._newest:
+                session = self._sessions[edge, client] = self._open(edge, client, b"", 0.0)
+                session.subject = player.subject
+                session.seat(player)
+                assert isinstance(player.inputs, BatchInputs)
+                player.inputs.latest = held_input(self.world, entity)

@@ -1,0 +1,70 @@
+"""What the parts of a world send each other: batches of an edge to the sequencer, and records from it to all.
+
+batch     [edge, number, before, inputs, requests]
+          number: the tick that the inputs are for   before: number of the edge's batch before; -1: none
+          inputs: as in a recording (`server.journal.records`)
+request   [JOIN, client, name, subject, resume, token]
+          resume, token: digests of the presented resume token (empty: none) and of the new one
+          [KNOWS, client]   the client has the new token     [LOST, client]   [LEAVE, client]
+          [COMMAND, client, number, tick, seen, name, payload, gaps]
+record    [epoch, tick, batches, journal, placed, acted, removed, events, seated, ended]
+          batches: edge, newest batch in it, ...   journal: a tick of a recording; nil: the record begins an epoch
+          placed, acted, removed: entities   events: [players or nil, message], ...
+          seated: edge, client, player, ...   ended: edge, client, close code (`GONE`: the edge knows), reason, ...
+
+A client is a number that its edge gives to a connection. All of it is MessagePack.
+"""
+
+from typing import Any, NamedTuple
+
+import msgpack
+
+GONE = 0
+"""Close code in a record of a connection that its edge has lost."""
+JOIN, KNOWS, LOST, LEAVE, COMMAND = range(5)
+
+
+class Batch(NamedTuple):
+    """The inputs of an edge for one tick, and the requests that came since the batch before."""
+
+    edge: str
+    number: int
+    before: int
+    inputs: list[int]
+    requests: list[list[Any]]
+
+
+class Record(NamedTuple):
+    """One tick of the log, or the begin of an epoch."""
+
+    epoch: int
+    tick: int
+    batches: list[Any]
+    journal: list[Any] | None
+    placed: list[int]
+    acted: list[int]
+    removed: list[int]
+    events: list[Any]
+    seated: list[Any]
+    ended: list[Any]
+
+
+def packed(value: Batch | Record) -> bytes:
+    """Returns the bytes of a batch or a record."""
+    data: bytes = msgpack.packb(list(value))
+    return data
+
+
+def batch_of(data: bytes) -> Batch:
+    """Returns the batch in bytes of `packed`."""
+    return Batch(*msgpack.unpackb(data))
+
+
+def record_of(data: bytes) -> Record:
+    """Returns the record in bytes of `packed`."""
+    return Record(*msgpack.unpackb(data))
+
+
+def rows(flat: list[Any], width: int) -> list[list[Any]]:
+    """Returns a flat list as rows of a width."""
+    return [flat[at : at + width] for at in range(0, len(flat), width)]

@@ -1,0 +1,234 @@
+"""Tests of a world on many processes, in simulated time: equal replicas, kills of every part, late batches."""
+
+import random
+from collections import Counter
+from typing import Any
+
+import pytest
+
+from client_sdk.core import Core
+from client_sdk.events import Answered, Corrected, Diverged
+from client_sdk.netsim.links import Link
+from server.config.limits import Limits
+from server.players.player import Player
+from server.rules import Rules
+from server.scale.wire import record_of
+from shared.inputs import Input
+from shared.scene import load_scene
+from sovereign_netcode.playtest.match import Policy, wander
+from sovereign_netcode.playtest.scaled import ScaledMatch, Seat
+
+ROUGH = {"jitter_s": 0.003, "stop": (3.0, 0.08), "twice": 0.02}
+"""A bus whose messages are late, stop for up to 80 ms about every 3 s, and come twice at times."""
+PATH = Link(delay_s=0.03, jitter_s=0.005)
+
+
+class Tally(Rules):
+    """Counts the commands of each player in shared values, and sends an event for each."""
+
+    def on_command(self, player: Player, name: str, data: Any) -> bool:
+        self.game.share(player.name, self.game.shared.get(player.name, 0) + 1)
+        self.game.set(player.entity, "latest", data)
+        self.game.send("did", data, to=player)
+        return True
+
+
+def causes(player: Seat) -> Counter[str]:
+    """Returns how many corrections of each cause a player had."""
+    return Counter(event.cause for event in player.events if isinstance(event, Corrected))
+
+
+def hashes_agree(match: ScaledMatch) -> None:
+    """Checks that all parts had the same world at every tick of the log."""
+    ticks = [record.tick for record in map(record_of, match.bus.log) if record.journal is not None]
+    assert match.differ == []
+    assert ticks == list(range(1, len(ticks) + 1))
+    assert set(match.hashes) == set(ticks)
+
+
+def asks(sent: Counter[str]) -> Policy:
+    """Returns a policy that wanders and sends a command in every fifth tick or so."""
+
+    def policy(core: Core, rng: random.Random) -> Input:
+        if rng.random() < 0.2:
+            sent[core.name] += 1
+            core.command("go", sent[core.name])
+        return wander(core, rng)
+
+    return policy
+
+
+def edits(core: Core, rng: random.Random) -> Input:
+    """Wanders, and places and removes blocks."""
+    if rng.random() < 0.1:
+        assert core.prediction is not None
+        x, y, z = core.prediction.predicted.position(core.entity)
+        core.edit(int(x) + rng.randint(-2, 2), int(y) + rng.randint(-2, 2), int(z) + 1, rng.randint(0, 1))
+    return wander(core, rng)
+
+
+def torment(match: ScaledMatch, seconds: float, seed: int) -> None:
+    """Runs a match and kills an edge or the sequencer every second or two. Replaces each part that was killed."""
+    rng, until = random.Random(seed), match.now + seconds
+
+    def kill() -> None:
+        if match.now > until:
+            return
+        living = [edge for edge in match.edges if edge.alive]
+        if rng.random() < 0.4 and len(living) > 1:
+            match.add_edge()
+            match.kill(rng.choice(living))
+        elif match.sequencer.alive:
+            match.add_standby()
+            match.kill(match.sequencer)
+        match.at(match.now + rng.uniform(0.8, 2.5), kill)
+
+    match.at(match.now + rng.random(), kill)
+    match.run(seconds)
+
+
+def calm(match: ScaledMatch, seconds: float = 6.0) -> None:
+    """Lets the players do nothing new until everything was answered."""
+    for player in match.players:
+        player.policy = lambda core, rng: core.input
+    match.run(seconds)
+
+
+def test_a_player_who_is_alone_has_no_corrections() -> None:
+    match = ScaledMatch(load_scene("hills"), 1, edges=3)
+    player = match.join(edits, PATH)
+    match.run(20)
+    assert causes(player) == Counter()
+    assert player.core.stats.inputs_used > 500
+    assert player.core.stats.inputs_substituted == 0
+    assert {event.done for event in player.events if isinstance(event, Answered)} >= {True}
+    hashes_agree(match)
+
+
+def test_all_edges_encode_the_same_changes() -> None:
+    match = ScaledMatch(load_scene("meadow"), 2, edges=3, rules=Tally)
+    sent: Counter[str] = Counter()
+    for _ in range(4):
+        match.join(asks(sent), PATH)
+    compared = 0
+    for _ in range(40):
+        match.run(0.1)
+        logs = [edge.core.log for edge in match.edges if edge.core.world.tick == match.edges[0].core.world.tick]
+        for ago in (0, 1, 7):
+            deltas = [log.since(max(match.edges[0].core.world.tick - ago, 0)) for log in logs]
+            for segment in match.scene.segments():
+                assert len({delta[segment] for delta in deltas}) == 1
+                compared += len(deltas) > 1
+    assert compared > 100
+    hashes_agree(match)
+
+
+@pytest.mark.parametrize(
+    "seed",
+    [
+        1,
+        2,
+        pytest.param(3, marks=pytest.mark.slow),
+        *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(4, 16)),
+    ],
+)
+def test_no_kill_loses_or_doubles_a_command(seed: int) -> None:
+    match = ScaledMatch(load_scene("meadow"), seed, edges=4, standbys=2, rules=Tally, bus=ROUGH)
+    sent: Counter[str] = Counter()
+    for _ in range(4):
+        match.join(asks(sent), PATH)
+    match.run(3)
+    torment(match, 12, seed)
+    calm(match)
+    shared = match.sequencer.core.api.shared
+    assert match.sequencer.core.epoch > 2
+    for player in match.players:
+        answered = Counter(event.number for event in player.events if isinstance(event, Answered))
+        assert player.core.state == "playing"
+        assert set(answered.values()) == {1}, "each command is answered once"
+        assert shared[player.core.name] == sent[player.core.name] == len(answered), "and was carried out once"
+        assert not any(isinstance(event, Diverged) for event in player.events)
+    hashes_agree(match)
+
+
+@pytest.mark.parametrize("seed", [5, pytest.param(6, marks=pytest.mark.slow), pytest.param(7, marks=pytest.mark.slow)])
+def test_late_batches_are_late_inputs_and_nothing_else(seed: int) -> None:
+    match = ScaledMatch(load_scene("hills"), seed, edges=2, bus={"stop": (1.0, 0.15), "twice": 0.1})
+    player = match.join(wander, PATH)
+    match.run(40)
+    assert sum(edge.late for edge in match.edges) > 5
+    assert set(causes(player)) <= {"late input"}
+    assert player.core.stats.inputs_substituted > 0
+    assert player.core.stats.divergences == 0
+    hashes_agree(match)
+
+
+@pytest.mark.parametrize("seed", [1, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(2, 10))])
+def test_a_player_who_is_alone_is_corrected_for_late_inputs_only_when_parts_are_killed(seed: int) -> None:
+    match = ScaledMatch(load_scene("hills"), seed, edges=3, standbys=2, bus=ROUGH)
+    player = match.join(edits, PATH)
+    match.run(3)
+    torment(match, 15, seed)
+    calm(match)
+    assert player.core.state == "playing"
+    assert set(causes(player)) <= {"late input"}
+    assert not any(isinstance(event, Diverged) for event in player.events)
+    hashes_agree(match)
+
+
+def test_a_deposed_sequencer_is_refused_and_ends() -> None:
+    match = ScaledMatch(load_scene("flat"), 3, edges=2, standbys=1)
+    player = match.join(wander, PATH)
+    match.run(3)
+    old = match.sequencer
+    match.bus.hold(old.name, "log", 1.0)
+    match.run(3)
+    assert match.sequencer is not old
+    assert not old.alive
+    assert match.bus.refused > 0
+    assert {record_of(data).epoch for data in match.bus.log} == {1, 2}
+    assert player.core.state == "playing"
+    hashes_agree(match)
+
+
+def test_a_new_edge_catches_up_and_serves() -> None:
+    match = ScaledMatch(load_scene("meadow"), 4, edges=1, rules=Tally)
+    sent: Counter[str] = Counter()
+    match.join(asks(sent), PATH)
+    match.run(5)
+    edge = match.add_edge()
+    core = Core("late", patience_s=60.0)
+    core.travel.path = edge.name
+    second = match.join(wander, PATH, core)
+    match.run(5)
+    assert (second.edge, second.core.state) == (edge, "playing")
+    assert second.core.shared == match.players[0].core.shared
+    hashes_agree(match)
+
+
+def test_a_player_keeps_its_entity_when_its_edge_is_killed() -> None:
+    match = ScaledMatch(load_scene("meadow"), 5, edges=2, rules=Tally)
+    sent: Counter[str] = Counter()
+    player = match.join(asks(sent), PATH)
+    match.run(4)
+    entity, edge = player.core.entity, player.edge
+    assert edge is not None
+    match.kill(edge)
+    match.run(4)
+    assert (player.core.state, player.core.entity) == ("playing", entity)
+    assert player.edge not in (None, edge)
+    assert len(match.sequencer.core.api.players) == 1
+    hashes_agree(match)
+
+
+def test_a_player_leaves_and_the_others_see_it() -> None:
+    match = ScaledMatch(load_scene("meadow"), 6, edges=2, limits=Limits(resume_s=1.0))
+    first, second = match.join(wander, PATH), match.join(wander, PATH)
+    match.run(3)
+    first.core.close()
+    first._flush()
+    match.run(3)
+    assert len(match.sequencer.core.world) == 1
+    assert [len(edge.core.players) for edge in match.edges] == [1, 1]
+    assert second.core.state == "playing"
+    hashes_agree(match)
