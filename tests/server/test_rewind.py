@@ -93,10 +93,10 @@ def test_every_tick_of_the_window_is_as_it_was_with_its_blocks(seed: int, ticks:
             assert past.seen == old.tick
             assert past.box((-99, -99, -99), (99, 99, 99)) == _ids(old)
             assert [past.position(entity) for entity in _ids(old)] == [old.position(entity) for entity in _ids(old)]
-            for cell in itertools.product(range(-25, 25, 3), range(-25, 25), (-1, 7)):
+            for cell in itertools.product(range(-25 + world.tick % 9, 25, 9), range(-25, 25), (-1, 7)):
                 assert past.block(*cell) == old.blocks.get(*cell)
 
-    crowd(seed, ticks, compiled, check)
+    crowd(seed, ticks if compiled else ticks // 3, compiled, check)
 
 
 @pytest.mark.parametrize("skips", [0.0, 0.5, 0.8])
