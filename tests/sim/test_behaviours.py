@@ -256,7 +256,7 @@ def test_each_announcement_reaches_its_own_player_once(preset: str, seed: int) -
 
     match.on_tick.append(note)
     first = match.game.world.tick
-    match.run(20)
+    match.run(12)
     last = match.game.world.tick
     match.run(8)
     for player in match.players:

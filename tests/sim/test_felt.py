@@ -17,7 +17,7 @@ def settled(match: Match, *players: Player) -> None:
     match.run_until(lambda: all(player.core.state == "playing" for player in players), 60)
 
 
-@pytest.mark.parametrize("seconds", [20, *long(240)])
+@pytest.mark.parametrize("seconds", [20, *long(120)])
 @pytest.mark.parametrize("preset", long_but(["lan", "typical", "dip"], PRESETS))
 def test_a_lone_player_is_only_ever_corrected_after_a_late_input(preset: str, seconds: float) -> None:
     match = Match(load_scene("hills"), 11)
@@ -86,7 +86,7 @@ def test_snapshots_are_as_fresh_as_the_link_delivers(
 
 @pytest.mark.parametrize(
     ("preset", "seconds"),
-    [("thin", 10), *long(("lan", 60), ("typical", 60), ("dip", 60), ("thin", 60))],
+    [("thin", 10), *long(("lan", 30), ("typical", 30), ("dip", 40), ("thin", 30))],
 )
 def test_without_the_systems_count_acknowledgements_keep_snapshots_fresh(
     preset: str, seconds: float, monkeypatch: pytest.MonkeyPatch
