@@ -35,6 +35,8 @@ from server.worlds.worlds import Worlds
 THREADS = 8
 """Number of threads that close and remove files of worlds that have ended."""
 
+OVERRUN = "the world %s: %d ticks in a second took longer than the time between two (longest ever: %.0f ms)"
+
 logger = logging.getLogger(__name__)
 
 
@@ -149,7 +151,11 @@ class WorldHost:
                 del self._saved[name]
 
     def look_after(self) -> None:
-        """Saves what has changed beside the stores, and forgets files that are closed. Call it now and then."""
+        """Saves what has changed beside the stores, and reports worlds with long ticks. Call it each second."""
+        for name, running in self.running.items():
+            if count := running.overran():
+                longest_ms = 1e3 * running.ticker.work.max_s
+                logger.warning(OVERRUN, name, count, longest_ms)
         for name in [name for name, closing in self._closing.items() if closing.done()]:
             del self._closing[name]
         if self._files is not None:

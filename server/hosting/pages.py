@@ -42,6 +42,7 @@ WORLD_COUNTERS = {
     "ticks": "Ticks of a world that have run.",
     "ticks_late": "Ticks of a world that began more than one tick late.",
     "ticks_failed": "Ticks of a world that raised an exception.",
+    "ticks_overrun": "Ticks of a world that took longer than the time between two.",
     "skipped_s": "Seconds of dropped ticks of a world.",
     "tick_work_s": "Seconds that the ticks of a world took.",
     "rules_failed": "Exceptions in the rules of a world.",
@@ -131,7 +132,7 @@ def _row(running: RunningWorld) -> dict[str, Any]:
         "names": [player.name for player in game.players.values()][:NAMES_MAX],
         "entities": len(game.world),
         "tick_work_ms": ticker.work.quantile_ms(0.99),
-        "ticks_late": ticker.ticks_late,
+        "ticks_overrun": ticker.overruns,
         "failures": ticker.failures + game.counters.rules_failed,
     }
 

@@ -26,6 +26,7 @@ class RunningWorld:
         self.store: Store | None = None
         self.recording: IO[bytes] | None = None
         self._live: Live | None = None
+        self._overruns = 0
 
     @property
     def live(self) -> Live:
@@ -41,6 +42,11 @@ class RunningWorld:
         more = {} if self.store is None else self.store.stats()
         return {**own, **self.game.stats(), **self.ticker.stats(), **more}
 
+    def overran(self) -> int:
+        """Returns the number of ticks since the last call that took longer than the time between two."""
+        before, self._overruns = self._overruns, self.ticker.overruns
+        return self._overruns - before
+
     def figures(self) -> dict[str, float]:
         """Returns the figures of the world that `/metrics` shows."""
         ticker = self.ticker
@@ -50,6 +56,7 @@ class RunningWorld:
             "ticks": ticker.ticks,
             "ticks_late": ticker.ticks_late,
             "ticks_failed": ticker.failures,
+            "ticks_overrun": ticker.overruns,
             "skipped_s": ticker.skipped_s,
             "tick_work_s": ticker.work.sum_s,
             "rules_failed": self.game.counters.rules_failed,

@@ -100,7 +100,8 @@ def serve(settings: Settings, arguments: Sequence[str]) -> int:
         settings: the settings.
         arguments: the command line that they come from.
     """
-    folder = folder_of(settings.game)
+    games = [settings.game, *(kind.game for kind in settings.worlds.values())]
+    folder = folder_of(next(filter(None, games), None))
     own = [*arguments, "--reload", "false", "--restart-s", str(RESTART_S)]
     child, standby = Child(), None
     try:

@@ -185,6 +185,8 @@ class Ticker:
         self.ticks = 0
         self.ticks_late = 0
         self.failures = 0
+        self.overruns = 0
+        """Number of ticks that took longer than the time between two."""
         self.latest = -math.inf
         """Time in seconds at which the latest tick began."""
         self._tick = tick
@@ -261,8 +263,11 @@ class Ticker:
             self._failed()
         else:
             self._failures_in_a_row = 0
-        self.work.record(self._clock() - now)
+        work_s = self._clock() - now
+        self.work.record(work_s)
         self.ticks += 1
+        if work_s * self._schedule.rate > 1:
+            self.overruns += 1
 
     def _failed(self) -> None:
         self.failures += 1

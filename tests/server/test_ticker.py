@@ -278,3 +278,12 @@ def test_a_paused_ticker_has_no_alarm_until_it_is_resumed() -> None:
     ticker.stop()
     ticker.resume(0.0)
     assert len(made) == 1
+
+
+def test_ticks_that_take_longer_than_the_time_between_two_are_counted() -> None:
+    bench = Bench(work_s=PERIOD)
+    bench.run(3)
+    assert bench.ticker.overruns == 0
+    bench.work_s = 1.5 * PERIOD
+    bench.run(2)
+    assert bench.ticker.overruns == 2

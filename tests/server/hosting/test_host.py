@@ -328,3 +328,23 @@ def _descriptors() -> int:
 def _mappings() -> int:
     path = Path("/proc/self/maps")
     return path.read_text().count("memfd:terrain") if path.exists() else 0
+
+
+def test_a_world_whose_ticks_take_too_long_is_reported_by_name(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    bench = Bench(tmp_path, PLAIN)
+    for name in ("slow", "quick"):
+        bench.worlds.create("plain", name=name)
+    ticker = bench.host.running["slow"].ticker
+    ends = iter([0.05, 1.01])
+    ticker._clock = lambda: next(ends)
+    with caplog.at_level(logging.WARNING):
+        ticker._run(0.0, 0.0)  # takes 50 ms
+        ticker._run(1.0, 1.0)  # takes 10 ms
+        bench.host.look_after()
+        bench.host.look_after()
+    (record,) = caplog.records
+    assert record.getMessage().startswith("the world slow: 1 ticks in a second took longer")
+    assert bench.host.running["slow"].figures()["ticks_overrun"] == 1
+    bench.close()
