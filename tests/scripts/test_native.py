@@ -34,7 +34,7 @@ def test_a_match_comes_to_the_same_figures(tmp_path: Path) -> None:
 
     def figures(root: Path, preset: str) -> dict[str, Any]:
         told = tmp_path / "told.json"
-        match = ("--preset", preset, "--clients", "8", "--minutes", "1", "--seed", "3", "--no-league")
+        match = ("--preset", preset, "--clients", "3", "--minutes", "0.5", "--seed", "3", "--no-league")
         run(root, str(root / "scripts" / "netlab.py"), *match, "--json", str(told))
         found: dict[str, Any] = json.loads(told.read_text("utf-8"))["presets"][preset]
         assert found.pop("simulated_s_per_cpu_s") > 0
