@@ -233,7 +233,14 @@ class Server:
             rate = self.game.scene.tick_rate
             if self.store is not None:
                 self.store.start(self.game.keep)
-            self.ticker = Ticker(rate, self.game.tick, self._broken, lambda ring: best_alarm(loop, ring), self.faults)
+            self.ticker = Ticker(
+                rate,
+                self.game.tick,
+                self._broken,
+                lambda ring: best_alarm(loop, ring),
+                self.faults,
+                yields=self._declared is not None,
+            )
             self.watchdog = Watchdog(loop)
             tasks = Tasks(loop, self.settings.limits.load_s)
             self.game.joining.run = tasks.run

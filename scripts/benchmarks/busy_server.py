@@ -184,7 +184,7 @@ class Stopwatch:
     def __init__(self, game: Game) -> None:
         self.ticks, self.before_step, self.collections = Histogram(), Histogram(), Histogram()
         self._plain_tick, self._plain_step = game.tick, game.world.step
-        cast("Any", app).Ticker = lambda rate, tick, *more: Ticker(rate, self._tick, *more)
+        cast("Any", app).Ticker = lambda rate, tick, *more, **options: Ticker(rate, self._tick, *more, **options)
         self._tick_began = self._collection_began = 0.0
         self.full_collection_s: float | None = None
         """CPU time of the collection that SIGUSR1 requested, in seconds; None until it is done."""

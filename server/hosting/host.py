@@ -1,10 +1,11 @@
 """The host of the worlds of one process: makes their games, runs their ticks, and keeps their files.
 
-Theory of operation. Each world has a ticker of its own, so a tick that takes long or raises delays no other world by
-more than its own time. The tickers' deadlines are spread over the tick's time. A world that rests has no timer. A world
-of which `FAILURES_MAX` ticks in a row have failed ends alone. Terrain is generated once for each scene, before the
-first world needs it. Files of worlds that have ended are closed and removed in other threads, because a disk may be
-slow; only the beginning of a saved world waits for its disk.
+Theory of operation. Each world has a ticker of its own, and the deadlines are spread over the tick's time. A tick that
+takes longer than the time between two delays other worlds by its own time at most, because its world then waits as
+long, and they catch up. A world that rests has no timer. A world of which `FAILURES_MAX` ticks in a row have failed
+ends alone. Terrain is generated once for each scene, before the first world needs it. Threads make the files of new
+worlds, and close and remove those of worlds that have ended, because a disk may be slow. Only a saved world that comes
+back is read at once.
 """
 
 import asyncio
@@ -213,6 +214,7 @@ class WorldHost:
             lambda ring: best_alarm(self._loop, ring),
             game.faults,
             paused=True,
+            yields=True,
         )
         running = RunningWorld(world, game, ticker)
         folder = settings.worlds[kind.name].record

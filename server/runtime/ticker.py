@@ -167,6 +167,8 @@ class Ticker:
         faults: where ticks that raise are reported.
         clock: returns the current time in seconds.
         paused: whether no tick runs before `resume`.
+        yields: whether a tick that takes longer than the time between two is followed by as much time for others, such
+            as the tickers of other worlds. Otherwise the next tick runs as soon as the event loop has run once.
     """
 
     def __init__(
@@ -179,6 +181,7 @@ class Ticker:
         clock: Callable[[], float] = time.monotonic,
         *,
         paused: bool = False,
+        yields: bool = False,
     ) -> None:
         self.lateness = Histogram()
         self.work = Histogram()
@@ -195,6 +198,7 @@ class Ticker:
         self._clock = clock
         self._failures_in_a_row = 0
         self._make_alarm = alarm
+        self._yields, self._not_before = yields, -math.inf
         self._alarm: Alarm | None = None
         self._schedule = Schedule(rate, clock())
         if not paused:
@@ -249,7 +253,7 @@ class Ticker:
         if deadline is not None:
             self._run(deadline, now)
         if self._alarm is not None:
-            self._alarm.set(self._schedule.deadline)
+            self._alarm.set(max(self._schedule.deadline, self._not_before))
 
     def _run(self, deadline: float, now: float) -> None:
         self.latest = now
@@ -268,6 +272,8 @@ class Ticker:
         self.ticks += 1
         if work_s * self._schedule.rate > 1:
             self.overruns += 1
+            if self._yields:
+                self._not_before = now + 2 * work_s
 
     def _failed(self) -> None:
         self.failures += 1

@@ -287,3 +287,45 @@ def test_ticks_that_take_longer_than_the_time_between_two_are_counted() -> None:
     bench.work_s = 1.5 * PERIOD
     bench.run(2)
     assert bench.ticker.overruns == 2
+
+
+def test_a_world_with_long_ticks_delays_another_by_one_of_its_ticks_at_most_and_costs_it_none() -> None:
+    now = 0.0
+    waiting: dict[Callable[[], None], float] = {}
+    works = {"slow": 3 * PERIOD, "quick": PERIOD / 64}
+
+    class Loop:
+        """A timer of a simulated event loop, which calls the function whose time is the earliest."""
+
+        def __init__(self, ring: Callable[[], None]) -> None:
+            self.ring = ring
+
+        def set(self, at: float) -> None:
+            waiting[self.ring] = at
+
+        def close(self) -> None:
+            waiting.pop(self.ring, None)
+
+    def tick_of(name: str) -> Callable[[float, float], None]:
+        def tick(deadline: float, began: float) -> None:
+            nonlocal now
+            now += works[name]
+
+        return tick
+
+    tickers = {
+        name: Ticker(RATE, tick_of(name), lambda: None, Loop, clock=lambda: now, paused=True, yields=True)
+        for name in works
+    }
+    for phase, ticker in enumerate(tickers.values()):
+        ticker.resume(phase / 2)
+    while now < 20.0:
+        ring = min(waiting, key=waiting.__getitem__)
+        now = max(now, waiting.pop(ring))
+        ring()
+    slow, quick = tickers["slow"], tickers["quick"]
+    assert quick.lateness.max_s <= works["slow"] + 4 * works["quick"]
+    assert quick.skipped_s == 0.0
+    assert quick.ticks >= 20.0 * RATE - 4
+    assert slow.overruns == slow.ticks > 20.0 * RATE / 7
+    assert slow.skipped_s > 15.0

@@ -49,7 +49,7 @@ class Server:
 
     async def until_stopped(self) -> str:
         async with asyncio.timeout(LONG_S):
-            while not self.stopped:  # noqa: ASYNC110 - the server is not told of anything else
+            while not self.stopped:  # noqa: ASYNC110 - a function is called, no event is set
                 await asyncio.sleep(0.005)
         return self.stopped[0]
 
