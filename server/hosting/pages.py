@@ -61,13 +61,12 @@ class WorldPages:
 
     def __init__(self, worlds: Worlds, host: WorldHost, *, live: bool) -> None:
         self._worlds, self._host, self._live = worlds, host, live
+        self._lists: dict[str, tuple[float, Page]] = {}
 
     def get(self, request: PageRequest) -> Page | None:
         """Returns the answer to a GET request; None: it is for another page."""
         if request.path == "/worlds":
-            kind = parse_qs(request.query).get("kind", [None])[0]
-            listed = [entry for entry in self._worlds.entries() if kind in (None, entry["kind"])]
-            return json_answer({"worlds": listed})
+            return self._list(parse_qs(request.query).get("kind", [""])[0])
         first, _, rest = request.path[1:].partition("/")
         running = self._host.running.get(first)
         if first != "worlds" and running is None:
@@ -78,6 +77,19 @@ class WorldPages:
             return line(HTTPStatus.FOUND, f"see /{first}/", location=f"/{first}/")
         page = self._index(rest) if running is None else self._of_world(running, rest)
         return page or line(HTTPStatus.NOT_FOUND, f"{request.path}: no such page")
+
+    def _list(self, kind: str) -> Page:
+        """Returns the list of the public worlds, all or those of a kind.
+
+        It is made anew ten times per second at most, because everybody may ask for it.
+        """
+        if kind and kind not in self._worlds.kinds:
+            return json_answer({"worlds": []})
+        now = self._worlds.now
+        if kind not in self._lists or self._lists[kind][0] != now:
+            listed = [entry for entry in self._worlds.entries() if kind in ("", entry["kind"])]
+            self._lists[kind] = now, json_answer({"worlds": listed})
+        return self._lists[kind][1]
 
     def metrics(self) -> Iterator[Metric]:
         """Yields the metrics of the worlds, and those of each world that ticks, with its name and kind as labels."""

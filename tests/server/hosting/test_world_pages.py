@@ -63,6 +63,24 @@ def test_everybody_sees_the_public_worlds(reader: Reader) -> None:
     assert reader.json("/worlds?kind=none", trusted=False) == {"worlds": []}
 
 
+def test_the_list_is_made_anew_ten_times_per_second_at_most(reader: Reader, monkeypatch: pytest.MonkeyPatch) -> None:
+    reader.worlds.create("plain", name="a")
+    entries, calls = reader.worlds.entries, list[int]()
+
+    def counted() -> list[dict[str, Any]]:
+        calls.append(1)
+        return entries()
+
+    monkeypatch.setattr(reader.worlds, "entries", counted)
+    for _ in range(3):
+        for _ in range(100):
+            assert len(reader.json("/worlds", trusted=False)["worlds"]) == 1
+            assert len(reader.json("/worlds?kind=plain", trusted=False)["worlds"]) == 1
+            assert reader.json("/worlds?kind=nothing", trusted=False)["worlds"] == []
+        reader.pass_s(0.1)
+    assert len(calls) == 6
+
+
 def test_those_who_may_see_private_pages_see_all_worlds_without_codes(reader: Reader) -> None:
     code = reader.worlds.create("plain", {"mode": "2v2"}, name="a", private=True).code
     reader.join(f"/{reader.worlds.seat('a', '', None, '').path[1:]}", "Ann")
