@@ -35,7 +35,6 @@ class SavedWorld(NamedTuple):
     code: str
     locked: bool
     asleep: bool
-    stays: bool
 
 
 class WorldFiles:

@@ -92,7 +92,7 @@ class WorldHost:
             closing.result()
         before = self._saved.get(world.name)
         if before is not None:
-            world.locked, world.stays = before.locked, before.stays
+            world.locked = before.locked
         token = WORLD.set(world.name)
         try:
             with contextlib.ExitStack() as undo:
@@ -300,4 +300,4 @@ class WorldHost:
 
 def _state_of(world: HostedWorld, *, asleep: bool = False) -> SavedWorld:
     """Returns what `world.json` of a world is to have."""
-    return SavedWorld(world.kind.name, dict(world.properties), world.code, world.locked, asleep, world.stays)
+    return SavedWorld(world.kind.name, dict(world.properties), world.code, world.locked, asleep)

@@ -46,6 +46,7 @@ WORLD_COUNTERS = {
     "skipped_s": "Seconds of dropped ticks of a world.",
     "tick_work_s": "Seconds that the ticks of a world took.",
     "rules_failed": "Exceptions in the rules of a world.",
+    "internal_errors": "Exceptions in the server that cost a client, a command or a tick of a world.",
 }
 """Counters of each world that ticks, by the name of the figure, with their help texts."""
 
@@ -145,7 +146,7 @@ def _row(running: RunningWorld) -> dict[str, Any]:
         "entities": len(game.world),
         "tick_work_ms": ticker.work.quantile_ms(0.99),
         "ticks_overrun": ticker.overruns,
-        "failures": ticker.failures + game.counters.rules_failed,
+        "failures": running.internal_errors + game.counters.rules_failed,
     }
 
 

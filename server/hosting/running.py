@@ -40,7 +40,13 @@ class RunningWorld:
         """Returns the figures of the world."""
         own = {"world": self.world.name, "kind": self.world.kind.name, "ticking": self.world.ticking}
         more = {} if self.store is None else self.store.stats()
-        return {**own, **self.game.stats(), **self.ticker.stats(), **more}
+        errors = {"ticks_overrun": self.ticker.overruns, "internal_errors": self.internal_errors}
+        return {**own, **self.game.stats(), **self.ticker.stats(), **more, **errors}
+
+    @property
+    def internal_errors(self) -> int:
+        """Number of exceptions in our own code."""
+        return self.game.faults.total + (0 if self.store is None else self.store.faults.total)
 
     def overran(self) -> int:
         """Returns the number of ticks since the last call that took longer than the time between two."""
@@ -60,6 +66,7 @@ class RunningWorld:
             "skipped_s": ticker.skipped_s,
             "tick_work_s": ticker.work.sum_s,
             "rules_failed": self.game.counters.rules_failed,
+            "internal_errors": self.internal_errors,
         }
 
     def end_recording(self) -> None:

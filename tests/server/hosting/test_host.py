@@ -198,7 +198,6 @@ def test_a_world_that_ends_takes_its_data_with_it_unless_they_are_kept(tmp_path:
 
     again = Bench(tmp_path, PLAIN + KEEPING, data)
     assert ([*again.worlds.asleep], [*again.worlds.worlds]) == (["kept"], ["other"])
-    assert again.worlds.worlds["other"].stays
     assert again.worlds.coded(code).name == "kept"
     assert again.game("kept").world.state_hash() == changed
     again.worlds.end("kept", "an operator says so")
