@@ -224,8 +224,11 @@ class Directory:
         """
         self.now = now
         self.seats.expire(now)
-        for world in tuple(self.worlds.values()):
-            self._look_after(world, now)
+        for world in tuple(
+            self.worlds.values()
+        ):  # nothing can become of a world that rests before it is empty for long
+            if world.ticking or world.ending is not None or now - world.used_at >= world.kind.empty_s:
+                self._look_after(world, now)
 
     def path(self, world: HostedWorld, subject: str, data: Any) -> str:
         """Reserves a seat in a world. Returns the path at which a client takes it."""
