@@ -14,6 +14,7 @@ import pytest
 
 from scripts.benchmarks.peers import figures, install, proxy, rig
 from scripts.benchmarks.peers.figures import Logs
+from scripts.benchmarks.server import RigError
 
 ROOT = Path(__file__).resolve().parent.parent.parent
 needs_linux = pytest.mark.skipif(sys.platform != "linux", reason="the generator polls with epoll")
@@ -245,6 +246,28 @@ def test_without_npm_the_command_says_so_and_ends_with_2(
     assert app.main(["peers", "--quick", "--json", str(out)]) == 2
     assert "error: npm is not installed" in capsys.readouterr().err
     assert not out.exists()
+
+
+@needs_linux
+def test_a_run_that_fails_leaves_the_others(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from scripts.benchmarks import app
+    from scripts.benchmarks.peers import app as peers
+
+    def cheat(side: str, *_: object) -> figures.Figures:
+        if side == "for..of":
+            raise RigError("it does not answer")
+        return {"speed": 1.0}
+
+    monkeypatch.setattr(install, "ensure", lambda: "node")
+    monkeypatch.setattr(peers, "cheat", cheat)
+    out = tmp_path / "out.json"
+    assert app.main(["peers", "--only", "two inputs", "--json", str(out)]) == 2
+    assert "two inputs per step: for..of: it does not answer" in capsys.readouterr().err
+    assert [run["side"] for run in json.loads(out.read_text("utf-8"))["runs"]] == ["ours", "next()"]
+    assert app.main(["peers", "--only", "nothing like this"]) == 2
+    assert "--only = 'nothing like this': no scenario" in capsys.readouterr().err
 
 
 # -- with Colyseus -----------------------------------------------------------------------------------------

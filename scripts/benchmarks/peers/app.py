@@ -13,6 +13,7 @@ from rich.table import Table
 
 from scripts.benchmarks.peers import figures, install
 from scripts.benchmarks.peers.rig import OURS, SIDES, Rig, Window
+from scripts.benchmarks.server import RigError
 
 
 class Lengths(NamedTuple):
@@ -121,12 +122,21 @@ def run(args: argparse.Namespace, console: Console) -> tuple[dict[str, Any], int
         return {}, 2
     lengths = QUICK if args.quick else Lengths(warm_up_s=args.warm_up, window_s=args.seconds)
     chosen = {name: measure for name, measure in scenarios(lengths, node).items() if not args.only or args.only in name}
+    if not chosen:
+        print(f"error: --only = {args.only!r}: no scenario has this in its name", file=sys.stderr)
+        return {}, 2
     runs: list[dict[str, Any]] = []
+    failed = 0
     for number in range(args.runs):
         for scenario, measure in chosen.items():
             for side in SIDES:
                 load = os.getloadavg()[0]
-                found = measure(side, number + 1)
+                try:
+                    found = measure(side, number + 1)
+                except RigError as error:  # the other runs count
+                    failed += 1
+                    print(f"error: {scenario}: {side}: {error}", file=sys.stderr)
+                    continue
                 runs.append({"scenario": scenario, "side": side, "run": number + 1, "load": load, "figures": found})
                 text = f"  run {number + 1}: {scenario}: {side} (load of the machine before: {load:.1f})"
                 console.print(text, highlight=False, soft_wrap=True)
@@ -136,7 +146,7 @@ def run(args: argparse.Namespace, console: Console) -> tuple[dict[str, Any], int
     console.print("Ours is behind, in every run and by more than 5 %:" if lines else "Ours is behind in no figure.")
     for line in lines:
         console.print(f"  {line}", highlight=False, soft_wrap=True)
-    return {"lengths": lengths._asdict(), "machine": machine(), "runs": runs, "behind": lines}, 0
+    return {"lengths": lengths._asdict(), "machine": machine(), "runs": runs, "behind": lines}, 2 if failed else 0
 
 
 def table(scenario: str, runs: list[dict[str, Any]]) -> Table:

@@ -63,8 +63,8 @@ def _npm(place: Path, npm: str) -> None:
     except subprocess.TimeoutExpired:
         raise PeersError(f"npm has not finished within {TIME_S:g} s; is the network there?") from None
     if done.returncode != 0:
-        last = "\n".join(done.stdout.strip().splitlines()[-8:])
-        raise PeersError(f"npm could not install the pinned packages; is the network there?\n{last}")
+        why = "\n".join(done.stdout.strip().splitlines()[:6])
+        raise PeersError(f"npm could not install the pinned packages; is the network there?\n{why}")
 
 
 def _node(place: Path) -> str:
