@@ -26,6 +26,8 @@ LOOK_S = 0.1
 """Seconds between two looks at the worlds: who gets a seat, which rest, which end."""
 FILES_LOOKS = 10
 """Number of such looks between two at what is to be saved beside the stores."""
+TOO_OFTEN = "too many requests for a world from your address; wait some seconds"
+"""Reason for a client whose address asks for worlds too often."""
 STOPPING = "the server is about to stop"
 
 logger = logging.getLogger(__name__)
@@ -108,7 +110,9 @@ class Hosting:
             retry = str(max(1, round(self._settings.restart_s)))
             return line(HTTPStatus.SERVICE_UNAVAILABLE, STOPPING, retry_after=retry)
         exempt = limits.loopback_exempt and is_loopback(address)
-        found = self.worlds.route(target, "" if exempt else network_of(address))
+        if not exempt and not self.worlds.may_ask(target, network_of(address)):
+            return line(HTTPStatus.TOO_MANY_REQUESTS, TOO_OFTEN, retry_after="2")
+        found = self.worlds.route(target)
         return line(HTTPStatus.NOT_FOUND, found) if isinstance(found, str) else found
 
     def page(self, request: PageRequest) -> Page | None:

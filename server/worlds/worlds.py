@@ -69,13 +69,20 @@ class Worlds(Directory):
         if default is not None:
             default.api.hosting = RulesWorlds(self, None)
 
-    def route(self, target: str, address: str = "") -> Way | str:
-        """Returns what the path of a WebSocket request leads to, or the reason why it leads nowhere.
+    def may_ask(self, target: str, address: str) -> bool:
+        """Returns whether an address may send a request now; those for a world, by the lobby, have a limit.
 
         Args:
-            target: path and query.
-            address: the client's address, by which requests are limited; empty: they are not.
+            target: path and query of the request.
+            address: the client's address, or its network.
         """
+        if target.partition("?")[0].strip("/") not in VERBS or self._limit(address).take(self.now):
+            return True
+        self.counts["refused_often"] += 1
+        return False
+
+    def route(self, target: str) -> Way | str:
+        """Returns what the path and query of a WebSocket request lead to, or the reason why they lead nowhere."""
         path, _, query = target[:PATH_MAX].partition("?")
         name = path.strip("/")
         seated = query.startswith("seat=")
@@ -83,9 +90,6 @@ class Worlds(Directory):
             return self.default or NO_DEFAULT
         try:
             if name in VERBS:
-                if address and not self._limit(address).take(self.now):
-                    self.counts["refused_often"] += 1
-                    return "too many requests from your address; wait some seconds"
                 return _LobbyWay(self.lobby, Request(name, query))
             world = self.get(name) if name else None
             game = self.default if world is None else world.game

@@ -80,8 +80,8 @@ async def test_requests_of_an_address_are_limited_but_not_those_of_this_machine(
     server = Server(tmp_path, PLAIN + "[limits]\nasks_per_s = 0.01\n")
     for address in ("1.2.3.4", "2001:db8::1"):
         assert not isinstance(server.route("/match?kind=plain", address), Page)
-        assert refused(server.route("/match?kind=plain", address))[0] == 404
-    assert refused(server.route("/match?kind=plain", "2001:db8::2"))[0] == 404, "one customer has a whole network"
+        assert refused(server.route("/match?kind=plain", address))[0] == 429
+    assert refused(server.route("/match?kind=plain", "2001:db8::2"))[0] == 429, "one customer has a whole network"
     assert not isinstance(server.route("/match?kind=plain", "1.2.3.5"), Page)
     for _ in range(50):
         assert not isinstance(server.route("/match?kind=plain"), Page)

@@ -51,7 +51,7 @@ class Peer:
         self.unread = 0
         """Bytes that have not reached the client, as the server sees it."""
         self.refused = ""
-        way = server.worlds.route(path, "")
+        way = server.worlds.route(path)
         self.way: Any = None
         self.session: Any = None
         if isinstance(way, str):

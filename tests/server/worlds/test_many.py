@@ -119,11 +119,11 @@ def test_a_flood_of_requests_is_bounded() -> None:
     server = Server(kind(), limits=Limits(worlds_max=50, creations_per_s=2, asks_per_s=1))
     answers = Counter[str]()
     for _ in range(200):
-        way = server.worlds.route("/create?kind=arena", "192.0.2.7")
-        answers["refused" if isinstance(way, str) else "open"] += 1
+        answers["open" if server.worlds.may_ask("/create?kind=arena", "192.0.2.7") else "refused"] += 1
     assert answers == {"open": 10, "refused": 190}
+    assert server.worlds.may_ask("/arena-1?seat=x", "192.0.2.7")
     for number in range(5000):  # more addresses than are counted
-        server.worlds.route("/join?code=AAAAAA", f"2001:db8:{number:x}::1")
+        server.worlds.may_ask("/join?code=AAAAAA", f"2001:db8:{number:x}::1")
     assert len(server.worlds._asked) <= 4096
     peers = [server.peer("/create?kind=arena") for _ in range(100)]
     made = [peer for peer in peers if peer.over == (1000, "")]
