@@ -364,7 +364,7 @@ def test_the_digest_is_of_the_code_that_runs_and_not_of_a_file_that_changes_late
 @pytest.mark.parametrize(("seed", "ticks"), [(1, 120), *long(*((seed, 1_500) for seed in range(2, 8)))])
 def test_boxes_and_blocks_put_into_each_other_have_one_result_in_any_order_of_the_inputs(seed: int, ticks: int) -> None:
     (fast, ids), (plain, _), (other, _) = (piled(6, compiled=compiled) for compiled in (True, False, True))
-    rng, pressers = random.Random(seed), [Presser(5) for _ in range(6)]
+    rng, pressers, most = random.Random(seed), [Presser(5) for _ in range(6)], 0
     for tick in range(ticks):
         inputs = {entity: presser.next(rng) for entity, presser in zip(ids, pressers, strict=True)}
         if tick % 7 == 0:
@@ -374,4 +374,5 @@ def test_boxes_and_blocks_put_into_each_other_have_one_result_in_any_order_of_th
         other.step({entity: inputs[entity] for entity in shuffled(rng, ids)})
         assert fast.state_hash() == plain.state_hash() == other.state_hash(), tick
         assert failures(fast) == []
-    assert len(fast) > 6
+        most = max(most, len(fast))
+    assert most > 6
