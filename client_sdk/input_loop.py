@@ -127,6 +127,18 @@ class InputLoop:
             return self.restart(now, BEHIND if ticks < 0 else AHEAD)
         return []
 
+    def prepare(self, snapshot: Snapshot, now: float) -> None:
+        """Learns arrival margins from a second connection, so that inputs are in time over it, too."""
+        one, newest, margins = self._bounds.margin_one, snapshot.newest, snapshot.margins
+        for tick, (margin,) in enumerate(iter_unpack("<h", margins), newest + 1 - len(margins) // 2):
+            phase = self._phases.get(tick)
+            if phase is not None and margin != MARGIN_REFUSED and self._settling is None:
+                self._lead.observe(tick, margin / one, phase, now)
+
+    def change_over(self) -> None:
+        """Notes that a second connection has taken over: input statuses of the first may have been lost."""
+        self._late = True
+
     def answered(self, sent: float) -> None:
         """Notes that a ping sent at `sent` was answered, so the server has received everything sent before it."""
         if self._settling is not None and sent > self._settling:

@@ -50,6 +50,11 @@ class Roster:
         return InputQueue(self._bounds, self._world.scene.input_row_bytes)
 
     @property
+    def players(self) -> dict[int, Player]:
+        """Players by entity."""
+        return self._api.players
+
+    @property
     def connected(self) -> int:
         """Number of players with a connection, including connections whose loss has not been noticed yet."""
         return sum(player.session is not None for player in self._api.players.values())

@@ -43,6 +43,8 @@ class Session:
         """Times in seconds: when the connection opened, and when the latest message arrived."""
         self.allowance = 0.0
         """Number of messages that the client may send besides a full burst. Negative: the used part of the burst."""
+        self.beside = False
+        """Whether this is the second connection of a client that plays over another one (`server.scale`)."""
         self.closed = False
         self.resynced_at = now
         """Time in seconds of the client's latest request to get everything anew."""

@@ -54,6 +54,11 @@ class Outbox:
         """Notes that the player has reconnected, so events on their way may be lost."""
         self._unsure = True
 
+    def begin(self, number: int) -> None:
+        """Drops all events, because another process has sent them. The next one has a number."""
+        self._waiting.clear()
+        self._next, self._unsure = number, True
+
     def take(self, complete_tick: int, room: int) -> list[bytes]:
         """Takes the messages to send now, and returns them.
 

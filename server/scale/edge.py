@@ -29,7 +29,7 @@ from server.players.input_queue import InputQueue
 from server.players.player import Player
 from server.rules import Rules
 from server.scale.replica import Replica
-from server.scale.wire import COMMAND, GONE, JOIN, KNOWS, LEAVE, LOST, Batch, Record, rows
+from server.scale.wire import COMMAND, GONE, JOIN, KNOWS, LEAVE, LOST, SWITCH, Batch, Record, rows
 from shared import fields, messages
 from shared.bounds import Bounds, bounds
 from shared.inputs import Input
@@ -54,13 +54,21 @@ class EdgeInputs(InputQueue):
         if resumed:
             self.statuses.append(REPEATED)  # for the tick of the seat
         self._taken: dict[int, int] = {}
+        self.takes = IDLE
+        """Status of the newest tick that was taken."""
+        self.switching = False
+        """Whether the change of the player to this edge was asked for."""
         self.sent: Input | None = None
         """The input in the latest batch that had one."""
 
     def take(self, tick: int) -> Input:
         input_ = super().take(tick)
-        self._taken[tick] = self.statuses.pop()
+        self.takes = self._taken[tick] = self.statuses.pop()
         return input_
+
+    def skip(self, tick: int) -> None:
+        """Drops the status of a tick for which another edge had the input."""
+        self._taken.pop(tick, None)
 
     def confirm(self, tick: int, missing: int) -> None:
         """Files the status of a tick whose record has come.
@@ -88,6 +96,8 @@ class EdgeRoster:
         self.requests: list[list[Any]] = []
         self.clients: dict[Session, int] = {}
         """Clients that have asked to join, with their numbers."""
+        self.mine: set[int] = set()
+        """Players whose latest connection was one to this edge."""
 
     def lost(self, session: Session, now: float) -> None:
         """Reports a lost connection."""
@@ -102,6 +112,8 @@ class EdgeRoster:
 
     def _report(self, kind: int, session: Session) -> None:
         client = self.clients.pop(session, None)
+        if session.beside and session.player is not None:
+            self.mine.discard(session.player.entity)
         if client is not None:
             self.requests.append([kind, client])
         if session.player is not None and session.player.session is session:
@@ -158,6 +170,7 @@ class EdgeServer(Front):
         self._unrecorded: deque[Batch] = deque()
         self._next, self._before = 0, -1
         self._tokens: dict[int, bytes] = {}
+        self._mine = self._roster.mine
         self._known: set[Session] = set()
         self._scene_table = self.scene.to_table()
 
@@ -189,6 +202,9 @@ class EdgeServer(Front):
             queue = session.inputs
             assert isinstance(queue, EdgeInputs)
             input_ = queue.take(tick)
+            if session.beside and not queue.switching and queue.takes == USED:
+                queue.switching = True
+                requests.append([SWITCH, client])
             if input_ != queue.sent:
                 queue.sent = input_
                 inputs += input_record(player.entity, input_, aim=self.scene.aim)
@@ -216,9 +232,10 @@ class EdgeServer(Front):
             session.received_at = session.stream.sent_at = now
             self._next += 1
             client = self._roster.clients[session] = self._next
-            token = self._tokens[client] = secrets.token_bytes(fields.RESUME_BYTES)
+            token = hello.resume if session.beside else secrets.token_bytes(fields.RESUME_BYTES)
+            self._tokens[client] = token
             resume = digest_of(hello.resume) if hello.resume else b""
-            request = [JOIN, client, hello.name, session.subject, resume, digest_of(token)]
+            request = [JOIN, client, hello.name, session.subject, resume, digest_of(token), session.beside]
             self._roster.requests.append(request)
 
     # -- from the log --------------------------------------------------------------------------------------
@@ -239,9 +256,16 @@ class EdgeServer(Front):
         newest = replica.batches.get(self.name, -1)
         while self._unrecorded and self._unrecorded[0].number <= newest:
             self._unrecorded.popleft()
+        seated = rows(record.seated, 4)
+        switched = {client for edge, client, _, beside in seated if edge == self.name and not beside}
         for session in self._roster.clients:
-            if isinstance(session.inputs, EdgeInputs) and session.player is not None:
-                session.inputs.confirm(record.tick, record.tick - newest)
+            inputs = session.inputs
+            if isinstance(inputs, EdgeInputs) and session.player is not None:
+                session.beside = session.beside and self._roster.clients[session] not in switched
+                if session.beside:
+                    inputs.skip(record.tick)
+                else:
+                    inputs.confirm(record.tick, record.tick - newest)
         self.commands.newest = max(self.commands.newest, self.world.tick)
         self._seat(record, known, now)
         self._half.follow(replica.outcome)
@@ -249,12 +273,12 @@ class EdgeServer(Front):
         if replica.shared_changed:
             replica.shared_changed = False
             self._values.renew()
-        self._forget_others()
         self.clocks.refill()
         self._send(self._values, now)
         for edge, client, code, reason in rows(record.ended, 4):
             if edge == self.name and code != GONE:
                 self._end(client, code, reason)
+        self._forget_others()
         self.clocks.check(now)
         return False
 
@@ -266,21 +290,33 @@ class EdgeServer(Front):
             known: the players before it.
             now: the current time in seconds.
         """
+        fresh: dict[int, int] = {}
+        for to, _ in self.replica.outcome.events:
+            for entity in self.players if to is None else to:
+                fresh[entity] = fresh.get(entity, 0) + 1
         clients = {client: session for session, client in self._roster.clients.items()}
-        for edge, client, entity in rows(record.seated, 3):
+        for edge, client, entity, beside in rows(record.seated, 4):
             player = self.players.get(entity)
-            if player is None:
+            if player is None or (beside and edge != self.name):
                 continue
             if edge != self.name:
                 player.session = None
+                self._mine.discard(entity)
                 continue
+            begins = entity not in self._mine
+            self._mine.add(entity)
             session, token = clients.get(client), self._tokens.pop(client, b"")
-            if session is None or session.closed:
-                continue
+            if session is None or session.closed or session is player.session:
+                continue  # it is gone, or was seated beside its other connection before
             held = held_input(self.world, entity)
-            player.inputs = EdgeInputs(self._bounds, self._row_bytes, held, resumed=entity in known)
+            resumed = entity in known and not beside
+            player.inputs = EdgeInputs(self._bounds, self._row_bytes, held, resumed=resumed)
+            if player.session is not None:
+                self._roster.clients.pop(player.session, None)
             player.commands.clear()
             player.outbox.reconnect()
+            if begins:
+                player.outbox.begin(self.replica.events.get(entity, 0) - fresh.get(entity, 0))
             session.loading = False
             session.seat(player)
             session.received_at = session.stream.sent_at = now
@@ -289,9 +325,10 @@ class EdgeServer(Front):
             session.greeting = (record.tick, welcome)
 
     def _forget_others(self) -> None:
-        """Drops verdicts for players without a client here; an edge that seats them later has them as settled."""
-        for player in self.players.values():
-            if player.session is None and player.verdicts:
+        """Drops events and verdicts for players of other edges. An edge that seats them later has these as settled."""
+        for entity, player in self.players.items():
+            if entity not in self._mine and (player.verdicts or len(player.outbox)):
+                player.outbox.begin(0)
                 player.verdicts.clear()
 
     def _end(self, client: int, code: int, reason: str) -> None:

@@ -7,6 +7,7 @@ from server.game.roster import Roster
 from server.game.session import Session
 from server.players.input_queue import InputQueue
 from server.players.player import Player
+from shared import messages
 from shared.bounds import Bounds
 from shared.inputs import NEUTRAL, Input
 
@@ -78,4 +79,24 @@ class RemoteJoining(Joining):
     def _admit(self, session: Session, player: Player) -> None:
         assert isinstance(session.link, RemoteLink)
         self._roster.issue(player)
-        self.seated += (session.link.edge, session.link.client, player.entity)
+        self.seated += (session.link.edge, session.link.client, player.entity, False)
+
+    def seat_beside(self, session: Session, resume: bytes) -> bool:
+        """Lets a client prepare a change to another edge. Returns whether its player was found.
+
+        The resume token stays valid: the client gets no new one, because it may never see the second welcome.
+
+        Args:
+            session: its second session.
+            resume: digest of its resume token.
+        """
+        assert isinstance(session.link, RemoteLink)
+        players = self._roster.players.values() if resume else ()
+        player = next((each for each in players if resume in each.tokens and each.subject == session.subject), None)
+        home = None if player is None or player.session is None else player.session.link
+        if player is None or not isinstance(home, RemoteLink) or home.edge == session.link.edge:
+            self._connections.refuse(session, messages.GOING_AWAY, "there is no player who can change over")
+            return False
+        session.player = player
+        self.seated += (session.link.edge, session.link.client, player.entity, True)
+        return True

@@ -36,6 +36,10 @@ class Replica:
         """Newest batch of each edge in the newest record."""
         self.homes: dict[int, tuple[str, int]] = {}
         """Edge and client of each player's latest connection."""
+        self.events: dict[int, int] = {}
+        """Number of game events for each player so far."""
+        self.beside: dict[tuple[str, int], int] = {}
+        """Players of the clients that prepare a change to another edge, by that edge and its client."""
         self.outcome = Outcome()
         """Outcome of the newest record; the caller clears it."""
         self.shared_changed = False
@@ -48,6 +52,7 @@ class Replica:
         notes = msgpack.unpackb(msgpack.packb(persisted_state.whole(self.kept)), strict_map_key=False)
         other = Replica(world, persisted_state.restored(notes))
         other.epoch, other.batches, other.homes = self.epoch, dict(self.batches), dict(self.homes)
+        other.beside, other.events = dict(self.beside), dict(self.events)
         return other
 
     def take(self, record: Record) -> bool:
@@ -75,11 +80,19 @@ class Replica:
         for entity in record.removed:
             self.kept.attributes.pop(entity, None)
         outcome.events += [(None if to is None else frozenset(to), message) for to, message in record.events]
+        for to, _ in outcome.events:
+            for entity in self.kept.players if to is None else to:
+                self.events[entity] = self.events.get(entity, 0) + 1
         if self.world.turns is not None:
             outcome.announced += self.world.turns.announced
-        for edge, client, entity in rows(record.seated, 3):
-            self.homes[entity] = (edge, client)
+        for edge, client, entity, beside in rows(record.seated, 4):
+            if beside:
+                self.beside[edge, client] = entity
+            else:
+                self.beside.pop((edge, client), None)
+                self.homes[entity] = (edge, client)
         for edge, client, _, _ in rows(record.ended, 4):
+            self.beside.pop((edge, client), None)
             for entity in [entity for entity, home in self.homes.items() if home == (edge, client)]:
                 del self.homes[entity]
         return True
@@ -108,6 +121,7 @@ class Replica:
             self.shared_changed = True
         elif kind == persisted_state.LEFT:
             self.homes.pop(parts[0], None)
+            self.events.pop(parts[0], None)
 
     def settle(self) -> None:
         """Files the verdicts of the newest record with the players. An edge does this by `Answers` instead."""

@@ -25,7 +25,7 @@ from server.rewind import Rewind
 from server.rules import Rules
 from server.scale.remote import BatchInputs, RemoteJoining, RemoteLink, RemoteRoster
 from server.scale.replica import Replica
-from server.scale.wire import COMMAND, GONE, JOIN, KNOWS, LEAVE, LOST, Batch, Record, packed, rows
+from server.scale.wire import COMMAND, GONE, JOIN, KNOWS, LEAVE, LOST, SWITCH, Batch, Record, packed, rows
 from shared import messages
 from shared.bounds import in_ticks
 from shared.messages import Command, Hello
@@ -141,12 +141,17 @@ class WorldSequencer:
             key = (batch.edge, client)
             session = self._sessions.get(key)
             if kind == JOIN and session is None:
-                name, subject, resume, token = parts
+                name, subject, resume, token, beside = parts
                 session = self._sessions[key] = self._open(batch.edge, client, token, now)
                 session.subject = subject
-                session.hello = Hello(messages.VERSION, {}, name, "", resume)
+                if beside:
+                    self._joining.seat_beside(session, resume)
+                else:
+                    session.hello = Hello(messages.VERSION, {}, name, "", resume)
             elif session is None:
                 continue
+            elif kind == SWITCH:
+                self._switch(session)
             elif kind == KNOWS:
                 session.stream.acked = max(session.stream.acked, 0)
             elif kind in (LOST, LEAVE):
@@ -187,6 +192,17 @@ class WorldSequencer:
                 session.close(messages.TOO_SLOW, "the edge was silent")
                 self.connections.lost(session, now)
 
+    def _switch(self, session: Session) -> None:
+        """Makes the second connection of a client the one that counts, and ends the first."""
+        player = session.player
+        assert isinstance(session.link, RemoteLink)
+        if player is None or player.entity not in self.api.players or player.session is session:
+            return
+        if player.session is not None:
+            self.connections.end(player.session, messages.TAKEN_OVER, "the player goes on over another connection")
+        session.seat(player)
+        self._joining.seated += (session.link.edge, session.link.client, player.entity, False)
+
     # -- sessions ------------------------------------------------------------------------------------------
 
     def _open(self, edge: str, client: int, token: bytes, now: float) -> Session:
@@ -203,3 +219,8 @@ class WorldSequencer:
                 session.seat(player)
                 assert isinstance(player.inputs, BatchInputs)
                 player.inputs.latest = held_input(self.world, entity)
+        for (edge, client), entity in replica.beside.items():
+            if entity in self.api.players and edge in self._newest:
+                session = self._sessions[edge, client] = self._open(edge, client, b"", 0.0)
+                session.player = self.api.players[entity]
+                session.subject = session.player.subject

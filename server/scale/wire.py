@@ -3,14 +3,16 @@
 batch     [edge, number, before, inputs, requests]
           number: the tick that the inputs are for   before: number of the edge's batch before; -1: none
           inputs: as in a recording (`server.journal.records`)
-request   [JOIN, client, name, subject, resume, token]
+request   [JOIN, client, name, subject, resume, token, beside]
           resume, token: digests of the presented resume token (empty: none) and of the new one
+          beside: whether the client goes on over another connection until SWITCH   [SWITCH, client]
           [KNOWS, client]   the client has the new token     [LOST, client]   [LEAVE, client]
           [COMMAND, client, number, tick, seen, name, payload, gaps]
 record    [epoch, tick, batches, journal, placed, acted, removed, events, seated, ended]
           batches: edge, newest batch in it, ...   journal: a tick of a recording; nil: the record begins an epoch
           placed, acted, removed: entities   events: [players or nil, message], ...
-          seated: edge, client, player, ...   ended: edge, client, close code (`GONE`: the edge knows), reason, ...
+          seated: edge, client, player, beside, ...   ended: edge, client, code, reason, ...
+          code: the close code; `GONE`: the edge knows
 
 A client is a number that its edge gives to a connection. All of it is MessagePack.
 """
@@ -21,7 +23,7 @@ import msgpack
 
 GONE = 0
 """Close code in a record of a connection that its edge has lost."""
-JOIN, KNOWS, LOST, LEAVE, COMMAND = range(5)
+JOIN, KNOWS, LOST, LEAVE, COMMAND, SWITCH = range(6)
 
 
 class Batch(NamedTuple):

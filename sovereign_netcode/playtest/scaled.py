@@ -15,230 +15,20 @@ from types import MappingProxyType
 from typing import Any, cast
 
 from client_sdk.core import Core
-from client_sdk.netsim.links import Link
+from client_sdk.netsim.links import Link, TcpStream
 from server.config.limits import Limits
 from server.game.session import Session
 from server.journal.recorded_world import RecordedWorld
 from server.players.persisted_state import PersistedState
 from server.rules import Rules, prepared
 from server.scale.edge import EdgeServer
-from server.scale.replica import GapError, Replica
+from server.scale.replica import Replica
 from server.scale.sequencer import WorldSequencer
-from server.scale.wire import Batch, Record, batch_of, packed, record_of
+from server.scale.wire import batch_of
 from server.worlds.host import Way
 from shared.scene import Scene
 from sovereign_netcode.playtest.match import Player, Policy, Simulation
-
-SILENCE_S = 0.25
-"""Seconds without a record after which a standby takes over."""
-LEAD_S = 0.008
-"""Seconds that an edge's deadline is ahead of the sequencer's at first."""
-LEAD_MORE, LEAD_LESS_S, LEAD_S_MAX = 1.5, 0.000002, 0.1
-"""Factor of the lead after a late batch; seconds that it falls per tick; its greatest value in seconds."""
-
-
-class Bus:
-    """A simulated bus with one log.
-
-    Args:
-        match: has the simulated time.
-        seed: source of everything random.
-        delay_s: least time of a message, in seconds.
-        jitter_s: largest additional time, in seconds.
-        stop: about every `stop[0]` seconds, the messages of one pair of parts wait for up to `stop[1]` seconds.
-        twice: share of the messages that come twice.
-    """
-
-    def __init__(
-        self,
-        match: "ScaledMatch",
-        seed: int,
-        *,
-        delay_s: float = 0.001,
-        jitter_s: float = 0.001,
-        stop: tuple[float, float] | None = None,
-        twice: float = 0.0,
-    ) -> None:
-        self._match, self._rng = match, random.Random(seed)
-        self._delay_s, self._jitter_s, self._stop, self._twice = delay_s, jitter_s, stop, twice
-        self._free: dict[tuple[str, str], float] = {}
-        self.log: list[bytes] = []
-        """All records that the log has accepted."""
-        self.refused = 0
-        """Records that the log has refused, because their writer is deposed."""
-        self._last = (0, -1)
-
-    def send(self, source: str, target: str, deliver: Callable[[], None]) -> None:
-        """Delivers a message from one part to another, after the messages before it."""
-        rng, now = self._rng, self._match.now
-        due = now + self._delay_s + rng.random() * self._jitter_s
-        if self._stop is not None and rng.random() < 1 / (self._stop[0] * self._match.rate):
-            due += rng.random() * self._stop[1]
-        for _ in range(2 if rng.random() < self._twice else 1):
-            due = max(due, self._free.get((source, target), 0.0))
-            self._free[source, target] = due
-            self._match.at(due, deliver)
-
-    def hold(self, source: str, target: str, seconds: float) -> None:
-        """Makes all messages from one part to another wait for some time from now on."""
-        self._free[source, target] = self._match.now + seconds
-
-    def append(self, data: bytes, last: tuple[int, int]) -> bool:
-        """Appends a record if `last`, its writer's newest record, is the newest of the log. Returns whether it was."""
-        if last != self._last:
-            self.refused += 1
-            return False
-        record = record_of(data)
-        self._last = (record.epoch, record.tick)
-        self.log.append(data)
-        self._match.publish(data)
-        return True
-
-
-class Part:
-    """A process of the match: it can be killed."""
-
-    def __init__(self, name: str) -> None:
-        self.name = name
-        self.alive = True
-
-
-class SequencerPart(Part):
-    """The sequencer in one process."""
-
-    def __init__(self, match: "ScaledMatch", name: str, core: WorldSequencer, last: tuple[int, int]) -> None:
-        super().__init__(name)
-        self._match, self.core, self._last = match, core, last
-        self._began, self._ticks = match.now, 0
-        self._append(core.begin(), None)
-        self._schedule()
-
-    def _schedule(self) -> None:
-        self._ticks += 1
-        self._match.at(self._began + self._ticks / self._match.rate, self._tick)
-
-    def _tick(self) -> None:
-        if not self.alive:
-            return
-        data, world = self.core.tick(self._match.now), self.core.world
-        hashed = world.state_hash()
-        self._match.bus.send(self.name, "log", lambda: self._append(data, hashed))
-        self._schedule()
-
-    def _append(self, data: bytes, hashed: bytes | None) -> None:
-        """Is called when a record arrives at the log, also after its writer was killed."""
-        record = record_of(data)
-        if (record.epoch, record.tick) <= self._last:
-            return  # it came twice
-        if self._match.bus.append(data, self._last):
-            self._last = (record.epoch, record.tick)
-            if hashed is not None:
-                self._match.seen(self.name, record.tick, hashed)
-        else:
-            self.alive = False  # another one has taken over
-
-
-class Reader(Part):
-    """A process with a replica: an edge or a standby."""
-
-    def __init__(self, match: "ScaledMatch", name: str, replica: Replica) -> None:
-        super().__init__(name)
-        self.match, self.replica = match, replica
-        self.heard_at = match.now
-        self.hashes: dict[int, bytes] = {}
-
-    def receive(self, data: bytes) -> None:
-        """Takes a record, and fetches the ones before it from the log if they are missing."""
-        if not self.alive:
-            return
-        self.heard_at = self.match.now
-        try:
-            self.follow(record_of(data))
-        except GapError:
-            for each in self.match.bus.log:
-                self.follow(record_of(each))
-
-    def follow(self, record: Record) -> None:
-        """Takes a record."""
-        before = self.replica.world.tick
-        self.take(record)
-        if self.replica.world.tick > before:
-            self.match.seen(self.name, self.replica.world.tick, self.replica.world.state_hash())
-
-    def take(self, record: Record) -> None:
-        """Passes a record to the core."""
-        self.replica.take(record)
-        self.replica.settle()
-
-
-class StandbyPart(Reader):
-    """A replica without clients, which takes over if the log falls silent."""
-
-    def __init__(self, match: "ScaledMatch", name: str, replica: Replica, rank: int) -> None:
-        super().__init__(match, name, replica)
-        self._silence_s = SILENCE_S * (1 + rank)
-        self._watch()
-
-    def _watch(self) -> None:
-        if not self.alive:
-            return
-        if self.match.now - self.heard_at > self._silence_s:
-            for each in self.match.bus.log:  # the log's end may be newer than what was delivered
-                self.follow(record_of(each))
-            self.alive = False
-            self.match.take_over(self)
-            return
-        self.match.at(self.match.now + 1 / self.match.rate, self._watch)
-
-
-class EdgePart(Reader):
-    """An edge, with its clock: it follows the arrival of records."""
-
-    def __init__(self, match: "ScaledMatch", name: str, replica: Replica, limits: Limits | None) -> None:
-        super().__init__(match, name, replica)
-        self.core = EdgeServer(name, replica, limits)
-        self.lead_s = LEAD_S
-        self.late = 0
-        """Records that lacked the batch of their tick."""
-        self._phase = -1e9
-
-    def take(self, record: Record) -> None:
-        again = self.core.follow(record, self.match.now)
-        if again:
-            for batch in self.core.unrecorded():
-                self._send(batch)
-            self._phase = -1e9
-        if record.journal is None:
-            return
-        tick, now, rate = record.tick, self.match.now, self.match.rate
-        self._phase = max(self._phase - 1e-5, tick - now * rate)
-        missing = tick - self.replica.batches.get(self.name, tick)
-        self.late += missing > 0
-        self.lead_s = min(max(self.lead_s - LEAD_LESS_S, LEAD_S / 4) * (LEAD_MORE if missing else 1), LEAD_S_MAX)
-        self._schedule()
-
-    def due(self) -> float:
-        """Returns the time of the deadline of the next tick at this edge."""
-        return (self.core.newest + 1 - self._phase) / self.match.rate - self.lead_s
-
-    def _schedule(self) -> None:
-        self.match.at(max(self.due(), self.match.now + 1e-4), self._collect, key=self)
-
-    def _collect(self) -> None:
-        if not self.alive:
-            return
-        due = self.due()
-        if due <= self.match.now + 1e-9:
-            batch = self.core.collect(due, self.match.now)
-            if batch is None:  # the log is silent
-                self.match.at(self.match.now + 1 / self.match.rate, self._collect, key=self)
-                return
-            self._send(batch)
-        self._schedule()
-
-    def _send(self, batch: Batch) -> None:
-        data = packed(batch)
-        self.match.bus.send(self.name, "sequencer", lambda: self.match.deliver(data))
+from sovereign_netcode.playtest.parts import Bus, EdgePart, Part, SequencerPart, StandbyPart
 
 
 class _Dead:
@@ -252,6 +42,8 @@ class Seat(Player):
     """A client of a scaled match, connected to one edge. The path of its connection is the name of an edge."""
 
     match: "ScaledMatch"
+    second: "_Second | None" = None
+    """The second connection, while the client changes to another edge."""
 
     @property
     def edge(self) -> EdgePart | None:
@@ -265,6 +57,83 @@ class Seat(Player):
         if self.session is not None:
             self._way = cast("EdgeServer", _Dead())
             self.disconnect()
+
+    def move(self, edge: EdgePart) -> bool:
+        """Changes to another edge without a pause. Returns whether it has begun."""
+        handover = self.core.begin_handover() if self.session is not None else None
+        if handover is None:
+            return False
+        self.second = _Second(self, edge)
+        return True
+
+    def _update(self) -> None:
+        if self.session is not None and self.session.closed and self.core.state == "reconnecting":
+            self._cut(1006, "closed by the server")
+        super()._update()
+
+    def _flush(self) -> None:
+        super()._flush()
+        if self.second is not None:
+            self.second.flush()
+
+    def take_place(self, second: "_Second") -> None:
+        """Makes the second connection the only one."""
+        if self.session is not None:
+            self._way.lost(self.session, self.match.now)
+        self.up.cut()
+        self.down.cut()
+        self.up, self.down, self._way, self.session = second.up, second.down, second.edge.core, second.session
+        self.closed, self.second = None, None
+
+
+class _Second:
+    """The second connection of a client, to another edge; also the `Link` of that edge."""
+
+    def __init__(self, seat: Seat, edge: EdgePart) -> None:
+        self._seat, self.edge = seat, edge
+        self.up = TcpStream(seat.match, seat.link_events, seat.match.rng.getrandbits(30), self._at_server)
+        self.down = TcpStream(seat.match, seat.link_events, seat.match.rng.getrandbits(30), self._at_client)
+        self.session: Session = edge.core.open(self, seat.match.now)
+        self.session.beside = True
+
+    def send(self, message: bytes) -> None:
+        self.down.send(message)
+
+    def outstanding(self) -> int:
+        return self.down.outstanding()
+
+    def close(self, code: int, reason: str) -> None:
+        if self._seat.session is self.session:
+            self._seat.close(code, reason)
+        else:
+            self.edge.core.lost(self.session, self._seat.match.now)
+
+    def flush(self) -> None:
+        """Sends what the client has for the second connection, or ends it."""
+        seat, handover = self._seat, self._seat.core.handover
+        if handover is not None:
+            for message in handover.outgoing():
+                self.up.send(message)
+        elif seat.second is self:  # it has failed
+            seat.second = None
+            if self.edge.alive:
+                self.edge.core.lost(self.session, seat.match.now)
+
+    def _at_server(self, message: bytes) -> None:
+        if self.edge.alive:
+            self.edge.core.receive(self.session, message, self._seat.match.now)
+
+    def _at_client(self, message: bytes) -> None:
+        seat = self._seat
+        if seat.session is self.session:
+            seat._at_client(message)
+            return
+        handover = seat.core.handover
+        if seat.second is self:
+            seat.core.receive_beside(message, seat.local)
+            if handover is not None and handover.complete:
+                seat.take_place(self)
+            seat._flush()
 
 
 class ScaledMatch(Simulation):
@@ -347,6 +216,9 @@ class ScaledMatch(Simulation):
         """Kills a part. What it has sent still arrives; the connections of an edge's clients break."""
         part.alive = False
         for player in self.players:
+            if isinstance(player, Seat) and player.second is not None and player.second.edge is part:
+                player.core.lost_beside(player.local)
+                player.second = None
             if isinstance(player, Seat) and player.edge is part:
                 player.cut()
 

@@ -7,7 +7,16 @@ from typing import Any
 import pytest
 
 from client_sdk.core import Core
-from client_sdk.events import Answered, Corrected, Diverged
+from client_sdk.events import (
+    Answered,
+    Corrected,
+    Disconnected,
+    Diverged,
+    EventsDropped,
+    Happened,
+    Resumed,
+    Resynchronised,
+)
 from client_sdk.netsim.links import Link
 from server.config.limits import Limits
 from server.players.player import Player
@@ -231,4 +240,84 @@ def test_a_player_leaves_and_the_others_see_it() -> None:
     assert len(match.sequencer.core.world) == 1
     assert [len(edge.core.players) for edge in match.edges] == [1, 1]
     assert second.core.state == "playing"
+    hashes_agree(match)
+
+
+def tour(match: ScaledMatch, player: Seat, seconds: float, every: float = 5.0) -> int:
+    """Runs a match while a player changes to the next edge every so often. Returns how often it has."""
+    moves = 0
+    until = match.now + seconds
+    while match.now < until:
+        before = player.edge
+        living = [edge for edge in match.edges if edge.alive]
+        if before in living and player.move(living[(living.index(before) + 1) % len(living)]):
+            match.run(every)
+            moves += player.edge not in (before, None)
+        else:
+            match.run(every)
+    return moves
+
+
+@pytest.mark.parametrize(
+    ("seed", "seconds"), [(1, 60), pytest.param(2, 600, marks=pytest.mark.slow)], ids=["short", "long"]
+)
+def test_a_lone_player_who_is_moved_between_edges_has_no_corrections(seed: int, seconds: float) -> None:
+    match = ScaledMatch(load_scene("hills"), seed, edges=4)
+    player = match.join(edits, PATH)
+    match.run(3)
+    assert tour(match, player, seconds) == seconds // 5
+    stats = player.core.stats
+    assert causes(player) == Counter()
+    assert (stats.corrections, stats.divergences, stats.reconnects, stats.resyncs) == (0, 0, 0, 0)
+    assert stats.inputs_used > 30 * seconds
+    assert not any(isinstance(event, (Disconnected, Resumed, Resynchronised)) for event in player.events)
+    assert {event.done for event in player.events if isinstance(event, Answered)} >= {True}
+    hashes_agree(match)
+
+
+@pytest.mark.parametrize("seed", [1, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(2, 8))])
+def test_events_and_commands_come_once_over_all_edges(seed: int) -> None:
+    match = ScaledMatch(load_scene("meadow"), seed, edges=3, rules=Tally, bus=ROUGH)
+    sent: Counter[str] = Counter()
+    player, other = match.join(asks(sent), PATH), match.join(asks(sent), PATH)
+    match.run(3)
+    assert tour(match, player, 20, every=2.0) == 10
+    calm(match)
+    for each in (player, other):
+        assert [event.data for event in each.events if isinstance(event, Happened)] == [
+            *range(1, sent[each.core.name] + 1)
+        ]
+        assert not any(isinstance(event, EventsDropped) for event in each.events)
+        answered = Counter(event.number for event in each.events if isinstance(event, Answered))
+        assert set(answered.values()) == {1}
+        assert match.sequencer.core.api.shared[each.core.name] == sent[each.core.name] == len(answered)
+    hashes_agree(match)
+
+
+@pytest.mark.parametrize("seed", [1, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(2, 12))])
+def test_kills_while_players_move_between_edges(seed: int) -> None:
+    match = ScaledMatch(load_scene("meadow"), seed, edges=4, standbys=2, rules=Tally, bus=ROUGH)
+    sent: Counter[str] = Counter()
+    rng = random.Random(seed)
+    for _ in range(3):
+        match.join(asks(sent), PATH)
+    match.run(3)
+
+    def move() -> None:
+        player = rng.choice(match.players)
+        assert isinstance(player, Seat)
+        player.move(match.some_edge())
+        match.at(match.now + 0.4, move)
+
+    match.at(match.now, move)
+    torment(match, 12, seed)
+    calm(match)
+    for player in match.players:
+        answered = Counter(event.number for event in player.events if isinstance(event, Answered))
+        assert player.core.state == "playing"
+        assert set(answered.values()) == {1}
+        assert match.sequencer.core.api.shared[player.core.name] == sent[player.core.name] == len(answered)
+        events = [event.data for event in player.events if isinstance(event, Happened)]
+        assert events == sorted(set(events)), "each comes once, in order"
+        assert not any(isinstance(event, Diverged) for event in player.events)
     hashes_agree(match)
