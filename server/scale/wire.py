@@ -1,4 +1,4 @@
-"""What the parts of a world send each other: batches of an edge to the sequencer, and records from it to all.
+"""The messages between the parts of a world: batches of an edge to the sequencer, and records from it to all.
 
 batch     [edge, number, before, inputs, requests]
           number: the tick that the inputs are for   before: number of the edge's batch before; -1: none

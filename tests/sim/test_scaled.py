@@ -244,7 +244,7 @@ def test_a_player_leaves_and_the_others_see_it() -> None:
 
 
 def tour(match: ScaledMatch, player: Seat, seconds: float, every: float = 5.0) -> int:
-    """Runs a match while a player changes to the next edge every so often. Returns how often it has."""
+    """Runs a match while a player changes to the next edge every `every` seconds. Returns the number of changes."""
     moves = 0
     until = match.now + seconds
     while match.now < until:

@@ -23,12 +23,12 @@ class Lengths(NamedTuple):
     warm_up_s: float = 8.0
     window_s: float = 10.0
     settle_s: float = 4.0
-    """From the join until the server is stopped, or until a player sends two inputs per step."""
+    """Time from the join until the server is stopped, or until a player sends two inputs per step."""
     stop_s: float = 1.0
     after_s: float = 7.0
-    """From the end of a stall until its figures begin."""
+    """Time from the end of a stall until its figures begin."""
     heal_s: float = 8.0
-    """From the last late read until the figures begin."""
+    """Time from the last late read until the figures begin."""
     short_s: float = 2.0
     """Window of the figures after a stall, and of two inputs per step."""
 

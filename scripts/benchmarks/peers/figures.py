@@ -14,7 +14,7 @@ Figures = dict[str, float | None]
 
 
 class Logs(NamedTuple):
-    """What was noted in a run."""
+    """The notes of a run."""
 
     ticks: Sequence[float]
     """Times at which the server's ticks began."""
@@ -27,7 +27,7 @@ class Logs(NamedTuple):
 
 
 class Name(NamedTuple):
-    """How a figure is shown. The lower, the better, except for those without a direction."""
+    """The form in which a figure is shown. The lower, the better, except for those without a direction."""
 
     title: str
     form: str
