@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 SILENCE_S = 0.25
 """Seconds without a record after which a standby takes over."""
 LEAD_S = 0.008
-"""Seconds that an edge's deadline is ahead of the sequencer's at first."""
+"""Seconds that an edge's deadline is ahead of the sequencer's, at least."""
 LEAD_MORE, LEAD_LESS_S, LEAD_S_MAX = 1.5, 0.000002, 0.1
 """Factor of the lead after a late batch; seconds that it falls per tick; its greatest value in seconds."""
 
@@ -198,7 +198,7 @@ class EdgePart(Reader):
         self._phase = max(self._phase - 1e-5, tick - now * rate)
         missing = tick - self.replica.batches.get(self.name, tick)
         self.late += missing > 0
-        self.lead_s = min(max(self.lead_s - LEAD_LESS_S, LEAD_S / 4) * (LEAD_MORE if missing else 1), LEAD_S_MAX)
+        self.lead_s = min(max(self.lead_s - LEAD_LESS_S, LEAD_S) * (LEAD_MORE if missing else 1), LEAD_S_MAX)
         self._schedule()
 
     def due(self) -> float:
