@@ -51,7 +51,7 @@ def main() -> int:
     parser.add_argument("--scene", default="hills", help="default: %(default)s")
     parser.add_argument("--out", type=Path, default=Path("docs/live.png"), help="default: %(default)s")
     args = parser.parse_args()
-    args.tick_rate = None
+    args.tick_rate = args.game = None
     browser = installed()
     if browser is None:
         print("error: no Chromium was found on this machine", file=sys.stderr)

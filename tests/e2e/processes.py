@@ -25,8 +25,8 @@ ROOT = Path(__file__).resolve().parents[2]
 START_S = 400.0
 """Seconds until a server is ready. Compiling the kernel for the first time takes long."""
 END_S = 10.0
-BUSY = re.compile("stalled|suspended|goes on")
-"""Events of the watchdog, which also a machine causes that is busy with other work."""
+BUSY = re.compile("stalled|suspended|goes on|took longer than the time between two")
+"""Events of the watchdog and of ticks that took long, which also a machine causes that is busy with other work."""
 RECOVERY_S = 2.0
 """Seconds within which a player moves again after a stall or a reconnect."""
 MOVING_BLOCKS = 1.0

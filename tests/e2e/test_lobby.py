@@ -60,6 +60,7 @@ async def test_two_players_duel_and_come_back(settings: str) -> None:
     )
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(installed() is None, reason="there is no Chromium on this machine")
 async def test_a_browser_shows_the_worlds_and_their_players(settings: str) -> None:
     browser = installed()

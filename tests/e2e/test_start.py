@@ -242,7 +242,7 @@ def test_bad_settings(tmp_path: Path) -> None:
 
 def test_bad_commands() -> None:
     unknown = (
-        "error: 'chek': no such command (did you mean check?); the commands are token, check and describe; "
+        "error: 'chek': no such command (did you mean check?); the commands are token, check, describe and worlds; "
         "to start a server, give only flags (--help)\n"
     )
     fail(
