@@ -22,8 +22,8 @@ from tests.lengths import long
 from tests.packaging.bare import ROOT, build, environment, run
 from tests.packaging.test_rewriting import imported
 from tests.readme.pages import programs
-from tests.readme.run_snippet import LOOPS
-from tests.readme.test_snippets import A_FILE, ALONE, ENGINES, ON_A_SERVER
+from tests.readme.run_snippet import LOOPS, URL
+from tests.readme.test_snippets import A_FILE, ALONE, ENGINES, ON_A_SERVER, WORLDS
 
 pytestmark = pytest.mark.e2e
 
@@ -231,7 +231,19 @@ def test_the_other_programs(installed: Installed) -> None:
             assert "walked" in installed.run("-m", "tests.readme.run_snippet", name, url)
     for name in ALONE:
         installed.run("-c", f"from tests.readme.pages import programs; exec(programs()[{name!r}])")
-    assert len(programs()) == len([*LOOPS, A_FILE, *ENGINES, *ON_A_SERVER, *ALONE])
+    assert len(programs()) == len([*LOOPS, A_FILE, *ENGINES, *ON_A_SERVER, *ALONE, WORLDS])
+
+
+@pytest.mark.slow
+def test_a_world_is_found(installed: Installed, tmp_path: Path) -> None:
+    (config := tmp_path / "server.toml").write_text('scene = "flat"\n[worlds.arena]\nscene = "flat"\n', "utf-8")
+    with installed.served("--config", str(config)) as url:
+        told = {URL: url, "while not client.closed": "for _ in range(240)"}
+        program = (
+            f"text = programs()[{WORLDS!r}]\nfor old, new in {told!r}.items():\n    text = text.replace(old, new)\n"
+        )
+        said = installed.run("-c", f"from tests.readme.pages import programs\n{program}exec(text)")
+    assert "playing in arena-1" in said
 
 
 @pytest.mark.slow
