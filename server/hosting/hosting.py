@@ -18,9 +18,10 @@ from server.observability.errors import FaultReporter
 from server.observability.pages import Page, PageRequest, line
 from server.runtime.tasks import Tasks
 from server.runtime.terrain import TerrainPool
+from server.worlds.directory import STOPPING
 from server.worlds.host import Way
 from server.worlds.kinds import Kind, WorldsError
-from server.worlds.worlds import Worlds
+from server.worlds.worlds import Worlds, name_in
 
 LOOK_S = 0.1
 """Seconds between two looks at the worlds: who gets a seat, which rest, which end."""
@@ -28,7 +29,6 @@ FILES_LOOKS = 10
 """Number of such looks between two at what is to be saved beside the stores."""
 TOO_OFTEN = "too many requests for a world from your address; wait some seconds"
 """Reason for a client whose address asks for worlds too often."""
-STOPPING = "the server is about to stop"
 
 logger = logging.getLogger(__name__)
 
@@ -106,7 +106,7 @@ class Hosting:
             address: address of the client.
         """
         limits = self._settings.limits
-        if self.worlds.draining and target.partition("?")[0].strip("/") in ("match", "create"):
+        if self.worlds.draining and name_in(target) in ("match", "create"):
             retry = str(max(1, round(self._settings.restart_s)))
             return line(HTTPStatus.SERVICE_UNAVAILABLE, STOPPING, retry_after=retry)
         exempt = limits.loopback_exempt and is_loopback(address)

@@ -10,13 +10,13 @@ that page read the answers of this server. Therefore a request for a page is ref
 server. A request for a WebSocket is checked by its `Origin`, which only browsers send.
 """
 
-import math
 import re
 from collections import Counter
 from collections.abc import Callable
 from http import HTTPStatus
 from typing import NamedTuple
 
+from server.bucket import Bucket
 from server.config.hosts import ANY, NO_ADDRESS, is_loopback, network_of, parsed
 from server.config.limits import Limits
 from server.observability.pages import Page, Pages, line
@@ -84,8 +84,8 @@ class Admission:
         self.total = 0
         """Number of present connections."""
         self._by_network: Counter[str] = Counter()
-        self._joins = math.inf  # WebSockets that may be opened now; at first the whole burst
-        self._joins_at = 0.0
+        rate = self.limits.joins_per_s
+        self._joins = Bucket(rate, max(1.0, BURST_S * rate))
 
     def arrive(self, address: str) -> bool:
         """Counts a new connection. Returns False if it is to be dropped at once; then `leave` must not be called."""
@@ -142,19 +142,10 @@ class Admission:
             if self._by_network[network_of(address)] > limits.connections_per_address:
                 reason = f"too many connections from your address ({limits.connections_per_address} are allowed)"
                 return "address", line(HTTPStatus.TOO_MANY_REQUESTS, reason, retry_after=RETRY_S)
-            if not self._take_join(now):
+            if not self._joins.take(now):
                 reason = f"too many are joining right now ({limits.joins_per_s:g} per second are allowed)"
                 return "joins", line(HTTPStatus.SERVICE_UNAVAILABLE, reason, retry_after=RETRY_S)
         return "", None
-
-    def _take_join(self, now: float) -> bool:
-        rate = self.limits.joins_per_s
-        self._joins = min(self._joins + (now - self._joins_at) * rate, max(1.0, BURST_S * rate))
-        self._joins_at = now
-        if self._joins < 1:
-            return False
-        self._joins -= 1
-        return True
 
     def _welcome(self, request: Request) -> bool:
         """Returns whether the origin is allowed: none (not a browser), an allowed one, or a page of this server."""

@@ -16,6 +16,8 @@ from server.worlds.seats import Seats
 from shared import messages
 from shared.messages import Go
 
+STOPPING = "the server is about to stop"
+"""Reason for clients that ask for a world while the server drains."""
 CODE_SIGNS = "ABCDEFGHJKMNPQRSTUVWXYZ23456789"
 """Characters of codes: none that looks like another."""
 CODE_LENGTH = 6
@@ -91,7 +93,7 @@ class Directory:
         """
         found, checked = self.kind(kind), checked_properties(properties or {})
         if self.draining:
-            raise WorldsError("the server is about to stop")
+            raise WorldsError(STOPPING)
         if not self.room_for(found):
             most = min(self.limits.worlds_max, found.worlds_max)
             raise WorldsError(f"there are too many worlds now (limits: {most} of the kind {found.name})")

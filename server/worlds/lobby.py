@@ -15,6 +15,7 @@ from urllib.parse import parse_qsl
 import msgpack
 
 from server.auth.identity import checked_subject
+from server.bucket import Bucket
 from server.config.limits import Limits
 from server.game.loading import Runner
 from server.observability.errors import FaultReporter
@@ -76,7 +77,7 @@ class LobbySession:
         self.ticket: Ticket | None = None
         """The client's ticket; None: it has not said hello yet, or its data are being loaded."""
         self.greeted = self.closed = False
-        self.allowance, self.received_at = MESSAGES_BURST, now
+        self.messages, self.received_at = Bucket(MESSAGES_PER_S, MESSAGES_BURST), now
         self.reached_at = now
         """Time in seconds at which the client was seen to have everything that was sent."""
 
@@ -129,9 +130,8 @@ class Lobby:
         """Takes one message of a client: a Hello, and pings."""
         if session.closed:
             return
-        session.allowance = min(session.allowance + (now - session.received_at) * MESSAGES_PER_S, MESSAGES_BURST) - 1
         session.received_at = now
-        if session.allowance < 0:
+        if not session.messages.take(now):
             self.refuse(session, messages.MALFORMED, "too many messages")
             return
         try:

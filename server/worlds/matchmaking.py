@@ -2,8 +2,8 @@
 
 from collections.abc import Mapping
 
+from server.bucket import Bucket
 from server.players.ticket import Property
-from server.worlds.bucket import Bucket
 from server.worlds.directory import Directory
 from server.worlds.hosted import HostedWorld
 from server.worlds.kinds import Kind, WorldsError, matches

@@ -10,13 +10,13 @@ from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any
 
+from server.bucket import Bucket
 from server.config.limits import Limits
 from server.game import Game
 from server.game.loading import Runner, at_once
 from server.game.session import Session
 from server.observability.errors import FaultReporter
 from server.worlds.api import RulesWorlds
-from server.worlds.bucket import Bucket
 from server.worlds.directory import Directory
 from server.worlds.host import Host, Way
 from server.worlds.hosted import Entrance, HostedWorld
@@ -76,15 +76,14 @@ class Worlds(Directory):
             target: path and query of the request.
             address: the client's address, or its network.
         """
-        if target.partition("?")[0].strip("/") not in VERBS or self._limit(address).take(self.now):
+        if name_in(target) not in VERBS or self._limit(address).take(self.now):
             return True
         self.counts["refused_often"] += 1
         return False
 
     def route(self, target: str) -> Way | str:
         """Returns what the path and query of a WebSocket request lead to, or the reason why they lead nowhere."""
-        path, _, query = target[:PATH_MAX].partition("?")
-        name = path.strip("/")
+        name, query = name_in(target[:PATH_MAX]), target[:PATH_MAX].partition("?")[2]
         seated = query.startswith("seat=")
         if not name and not seated:
             return self.default or NO_DEFAULT
@@ -165,6 +164,11 @@ class Worlds(Directory):
             del self._asked[next(iter(self._asked))]
         self._asked[address] = limit
         return limit
+
+
+def name_in(target: str) -> str:
+    """Returns the name of a world, or a path of the lobby, in path and query of a request."""
+    return target.partition("?")[0].strip("/")
 
 
 class _LobbyWay:

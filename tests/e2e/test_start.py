@@ -28,7 +28,7 @@ pytestmark = pytest.mark.e2e
 def on_a_terminal(cache: Path) -> list[str]:
     """Returns the first word of each line on the terminal of a starting server, up to the line of its address.
 
-    What stands behind that line may or may not have arrived in the same read, so it does not count.
+    Lines behind it do not count, because the same read may have brought them, too.
     """
     seen, its = os.openpty()
     command = [sys.executable, "-m", "server", "--port", "0", "--scene", "flat", "--log-level", "warning"]

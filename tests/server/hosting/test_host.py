@@ -15,12 +15,9 @@ from server.runtime.ticker import FAILURES_MAX
 from server.worlds.kinds import WorldsError
 from shared import messages
 from sovereign_netcode.replay import main as replay
-from tests.server.hosting.bench import BROKEN, GAMES, KEEPING, PLAIN, Alarm, Bench, Broken, fake_alarms
+from tests.server.hosting.bench import BROKEN, GAMES, KEEPING, PLAIN, Alarm, Bench, Broken
 
-
-@pytest.fixture(autouse=True)
-def alarms(monkeypatch: pytest.MonkeyPatch) -> list[Alarm]:
-    return fake_alarms(monkeypatch)
+pytestmark = pytest.mark.usefixtures("alarms")
 
 
 # -- ticks ---------------------------------------------------------------------------------------------------

@@ -13,7 +13,9 @@ from server.hosting import command
 from server.hosting.operators import Operators
 from server.observability.pages import Page, PageRequest
 from shared import messages
-from tests.server.hosting.bench import PLAIN, Alarm, Bench, fake_alarms
+from tests.server.hosting.bench import PLAIN, Bench
+
+pytestmark = pytest.mark.usefixtures("alarms")
 
 TOKEN = "t0ken-of-operators"
 
@@ -43,11 +45,6 @@ class Office(Bench):
         assert page is not None
         assert page.status >= 400, page
         return page.status, page.body.decode().strip()
-
-
-@pytest.fixture(autouse=True)
-def alarms(monkeypatch: pytest.MonkeyPatch) -> list[Alarm]:
-    return fake_alarms(monkeypatch)
 
 
 @pytest.fixture

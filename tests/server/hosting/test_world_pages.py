@@ -10,7 +10,9 @@ from prometheus_client.parser import text_string_to_metric_families
 from server.hosting.pages import WorldPages
 from server.observability.metrics import metrics_page
 from server.observability.pages import Page, PageRequest
-from tests.server.hosting.bench import KEEPING, PLAIN, Alarm, Bench, fake_alarms
+from tests.server.hosting.bench import KEEPING, PLAIN, Bench
+
+pytestmark = pytest.mark.usefixtures("alarms")
 
 
 class Reader(Bench):
@@ -29,11 +31,6 @@ class Reader(Bench):
         assert page is not None
         assert (page.status, page.content_type) == (200, "application/json")
         return json.loads(page.body)
-
-
-@pytest.fixture(autouse=True)
-def alarms(monkeypatch: pytest.MonkeyPatch) -> list[Alarm]:
-    return fake_alarms(monkeypatch)
 
 
 @pytest.fixture
