@@ -1,7 +1,9 @@
 """The interface by which the game authenticates clients. `server.auth.tokens` implements it with signed tokens."""
 
+from collections.abc import Callable
 from typing import Protocol
 
+from server.observability.errors import FaultReporter
 from server.players.player import SUBJECT_MAX as SUBJECT_MAX
 from shared.checks import text
 
@@ -17,6 +19,27 @@ def checked_subject(subject: object) -> str:
         SceneError: it is not a text of at most `SUBJECT_MAX` characters, or UTF-8 cannot encode it.
     """
     return text(subject, "subject", SUBJECT_MAX, shortest=0)
+
+
+def identified(authenticate: Callable[[str], str] | None, token: str, faults: FaultReporter) -> str:
+    """Returns the subject of a token; empty if anyone may play.
+
+    Args:
+        authenticate: returns the subject, as for `Game`; None: anyone may play.
+        token: the token of a client.
+        faults: where a wrong result of `authenticate` is reported.
+
+    Raises:
+        ValueError: the client is refused, with the reason for it. Other exceptions are those of `authenticate`.
+    """
+    if authenticate is None:
+        return ""
+    subject = authenticate(token)
+    try:
+        return checked_subject(subject)
+    except ValueError:
+        faults.report("the result of the authenticator")
+    raise AuthError("the server's authenticator returned no valid subject")
 
 
 class Authenticator(Protocol):

@@ -4,11 +4,11 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any, Protocol
 
-from server.auth.identity import checked_subject
+from server.auth.identity import identified
 from server.config.limits import Limits
 from server.game.commands import Commands
 from server.game.connections import Connections
-from server.game.loading import Runner, at_once
+from server.game.loading import Runner, at_once, not_loaded
 from server.game.roster import Roster
 from server.game.session import Session
 from server.journal.recorded_world import RecordedWorld
@@ -68,9 +68,7 @@ class Joining:
     def hello(self, session: Session, hello: Hello, now: float) -> None:
         """Checks a Hello. Its client joins in one of the next ticks, or is refused now."""
         if hello.version != messages.VERSION:
-            newer = "older" if hello.version < messages.VERSION else "newer"
-            reason = f"the client is {newer}: protocol version {hello.version}, the server speaks {messages.VERSION}"
-            self._connections.refuse(session, messages.WRONG_VERSION, reason)
+            self._connections.refuse(session, messages.WRONG_VERSION, other_version(hello))
             return
         mine = self._world.scene.digests
         differ = sorted(name for name in mine | hello.scene if mine.get(name) != hello.scene.get(name))
@@ -100,14 +98,7 @@ class Joining:
         if error is None:
             session.loaded, session.hello = result, hello
             return
-        if isinstance(error, ValueError):
-            self._connections.refuse(session, messages.NOT_ADMITTED, str(error) or "the game refused the player")
-            return
-        try:
-            raise error
-        except Exception:
-            self._faults.report("load_player")
-        self._connections.refuse(session, messages.INTERNAL, "the game could not load the player's data")
+        self._connections.refuse(session, *not_loaded(error, self._faults))
 
     def join(self, now: float) -> None:
         """Lets the clients that wait join, at most `Limits.joins_per_tick` of them. Call it before the step.
@@ -141,22 +132,13 @@ class Joining:
 
     def _authenticated(self, session: Session, token: str) -> bool:
         """Sets the subject of a session. Returns False if the client was refused."""
-        if self.authenticate is None:
-            return True
         try:
-            subject = self.authenticate(token)
+            session.subject = identified(self.authenticate, token, self._faults)
         except ValueError as error:
             self._connections.refuse(session, messages.UNAUTHORISED, str(error))
             return False
         except Exception:
             self._connections.fail(session, "authenticating a client")
-            return False
-        try:
-            session.subject = checked_subject(subject)
-        except ValueError:
-            self._faults.report("the result of the authenticator")
-            reason = "the server's authenticator returned no valid subject"
-            self._connections.refuse(session, messages.UNAUTHORISED, reason)
             return False
         return True
 
@@ -200,3 +182,9 @@ class Joining:
         welcome = encode(Welcome(messages.VERSION, self._world.tick, player.entity, self._rules, token))
         session.stream.private_due = self._roster.private_of(player)
         session.greeting = (self._world.tick + 1, welcome)
+
+
+def other_version(hello: Hello) -> str:
+    """Returns the reason for refusing a client that speaks another version of the protocol."""
+    newer = "older" if hello.version < messages.VERSION else "newer"
+    return f"the client is {newer}: protocol version {hello.version}, the server speaks {messages.VERSION}"

@@ -8,6 +8,9 @@ not await anything that takes time.
 from collections.abc import Callable, Coroutine
 from typing import Any
 
+from server.observability.errors import FaultReporter
+from shared import messages
+
 Done = Callable[[Any, BaseException | None], None]
 """Function that takes the result of a coroutine, or its exception."""
 Runner = Callable[[Coroutine[Any, Any, Any], Done], None]
@@ -25,3 +28,19 @@ def at_once(coroutine: Coroutine[Any, Any, Any], done: Done) -> None:
     else:
         coroutine.close()
         done(None, RuntimeError("load_player awaits something that takes time: this needs a server, or its event loop"))
+
+
+def not_loaded(error: BaseException, faults: FaultReporter) -> tuple[int, str]:
+    """Returns the close code and the reason for a client whose `load_player` has raised.
+
+    Args:
+        error: the exception. A `ValueError` of the rules refuses the client; any other one is a fault.
+        faults: where a fault is reported.
+    """
+    if isinstance(error, ValueError):
+        return messages.NOT_ADMITTED, str(error) or "the game refused the player"
+    try:
+        raise error
+    except Exception:
+        faults.report("load_player")
+    return messages.INTERNAL, "the game could not load the player's data"

@@ -14,10 +14,11 @@ from urllib.parse import parse_qsl
 
 import msgpack
 
-from server.auth.identity import checked_subject
+from server.auth.identity import identified
 from server.bucket import Bucket
 from server.config.limits import Limits
-from server.game.loading import Runner
+from server.game.joining import other_version
+from server.game.loading import Runner, not_loaded
 from server.observability.errors import FaultReporter
 from server.players.ticket import Ticket
 from server.replication.client_stream import Transport
@@ -194,14 +195,13 @@ class Lobby:
 
     def _hello(self, session: LobbySession, hello: Hello, now: float) -> None:
         if hello.version != messages.VERSION:
-            reason = f"the client's protocol version is {hello.version}, the server speaks {messages.VERSION}"
-            self.refuse(session, messages.WRONG_VERSION, reason)
+            self.refuse(session, messages.WRONG_VERSION, other_version(hello))
             return
         if len(hello.name) > self._limits.name_max:
             self.refuse(session, messages.MALFORMED, f"a name longer than {self._limits.name_max} characters")
             return
         try:
-            subject = "" if self._authenticate is None else checked_subject(self._authenticate(hello.token))
+            subject = identified(self._authenticate, hello.token, self._faults)
         except ValueError as error:
             self.refuse(session, messages.UNAUTHORISED, str(error))
             return
@@ -230,11 +230,4 @@ class Lobby:
             ticket.loaded, session.ticket = result, ticket
             self._matchmaker.ask(session, session.received_at)
             return
-        if isinstance(error, ValueError):
-            self.refuse(session, messages.NOT_ADMITTED, str(error) or "the game refused the player")
-            return
-        try:
-            raise error
-        except Exception:
-            self._faults.report("load_player")
-        self.refuse(session, messages.INTERNAL, "the game could not load the player's data")
+        self.refuse(session, *not_loaded(error, self._faults))

@@ -297,3 +297,16 @@ def test_drain_and_shut_down() -> None:
     assert created.over == (messages.NOT_ADMITTED, "the server is about to stop")
     server.worlds.shut_down("the server is going down", 2.0)
     assert peer.got[-1] == waiting.got[-1] == Bye(messages.GOING_AWAY, "the server is going down", 2.0)
+
+
+def test_an_authenticator_that_is_wrong_is_reported_in_the_lobby_too() -> None:
+    def wrong(token: str) -> Any:
+        if token == "odd":
+            return 7
+        raise ZeroDivisionError
+
+    server = Server(kind(), authenticate=wrong)
+    odd, broken = (server.peer("/match?kind=arena", token=token) for token in ("odd", "broken"))
+    assert odd.over == (messages.UNAUTHORISED, "the server's authenticator returned no valid subject")
+    assert broken.over == (messages.INTERNAL, "internal error")
+    assert server.worlds.faults.total == 2
