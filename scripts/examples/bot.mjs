@@ -4,22 +4,32 @@
 //     npm ci && node bot.mjs "ws://127.0.0.1:8765/match?kind=arena" [seconds]
 //
 // It goes where the server sends it (`Go`), and reconnects to its world after a lost connection.
-// Its timeline is ahead of the server, and it sends an input per tick. It does not predict, and ignores the terrain:
-// the snapshots contain the effects of both on every entity.
+// Its timeline is ahead of the server, and it sends an input per tick. It predicts with the kernel in WebAssembly: the
+// world of the newest snapshot, stepped by the inputs after it. `predicted` in its output has its own states that it
+// had predicted before the server sent them. SOVEREIGN_WEB is the folder of kernel.js (default: that of this checkout).
 
+import { readFileSync } from "node:fs";
+import { pathToFileURL } from "node:url";
+import { inflateSync } from "node:zlib";
 import { decode, encode } from "@msgpack/msgpack";
 import WebSocket from "ws";
 
+const { SOVEREIGN_WEB: folder } = process.env;
+const WEB = folder ? pathToFileURL(`${folder}/`) : new URL("../../client_sdk/web/", import.meta.url);
+const { loadKernel } = await import(new URL("kernel.js", WEB));
+const kernel = await loadKernel(readFileSync(new URL("../../shared/prebuilt/kernel.wasm", WEB)));
+
 const [url = "ws://127.0.0.1:8765", seconds = 10] = process.argv.slice(2);
-const HELLO = 1, INPUTS = 2, PING = 3, BYE = 4, WELCOME = 17, SNAPSHOT = 18, PONG = 20, GOTO = 27, WAITING = 28;
+const HELLO = 1, INPUTS = 2, PING = 3, BYE = 4, WELCOME = 17, SNAPSHOT = 18, TERRAIN = 19, PONG = 20, GOTO = 27, WAITING = 28;
 const GOING_AWAY = 1001, TRIES = 3, HOPS = 8, NOTHING = new Uint8Array(0);
 const STOP = [1, 2, 4], GO = [8, 16], FALL = 32, LAUNCH = 64, TOLD = 128; // events in an entity's turn
 const BLOCK = 2 ** 24, SIDE = 32 * BLOCK, SPEED = 2 ** 16, KEYFRAME = -1, USED = 0, REFUSED = -32768;
 const SQUARE = [[127, 0], [0, 127], [-127, 0], [0, -127]]; // east, north, west, south
 
-const entities = new Map(); // id -> { tick, template, falls, at: [x, y, z], v: [x, y, z], move: [x, y] }, as on the wire
+const entities = new Map(); // id -> { tick, template, falls, at: [x, y, z], v: [x, y, z], move: [x, y, buttons] }, as on the wire
 const said = new Map(); // id -> attributes
 let me, scene, acked, sent, used = 0, pongs, margins, phase, lead; // of the world that it plays in
+let world, coming, newer, inputs, fates, ahead, agreed; // the predicted world, terrain on its way, and what is predicted
 let socket, path = new URL(url).pathname + new URL(url).search, lobby = path, resume = NOTHING, timers = [];
 let joined, going, leaving, ends, tries = 0, hops = 0, wait = 0; // `wait`: seconds to the next attempt; negative: none
 
@@ -28,7 +38,9 @@ const now = () => performance.now() / 1000;
 const rounded = value => Math.sign(value) * Math.round(Math.abs(value)); // halves away from zero
 const home = at => at.map(part => Math.floor(part / SIDE)).join(); // a position's segment, as text
 const ints = (bin, ...offsets) => offsets.map(offset => bin.readInt32LE(offset));
-const reader = (bin, at = 0) => ({ i8: () => bin.readInt8(at++), i32: () => bin.readInt32LE((at += 4) - 4) });
+const reader = (bin, at = 0) => ({
+  i8: () => bin.readInt8(at++), u8: () => bin.readUInt8(at++), i32: () => bin.readInt32LE((at += 4) - 4),
+});
 function* records(size, bin = []) { for (let at = 0; at < bin.length; at += size) yield bin.subarray(at, at + size); }
 
 function connect() { // to a path of the server; host and port stay those of the URL
@@ -44,6 +56,7 @@ function connect() { // to a path of the server; host and port stay those of the
     if (kind === WELCOME) welcome(...fields);
     else if (kind === PONG) pong(...fields);
     else if (kind === SNAPSHOT) snapshot(...fields);
+    else if (kind === TERRAIN) terrain(...fields);
     else if (kind === GOTO) go(...fields);
     else if (kind === WAITING) console.error("waits for a world", JSON.stringify(decode(fields[0])));
     else if (kind === BYE) {
@@ -80,6 +93,8 @@ function leave() {
 
 function welcome(version, tick, entity, rules, key) {
   [me, scene, resume, joined, tries, wait] = [entity, rules, key, true, 0, 0];
+  [world, coming, newer, agreed] = [kernel.world(scene), [], [], []];
+  [inputs, fates, ahead] = [new Map(), new Map(), new Map()];
   path = path.replace(/\?seat=.*/, ""); // the seat counts once
   for (let i = 0; i < 5; i++) timers.push(setTimeout(() => send(PING, now(), 0), 100 * i));
   timers.push(setInterval(() => { send(PING, now(), 0); tell(); hops = 0; }, 1000));
@@ -88,7 +103,8 @@ function welcome(version, tick, entity, rules, key) {
 
 function tell() {
   const places = Object.fromEntries([...entities].map(([id, { at }]) => [id, at.map(part => part / BLOCK)]));
-  console.log(JSON.stringify({ tick: acked, me, name: said.get(me)?.name, used, places }));
+  console.log(JSON.stringify({ tick: acked, me, name: said.get(me)?.name, used, places, predicted: agreed }));
+  agreed = [];
 }
 
 function pong(at, tick) { // the server's time is tick_rate * now + phase; the quickest answers measure it best
@@ -107,13 +123,43 @@ function walk() { // sends a row for each tick that our timeline has reached; ju
   if (tick <= sent) return;
   const row = [...SQUARE[Math.floor(tick / side) % 4], tick % side === 0];
   send(INPUTS, sent + 1, acked, Uint8Array.from(Array(tick - sent).fill(row).flat()));
-  sent = tick;
+  while (sent < tick) inputs.set(++sent, row);
+  if (acked >= 0) predict();
+}
+
+function predict() { // up to the newest input; notes the own state of each tick, and the snapshot that it is based on
+  while (world.tick < sent && world.has(me)) {
+    world.step(inputs.has(world.tick + 1) ? [[me, inputs.get(world.tick + 1)]] : []);
+    ahead.set(world.tick, { base: acked, state: world.state(me) });
+  }
+}
+
+function compare(tick) { // what was predicted for a tick, if the server used every input that led to it
+  const { base, state } = ahead.get(tick) ?? {};
+  const ticks = Array.from({ length: tick - base }, (_, k) => base + 1 + k);
+  if (state && ticks.every(each => fates.get(each) === USED)) agreed.push([tick, ...state]);
+  for (const map of [ahead, inputs, fates]) for (const old of map.keys()) if (old <= tick - 64) map.delete(old);
+}
+
+function again(tick) { // predicts from a snapshot on
+  world.reset(tick, [...entities].map(([id, { template, falls, at, v, move }]) =>
+    [id, template, falls ? 1 : 0, ...at, ...v, ...move]));
+  predict();
+}
+
+function terrain(x, y, z, offset, total, chunk) {
+  coming.push(chunk);
+  if (offset + chunk.length < total) return;
+  world.load([x, y, z], inflateSync(Buffer.concat(coming)));
+  for (const { segment, block, kind } of newer) if (segment === [x, y, z].join()) world.setBlock(...block, kind);
+  [coming, newer] = [[], []];
+  if (acked >= 0) again(acked);
 }
 
 function turn(entity, events, tail) { // returns the entity after a tick with these events
   const { tick, template, at } = entity, { walk_speed, jump_speed } = scene.templates[template];
   const { gravity, terminal_speed, tick_rate, integrator } = scene;
-  const move = events & TOLD ? [tail.i8(), tail.i8(), tail.i8()] : entity.move; // the third byte has the buttons
+  const move = events & TOLD ? [tail.i8(), tail.i8(), tail.u8()] : entity.move;
   const v = entity.v.map((old, k) =>
     k < 2 && walk_speed && events & (TOLD | GO[k]) ? rounded(walk_speed * SPEED * move[k] / 127) : old);
   if (events & LAUNCH) v[2] = rounded(jump_speed * SPEED);
@@ -140,7 +186,7 @@ function snapshot(tick, newest, early, first, statuses, verdicts, drops, ...part
     for (const id of records(4, gone)) left.add(`${segment}:${id.readUInt32LE()}`);
     for (const row of records(33, rows)) told.set(row.readUInt32LE(), {
       tick, template: row[4], falls: row[5] & 1, at: ints(row, 6, 10, 14).map((part, k) => segment[k] * SIDE + part),
-      v: ints(row, 18, 22, 26), move: [row.readInt8(30), row.readInt8(31)],
+      v: ints(row, 18, 22, 26), move: [row.readInt8(30), row.readInt8(31), row[32]],
     });
   }
   for (let [id, entity] of entities) { // all others continue without an event
@@ -152,6 +198,16 @@ function snapshot(tick, newest, early, first, statuses, verdicts, drops, ...part
   for (const [, , , , , , , , , , attributes = []] of parts)
     for (let i = 0; i < attributes.length; i += 2) said.set(attributes[i], attributes[i + 1]);
   acked = tick;
+  statuses.forEach((fate, i) => fates.set(first + i, fate));
+  for (const [x, y, z, , , , , , , edits] of parts)
+    for (const edit of records(3, edits)) {
+      const at = edit.readUInt16LE(), block = [x * 32 + (at & 31), y * 32 + (at >> 5 & 31), z * 32 + (at >> 10)];
+      if (coming.length) newer.push({ segment: [x, y, z].join(), block, kind: edit[2] });
+      if (world.loaded([x, y, z])) world.setBlock(...block, edit[2]);
+    }
+  for (const drop of records(12, drops)) world.unload(ints(drop, 0, 4, 8));
+  if (entities.has(me)) compare(tick);
+  again(tick);
   used += statuses.filter(fate => fate === USED).length;
   margins.push(...[...records(2, early)].map(margin => margin.readInt16LE()).filter(margin => margin !== REFUSED));
   margins = margins.slice(-2 * scene.tick_rate);

@@ -6,6 +6,7 @@ The positions that it was sent are compared with a recording of that server.
 import asyncio
 import json
 import math
+import os
 import re
 import shutil
 import signal
@@ -18,11 +19,14 @@ import pytest
 from client_sdk.netsim.links import Link
 from sovereign_netcode.examples.tag import Tag
 from sovereign_netcode.server.journal.records import replay
+from sovereign_netcode.shared import layout
 from sovereign_netcode.shared.layout import ID
 from tests.e2e.processes import running, stats, until
 from tests.proxy import Proxy
 
-EXAMPLES = Path(__file__).resolve().parents[2] / "scripts" / "examples"
+ROOT = Path(__file__).resolve().parents[2]
+EXAMPLES = ROOT / "scripts" / "examples"
+ENVIRONMENT = os.environ | {"SOVEREIGN_WEB": str(ROOT / "client_sdk" / "web")}
 FILES = ("bot.mjs", "package.json", "package-lock.json")
 PLAYED_S = 4
 UNREACHABLE = "ENOTFOUND|EAI_AGAIN|ECONNREFUSED|ECONNRESET|ETIMEDOUT|ENETUNREACH"
@@ -60,6 +64,7 @@ def test_it_joins_walks_and_knows_exactly_where_everybody_is(installed: Path) ->
         done = subprocess.run(
             ["node", "bot.mjs", url, str(PLAYED_S)],
             cwd=installed,
+            env=ENVIRONMENT,
             capture_output=True,
             text=True,
             timeout=60,
@@ -90,6 +95,36 @@ def test_it_joins_walks_and_knows_exactly_where_everybody_is(installed: Path) ->
 
 
 @pytest.mark.e2e
+def test_it_predicts_what_the_server_computes(installed: Path) -> None:
+    record = installed / "record"
+    with running("--port", "0", "--scene", "hills", "--record", str(record)) as server:
+        address = server.address()
+        done = subprocess.run(
+            ["node", "bot.mjs", "ws://{}:{}".format(*address), str(PLAYED_S)],
+            cwd=installed,
+            env=ENVIRONMENT,
+            capture_output=True,
+            text=True,
+            timeout=60,
+            check=False,
+        )
+        assert (done.returncode, done.stderr) == (0, "")
+        assert server.end(signal.SIGTERM) == 0
+    told = [json.loads(line) for line in done.stdout.splitlines()]
+    predicted = {tick: state for said in told for tick, *state in said["predicted"]}
+    assert len(predicted) > 32, "most ticks of the last seconds"
+    compared = {
+        moment.world.tick: (predicted[moment.world.tick], list(moment.world.state(told[0]["me"])))
+        for moment in replay(record)
+        if moment.world.tick in predicted and not moment.ended
+    }
+    assert compared.keys() == predicted.keys()
+    assert all(mine == truth for mine, truth in compared.values())
+    assert len({tuple(state[layout.X : layout.Z]) for state in predicted.values()}) > 32, "it walks"
+    assert any(state[layout.FLAGS] for state in predicted.values()), "and it jumps"
+
+
+@pytest.mark.e2e
 async def test_it_finds_a_world_and_reconnects_to_it(installed: Path) -> None:
     settings = installed / "worlds.toml"
     settings.write_text('scene = "flat"\n[worlds.arena]\nscene = "flat"\n', "utf-8")
@@ -99,6 +134,7 @@ async def test_it_finds_a_world_and_reconnects_to_it(installed: Path) -> None:
             bot = await asyncio.create_subprocess_exec(
                 *("node", "bot.mjs", f"{proxy.url}/match?kind=arena", str(PLAYED_S)),
                 cwd=installed,
+                env=ENVIRONMENT,
                 stdout=asyncio.subprocess.PIPE,
                 stderr=asyncio.subprocess.PIPE,
             )
