@@ -263,15 +263,31 @@ def _manifest() -> dict[str, Any]:
         return {}
 
 
+def source_hash() -> str:
+    """Returns a hash of the physics. Programs with equal hashes compute the same worlds, in any form of the kernel."""
+    known = _manifest()
+    texts = _source_texts()
+    if texts is None or (known and known["text_crc"] == freshness.text_crc(texts)):
+        code_crc = known.get("code_crc", 0)
+    else:
+        code_crc = freshness.code_crc(texts)
+    return f"{code_crc:08x}{constants_crc():08x}"
+
+
+def _source_texts() -> list[str] | None:
+    """Returns the texts of the sources; None: there are no source files, as in a frozen program."""
+    paths = [Path(source.__file__ or "") for source in SOURCES]
+    return freshness.sources(paths) if all(path.suffix == ".py" and path.is_file() for path in paths) else None
+
+
 def _made_from_the_sources(code_crc: int, known: dict[str, Any]) -> bool:
     """Returns whether a library with this checksum was made from the sources.
 
     Also true if there are no source files to compare with, as in a frozen program.
     """
-    paths = [Path(source.__file__ or "") for source in SOURCES]
-    if not all(path.suffix == ".py" and path.is_file() for path in paths):
+    texts = _source_texts()
+    if texts is None:
         return True
-    texts = freshness.sources(paths)
     quick = known and (known["text_crc"], known["code_crc"]) == (freshness.text_crc(texts), code_crc)
     return bool(quick) or freshness.code_crc(texts) == code_crc
 

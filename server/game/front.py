@@ -1,13 +1,16 @@
 """The front of a game: takes the messages of clients, and sends them what is due."""
 
-from typing import Protocol
+import dataclasses
+from typing import Any, Protocol
 
 from server.config.limits import Limits
 from server.game.clocks import Clocks
 from server.game.connections import Connections
 from server.game.session import Session
 from server.game_api.shared_values import SharedValues
+from server.journal.recorded_world import RecordedWorld
 from server.observability.counters import Counters
+from server.players.persisted_state import PersistedState
 from server.players.player import Player
 from server.replication.client_stream import Transport
 from server.replication.sender import Sender
@@ -25,6 +28,7 @@ from shared.messages import (
     decode_from_client,
     encode,
 )
+from shared.scene import Scene
 
 RESYNC_S = 1.0
 """Minimum time between two resynchronisations that one client requests, in seconds."""
@@ -58,7 +62,19 @@ class Front:
     sender: Sender
     joining: Greets
     commands: Files
+    world: RecordedWorld
+    scene: Scene
     _row_bytes: int
+
+    @property
+    def kept(self) -> PersistedState:
+        """The persisted state: players, attributes and shared values; do not change it."""
+        raise NotImplementedError
+
+    @property
+    def players(self) -> dict[int, Player]:
+        """Players by entity, in the order in which they joined; do not change the dictionary."""
+        return self.kept.players
 
     @property
     def newest(self) -> int:
@@ -69,6 +85,21 @@ class Front:
     def sessions(self) -> list[Session]:
         """The sessions of all connections, joined or not; do not change the list."""
         return self.connections.sessions
+
+    def stats(self) -> dict[str, Any]:
+        """Returns all counters, including the inputs of the present players, and the size of the game."""
+        totals = dataclasses.replace(self.counters)
+        for player in self.players.values():
+            totals.add(player.inputs)
+        return dataclasses.asdict(totals) | {
+            "tick": self.world.tick,
+            "tick_rate": self.scene.tick_rate,
+            "clients": sum(session.entity > 0 for session in self.sessions),
+            "players": len(self.players),
+            "entities": len(self.world),
+            "entities_awake": self.world.awake_count,
+            "segments": len(self.world.blocks.rows),
+        }
 
     # -- external events: queued ---------------------------------------------------------------------------
 

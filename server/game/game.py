@@ -7,7 +7,6 @@ connection has room for one. A client that was left out gets the union of what i
 error of a peer closes its connection with a code and a reason; no message of a peer raises an exception here.
 """
 
-import dataclasses
 from collections.abc import Callable
 from typing import Any
 
@@ -25,7 +24,7 @@ from server.journal.recorded_world import RecordedWorld, Saves
 from server.observability.counters import Counters
 from server.observability.errors import FaultReporter
 from server.players import persisted_state
-from server.players.player import Player
+from server.players.persisted_state import PersistedState
 from server.rewind import Rewind
 from server.rules import Rules, checked_function, equipped
 from shared import messages
@@ -118,9 +117,8 @@ class Game(Front):
         return self.world.tick
 
     @property
-    def players(self) -> dict[int, Player]:
-        """Players by entity, in the order in which they joined; do not change the dictionary."""
-        return self.api.kept.players
+    def kept(self) -> PersistedState:
+        return self.api.kept
 
     def shut_down(self, reason: str, wait: float, code: int = messages.GOING_AWAY) -> None:
         """Lets the rules finish (`on_stop`), and closes all connections.
@@ -136,7 +134,7 @@ class Game(Front):
 
     def keep(self) -> list[list[Any]]:
         """Returns the persisted state and the unanswered commands as notes, for a checkpoint."""
-        return [*persisted_state.whole(self.api.kept), *self.edge.answers.notes()]
+        return [*persisted_state.whole(self.kept), *self.edge.answers.notes()]
 
     # -- the tick: the only place where the world changes --------------------------------------------------
 
@@ -154,18 +152,3 @@ class Game(Front):
         self._send(self.api.shared_values, now)
         self.sequencer.finish()
         self.clocks.check(now)
-
-    def stats(self) -> dict[str, Any]:
-        """Returns all counters, including the inputs of the present players, and the size of the game."""
-        totals = dataclasses.replace(self.counters)
-        for player in self.players.values():
-            totals.add(player.inputs)
-        return dataclasses.asdict(totals) | {
-            "tick": self.world.tick,
-            "tick_rate": self.scene.tick_rate,
-            "clients": sum(session.entity > 0 for session in self.sessions),
-            "players": len(self.players),
-            "entities": len(self.world),
-            "entities_awake": self.world.awake_count,
-            "segments": len(self.world.blocks.rows),
-        }

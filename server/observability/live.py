@@ -173,7 +173,7 @@ class Live:
         listed = listed[np.sort(np.unique(listed[:, ID], return_index=True)[1])]
         listed[:, X : Z + 1] = listed[:, X : Z + 1] * 100 // BLOCK
         ids = listed[:, ID].tolist()
-        names = ((entity, game.api.get(entity, "name")) for entity in ids)
+        names = ((entity, game.kept.attributes.get(entity, {}).get("name")) for entity in ids)
         return {
             "scene": scene.name,
             "templates": [
@@ -190,7 +190,7 @@ class Live:
             "names": {entity: name[:NAME_MAX] for entity, name in names if isinstance(name, str)},
             "players": shown,
             "away": [entity for entity in shown if game.players[entity].session is None],
-            "shared": {name: _shown(value) for name, value in game.api.shared.items()},
+            "shared": {name: _shown(value) for name, value in game.kept.shared.items()},
             "figures": {name: figures[name] for name in FIGURES if name in figures},
             "durations": {name: histogram.counts() for name, histogram in self._durations().items()},
         }

@@ -9,6 +9,7 @@ begins. Clients steer by the edge's time: `collect` is the deadline that their a
 
 import secrets
 from collections import deque
+from collections.abc import Callable
 from typing import Any, cast
 
 from server.config.limits import Limits
@@ -26,6 +27,7 @@ from server.journal.records import input_record
 from server.observability.counters import Counters
 from server.observability.errors import FaultReporter
 from server.players.input_queue import InputQueue
+from server.players.persisted_state import PersistedState
 from server.players.player import Player
 from server.rules import Rules
 from server.scale.replica import Replica
@@ -35,6 +37,9 @@ from shared.bounds import Bounds, bounds
 from shared.inputs import Input
 from shared.messages import IDLE, NEUTRALISED, REPEATED, USED, Command, Welcome, encode
 
+RESEND_TICKS, RESENT_MAX = 8, 64
+"""Ticks without a batch in the records after which the unrecorded batches are sent again: one of them was lost on the
+way. Maximum number of batches that are sent again at once."""
 AHEAD_MAX = 8
 """Maximum number of batches that are in no record yet. An edge that hears nothing of the sequencer stops there."""
 
@@ -145,12 +150,19 @@ class EdgeServer(Front):
         name: name of the edge, which no other edge of the world has had.
         replica: the replica of the world at some tick of the log.
         limits: the limits.
+        authenticate: returns the subject of a client's token, as for `Game`; None: anyone may play.
     """
 
     commands: EdgeCommands
     joining: Joining
 
-    def __init__(self, name: str, replica: Replica, limits: Limits | None = None) -> None:
+    def __init__(
+        self,
+        name: str,
+        replica: Replica,
+        limits: Limits | None = None,
+        authenticate: Callable[[str], str] | None = None,
+    ) -> None:
         world = replica.world
         self.name, self.replica, self.world, self.scene = name, replica, world, world.scene
         self.limits, self.counters, self.faults = limits or Limits(), Counters(), FaultReporter()
@@ -163,11 +175,20 @@ class EdgeServer(Front):
         self.connections = Connections(roster, self.counters, self.faults)
         self.clocks = Clocks(self.scene.tick_rate, self.limits, self.connections, roster)
         self.joining = Joining(
-            world, self.limits, self.counters, self.faults, self.connections, roster, _Durable(world), None, Rules()
+            world,
+            self.limits,
+            self.counters,
+            self.faults,
+            self.connections,
+            roster,
+            _Durable(world),
+            authenticate,
+            Rules(),
         )
         self._values = SharedValues(world, replica.kept.shared)
         self.commands.newest = world.tick
         self._unrecorded: deque[Batch] = deque()
+        self._resent = 0
         self._next, self._before = 0, -1
         self._tokens: dict[int, bytes] = {}
         self._mine = self._roster.mine
@@ -179,9 +200,9 @@ class EdgeServer(Front):
         return self.commands.newest
 
     @property
-    def players(self) -> dict[int, Player]:
-        """All players of the world by entity, also those of other edges."""
-        return self.replica.kept.players
+    def kept(self) -> PersistedState:
+        """The persisted state, with all players of the world, also those of other edges."""
+        return self.replica.kept
 
     # -- to the sequencer ----------------------------------------------------------------------------------
 
@@ -220,8 +241,8 @@ class EdgeServer(Front):
         return batch
 
     def unrecorded(self) -> list[Batch]:
-        """Returns the batches that are in no record yet, to be sent again when an epoch begins."""
-        return list(self._unrecorded)
+        """Returns the oldest batches that are in no record yet, to be sent again."""
+        return list(self._unrecorded)[:RESENT_MAX]
 
     def _ask_to_join(self, now: float) -> None:
         """Adds the requests of clients that wait to join."""
@@ -241,7 +262,9 @@ class EdgeServer(Front):
     # -- from the log --------------------------------------------------------------------------------------
 
     def follow(self, record: Record, now: float) -> bool:
-        """Takes a record of the log. Returns whether it begins an epoch, so that `unrecorded` has to be sent again.
+        """Takes a record of the log. Returns whether `unrecorded` has to be sent again.
+
+        That is so if the record begins an epoch, or if a batch was lost on its way.
 
         Raises:
             GapError: a record before it is missing.
@@ -280,7 +303,14 @@ class EdgeServer(Front):
                 self._end(client, code, reason)
         self._forget_others()
         self.clocks.check(now)
-        return False
+        return self._is_lost(record.tick)
+
+    def _is_lost(self, tick: int) -> bool:
+        """Returns whether a batch seems to be lost, and is to be sent again."""
+        if not self._unrecorded or tick - max(self._unrecorded[0].number, self._resent) < RESEND_TICKS:
+            return False
+        self._resent = tick
+        return True
 
     def _seat(self, record: Record, known: set[int], now: float) -> None:
         """Welcomes the clients of this edge that have joined.

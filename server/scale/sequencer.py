@@ -38,6 +38,13 @@ GONE_S = 600.0
 """Seconds without a batch after which an edge is forgotten. It has to start anew under another name."""
 
 
+def begin_record(replica: Replica) -> tuple[int, bytes]:
+    """Returns the epoch that follows a replica's, and the record that begins it."""
+    epoch = replica.epoch + 1
+    batches = [part for pair in sorted(replica.batches.items()) for part in pair]
+    return epoch, packed(Record(epoch, replica.world.tick, batches, None, [], [], [], [], [], []))
+
+
 class _Pen(Observer):
     """Keeps the record of the latest tick."""
 
@@ -96,10 +103,6 @@ class WorldSequencer:
         self._half = Sequencer(world, self.api, rewind, self.roster, self._joining, self.commands, self.connections)
         if replica is not None:
             self._take_over(replica)
-
-    def begin(self) -> bytes:
-        """Returns the record that begins the epoch. It must be in the log before any other record of it."""
-        return packed(Record(self.epoch, self.world.tick, self._batches(), None, [], [], [], [], [], []))
 
     def receive(self, batch: Batch) -> None:
         """Keeps a batch for its tick. One that is in the log already is dropped."""

@@ -5,6 +5,7 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 from server.config.limits import Limits
+from server.scale.clock import EdgeClock
 from server.scale.edge import EdgeServer
 from server.scale.replica import GapError, Replica
 from server.scale.sequencer import WorldSequencer
@@ -15,10 +16,6 @@ if TYPE_CHECKING:
 
 SILENCE_S = 0.25
 """Seconds without a record after which a standby takes over."""
-LEAD_S = 0.008
-"""Seconds that an edge's deadline is ahead of the sequencer's, at least."""
-LEAD_MORE, LEAD_LESS_S, LEAD_S_MAX = 1.5, 0.000002, 0.1
-"""Factor of the lead after a late batch; seconds that it falls per tick; its greatest value in seconds."""
 
 
 class Bus:
@@ -31,6 +28,7 @@ class Bus:
         jitter_s: largest additional time, in seconds.
         stop: about every `stop[0]` seconds, the messages of one pair of parts wait for up to `stop[1]` seconds.
         twice: share of the messages that come twice.
+        lost: share of the batches that do not come at all.
     """
 
     def __init__(
@@ -42,9 +40,11 @@ class Bus:
         jitter_s: float = 0.001,
         stop: tuple[float, float] | None = None,
         twice: float = 0.0,
+        lost: float = 0.0,
     ) -> None:
         self._match, self._rng = match, random.Random(seed)
         self._delay_s, self._jitter_s, self._stop, self._twice = delay_s, jitter_s, stop, twice
+        self._lost = lost
         self._free: dict[tuple[str, str], float] = {}
         self.log: list[bytes] = []
         """All records that the log has accepted."""
@@ -55,6 +55,8 @@ class Bus:
     def send(self, source: str, target: str, deliver: Callable[[], None]) -> None:
         """Delivers a message from one part to another, after the messages before it."""
         rng, now = self._rng, self._match.now
+        if self._lost and target == "sequencer" and rng.random() < self._lost:
+            return
         due = now + self._delay_s + rng.random() * self._jitter_s
         if self._stop is not None and rng.random() < 1 / (self._stop[0] * self._match.rate):
             due += rng.random() * self._stop[1]
@@ -90,11 +92,13 @@ class Part:
 class SequencerPart(Part):
     """The sequencer in one process."""
 
-    def __init__(self, match: "ScaledMatch", name: str, core: WorldSequencer, last: tuple[int, int]) -> None:
+    def __init__(
+        self, match: "ScaledMatch", name: str, core: WorldSequencer, begin: bytes, last: tuple[int, int]
+    ) -> None:
         super().__init__(name)
         self._match, self.core, self._last = match, core, last
         self._began, self._ticks = match.now, 0
-        self._append(core.begin(), None)
+        self._append(begin, None)
         self._schedule()
 
     def _schedule(self) -> None:
@@ -181,29 +185,23 @@ class EdgePart(Reader):
     def __init__(self, match: "ScaledMatch", name: str, replica: Replica, limits: Limits | None) -> None:
         super().__init__(match, name, replica)
         self.core = EdgeServer(name, replica, limits)
-        self.lead_s = LEAD_S
-        self.late = 0
-        """Records that lacked the batch of their tick."""
-        self._phase = -1e9
+        self.clock = EdgeClock(match.rate)
 
     def take(self, record: Record) -> None:
         again = self.core.follow(record, self.match.now)
+        if record.journal is None:
+            self.clock.restart()
+        else:
+            missing = record.tick - self.replica.batches.get(self.name, record.tick)
+            self.clock.arrived(record.tick, missing, self.match.now)
+            self._schedule()
         if again:
             for batch in self.core.unrecorded():
                 self._send(batch)
-            self._phase = -1e9
-        if record.journal is None:
-            return
-        tick, now, rate = record.tick, self.match.now, self.match.rate
-        self._phase = max(self._phase - 1e-5, tick - now * rate)
-        missing = tick - self.replica.batches.get(self.name, tick)
-        self.late += missing > 0
-        self.lead_s = min(max(self.lead_s - LEAD_LESS_S, LEAD_S) * (LEAD_MORE if missing else 1), LEAD_S_MAX)
-        self._schedule()
 
     def due(self) -> float:
         """Returns the time of the deadline of the next tick at this edge."""
-        return (self.core.newest + 1 - self._phase) / self.match.rate - self.lead_s
+        return self.clock.due(self.core.newest + 1)
 
     def _schedule(self) -> None:
         self.match.at(max(self.due(), self.match.now + 1e-4), self._collect, key=self)

@@ -23,7 +23,7 @@ from server.players.persisted_state import PersistedState
 from server.rules import Rules, prepared
 from server.scale.edge import EdgeServer
 from server.scale.replica import Replica
-from server.scale.sequencer import WorldSequencer
+from server.scale.sequencer import WorldSequencer, begin_record
 from server.scale.wire import batch_of
 from server.worlds.host import Way
 from shared.scene import Scene
@@ -176,8 +176,9 @@ class ScaledMatch(Simulation):
         self._number_of_parts = 0
         self.edges = [self._edge(first) for _ in range(edges)]
         self.standbys = [StandbyPart(self, self._name("standby"), first.copy(), i) for i in range(standbys)]
+        _, begin = begin_record(first)
         core = WorldSequencer(world, made, limits, seed=seed)
-        self.sequencer = SequencerPart(self, self._name("sequencer"), core, (0, -1))
+        self.sequencer = SequencerPart(self, self._name("sequencer"), core, begin, (0, -1))
 
     def join(self, policy: Policy, path: Link | None = None, core: Core | None = None) -> Seat:
         """Adds a player, as `Match.join`. Its client connects to an edge by chance."""
@@ -241,8 +242,10 @@ class ScaledMatch(Simulation):
         rules = None if self._rules is None else self._rules()
         if rules is not None:
             prepared(rules, self.scene)
+        _, begin = begin_record(replica)
         core = WorldSequencer(replica.world, rules, self._limits, seed=self.seed, replica=replica)
-        self.sequencer = SequencerPart(self, standby.name, core, (replica.epoch, replica.world.tick))
+        last = (replica.epoch, replica.world.tick)
+        self.sequencer = SequencerPart(self, standby.name, core, begin, last)
 
     def seen(self, name: str, tick: int, hashed: bytes) -> None:
         """Compares the hash of a part's world with those of the others at the same tick."""

@@ -4,6 +4,7 @@ import random
 from collections import Counter
 from typing import Any
 
+import msgpack
 import pytest
 
 from client_sdk.core import Core
@@ -19,8 +20,10 @@ from client_sdk.events import (
 )
 from client_sdk.netsim.links import Link
 from server.config.limits import Limits
+from server.journal.recorded_world import RecordedWorld
 from server.players.player import Player
 from server.rules import Rules
+from server.scale import checkpoint
 from server.scale.wire import record_of
 from shared.inputs import Input
 from shared.scene import load_scene
@@ -165,7 +168,7 @@ def test_late_batches_are_late_inputs_and_nothing_else(seed: int) -> None:
     match = ScaledMatch(load_scene("hills"), seed, edges=2, bus={"stop": (1.0, 0.15), "twice": 0.1})
     player = match.join(wander, PATH)
     match.run(40)
-    assert sum(edge.late for edge in match.edges) > 5
+    assert sum(edge.clock.late for edge in match.edges) > 5
     assert set(causes(player)) <= {"late input"}
     assert player.core.stats.inputs_substituted > 0
     assert player.core.stats.divergences == 0
@@ -183,6 +186,53 @@ def test_a_player_who_is_alone_is_corrected_for_late_inputs_only_when_parts_are_
     assert set(causes(player)) <= {"late input"}
     assert not any(isinstance(event, Diverged) for event in player.events)
     hashes_agree(match)
+
+
+@pytest.mark.parametrize("seed", [1, pytest.param(2, marks=pytest.mark.slow)])
+def test_a_lost_batch_is_sent_again(seed: int) -> None:
+    match = ScaledMatch(load_scene("meadow"), seed, edges=2, rules=Tally, bus={"lost": 0.01, "twice": 0.02})
+    sent: Counter[str] = Counter()
+    for _ in range(2):
+        match.join(asks(sent), PATH)
+    match.run(20)
+    calm(match)
+    assert sum(edge.clock.late for edge in match.edges) > 5
+    for player in match.players:
+        answered = Counter(event.number for event in player.events if isinstance(event, Answered))
+        assert set(answered.values()) == {1}
+        assert match.sequencer.core.api.shared[player.core.name] == sent[player.core.name] == len(answered)
+    hashes_agree(match)
+
+
+@pytest.mark.parametrize("seed", [1, pytest.param(2, marks=pytest.mark.slow)])
+def test_a_replica_from_a_checkpoint_goes_on_as_the_others(seed: int) -> None:
+    match = ScaledMatch(load_scene("hills"), seed, edges=1, rules=Tally)
+    sent: Counter[str] = Counter()
+    match.join(asks(sent), PATH)
+    match.join(edits, PATH)
+    match.run(6)
+    source = match.standbys[0].replica
+    fresh = RecordedWorld(match.scene)
+    fresh.load_terrain()
+    replica, last = checkpoint.decoded(checkpoint.encoded(source, "1:7:a"), fresh)
+    assert last == "1:7:a"
+    assert replica.world.state_hash() == source.world.state_hash()
+    assert (replica.homes, replica.batches, replica.events) == (source.homes, source.batches, source.events)
+    match.standbys[0].alive = False
+    match.edges.append(match._edge(replica))
+    second = match.join(wander, PATH)
+    second.core.travel.path = match.edges[-1].name
+    match.run(6)
+    assert second.core.shared == match.players[0].core.shared
+    hashes_agree(match)
+
+
+def test_a_checkpoint_of_another_format_is_refused() -> None:
+    fresh = RecordedWorld(load_scene("flat"))
+    fresh.load_terrain()
+    data = msgpack.packb([0, "", [], [], [], [], []])
+    with pytest.raises(ValueError, match="format 0"):
+        checkpoint.decoded(data, fresh)
 
 
 def test_a_deposed_sequencer_is_refused_and_ends() -> None:
