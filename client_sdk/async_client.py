@@ -9,7 +9,6 @@ Time is `time.monotonic()`: an event loop's own clock may be as coarse as a mill
 
 import asyncio
 import socket
-import ssl
 import time
 from collections.abc import Callable, Iterable
 from types import TracebackType
@@ -17,28 +16,22 @@ from typing import TYPE_CHECKING, Any, cast
 
 from client_sdk import addresses
 from client_sdk.base import BaseClient, set_link
-from client_sdk.compiling import COMPILER
-from client_sdk.core import READ_BYTES, Core
 from client_sdk.events import Event
 from client_sdk.pending_events import PendingEvents
-from client_sdk.transports.connection import (
-    CLOSE_S,
-    UNSENT_MAX,
-    ConnectError,
-    Connection,
-    checked_tls,
-    insecure,
-    stalled,
-    unreachable,
-)
+from client_sdk.port import READ_BYTES
+from client_sdk.transports.common import CLOSE_S, UNSENT_MAX, ConnectError
 from client_sdk.transports.listing import WorldEntry, list_worlds
 from client_sdk.view import View
-from shared.behaviours import Behaviour
 from shared.checks import duration
-from shared.scene import Scene
 
 if TYPE_CHECKING:
+    import ssl
+
+    from client_sdk.core import Core
     from client_sdk.netsim.links import Link
+    from client_sdk.transports.connection import Connection
+    from shared.behaviours import Behaviour
+    from shared.scene import Scene
 
 
 TIMEOUT_S = 5.0
@@ -66,11 +59,13 @@ class AsyncClient(BaseClient):
 
     def __init__(
         self,
-        core: Core,
+        core: "Core",
         url: str,
-        before_update: Callable[[Core], None] | None = None,
-        tls: ssl.SSLContext | None = None,
+        before_update: "Callable[[Core], None] | None" = None,
+        tls: "ssl.SSLContext | None" = None,
     ) -> None:
+        from client_sdk.transports.connection import Connection
+
         self._tls = tls
         self._redialing: asyncio.Task[None] | None = None
         super().__init__(core)
@@ -93,14 +88,14 @@ class AsyncClient(BaseClient):
         url: str,
         *,
         name: str = "",
-        scene: Scene | None = None,
+        scene: "Scene | None" = None,
         token: str = "",
         patience_s: float = 30.0,
         timeout: float = TIMEOUT_S,
-        tls: ssl.SSLContext | None = None,
+        tls: "ssl.SSLContext | None" = None,
         link: "str | Link | None" = None,
-        before_update: Callable[[Core], None] | None = None,
-        behaviours: Iterable[type[Behaviour]] = (),
+        before_update: "Callable[[Core], None] | None" = None,
+        behaviours: "Iterable[type[Behaviour]]" = (),
     ) -> "AsyncClient":
         """Connects to a server. Returns as soon as the server has answered; the client then joins by itself.
 
@@ -122,6 +117,12 @@ class AsyncClient(BaseClient):
             ValueError: an argument is not valid.
             ConnectError: there is no connection; the text says why, and what to do.
         """
+        import ssl  # here and not above, so that an import of this class loads little
+
+        from client_sdk.compiling import COMPILER
+        from client_sdk.core import Core
+        from client_sdk.transports.connection import checked_tls, insecure, unreachable
+
         COMPILER.begin()
         core = Core(name, scene, token=token, patience_s=patience_s, behaviours=behaviours)
         set_link(core, link)
@@ -166,7 +167,7 @@ class AsyncClient(BaseClient):
 
     @staticmethod
     async def list_worlds(
-        url: str, kind: str | None = None, timeout: float = TIMEOUT_S, *, tls: ssl.SSLContext | None = None
+        url: str, kind: str | None = None, timeout: float = TIMEOUT_S, *, tls: "ssl.SSLContext | None" = None
     ) -> list[WorldEntry]:
         """Returns the public worlds of a server, as `client_sdk.list_worlds` does, in a thread of its own."""
         return await asyncio.to_thread(list_worlds, url, kind, timeout, tls=tls)
@@ -250,6 +251,8 @@ class AsyncClient(BaseClient):
 
     async def _redial(self) -> None:
         """Connects anew, once. After a failure, the core decides when to try again."""
+        from client_sdk.transports.connection import Connection
+
         connection = self._connection = Connection(self._connection.address, self.core)
         self._answered, self._gone = self._loop.create_future(), self._loop.create_future()
         try:
@@ -277,6 +280,8 @@ class AsyncClient(BaseClient):
         self._schedule(now)
 
     def _stalled(self) -> None:
+        from client_sdk.transports.connection import stalled
+
         now = time.monotonic()
         stalled(self._connection, now)
         self._drop()
@@ -349,7 +354,7 @@ class AsyncClient(BaseClient):
 class _Stream(asyncio.Protocol):
     """The asyncio protocol of one connection of a client. It ignores calls after the client has reconnected."""
 
-    def __init__(self, client: AsyncClient, connection: Connection) -> None:
+    def __init__(self, client: AsyncClient, connection: "Connection") -> None:
         self._client, self._connection = client, connection
 
     @property

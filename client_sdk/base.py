@@ -3,13 +3,7 @@
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, cast
 
-import numpy as np
-import numpy.typing as npt
-
-from client_sdk.core import Core
 from client_sdk.diagnosis import Diagnosis, Use, diagnosis
-from client_sdk.drawn import Drawn
-from client_sdk.picture_blocks import PictureBlocks
 from client_sdk.stats import Stats
 from client_sdk.view import View
 from shared.buttons import Names
@@ -17,8 +11,11 @@ from shared.checks import Cell
 from shared.inputs import make_input
 
 if TYPE_CHECKING:
+    from client_sdk.core import Core
+    from client_sdk.drawn import Drawn
     from client_sdk.netsim.linked import LinkedPort
     from client_sdk.netsim.links import Link
+    from shared.arrays import Uint8s
 
 
 class BaseClient:
@@ -28,7 +25,9 @@ class BaseClient:
         core: the client's state machine; read it for what this class does not offer.
     """
 
-    def __init__(self, core: Core) -> None:
+    def __init__(self, core: "Core") -> None:
+        from client_sdk.picture_blocks import PictureBlocks  # here, because an import of this class stays cheap
+
         self.core = core
         self._picture_blocks = PictureBlocks(core)
 
@@ -196,7 +195,7 @@ class BaseClient:
         """Returns the kind of a block as the client shows it, 0 for air; None if its segment is not loaded."""
         return self._picture_blocks.block(x, y, z)
 
-    def segment(self, index: Cell) -> npt.NDArray[np.uint8]:
+    def segment(self, index: Cell) -> "Uint8s":
         """Returns the kinds of a segment's blocks, [z, y, x], 32 each, as a copy; air if it is not loaded."""
         return self._picture_blocks.segment(index)
 
@@ -216,7 +215,7 @@ class BaseClient:
         use = Use(core.waiting, core.stats.played_s, core.controls.used, bool(scene and scene.behaviours))
         return diagnosis(core.stats, use)
 
-    def drawn(self, view: View) -> Drawn:
+    def drawn(self, view: View) -> "Drawn":
         """Returns the other entities of a view and the blocks, for rays and boxes: a hit that is judged ahead.
 
         A program shows the hit as a guess, and sends the shot as a command. The rules judge it by `game.rewound`, and
@@ -225,6 +224,8 @@ class BaseClient:
         Raises:
             RuntimeError: the client has not joined.
         """
+        from client_sdk.drawn import Drawn
+
         prediction, scene = self.core.prediction, self.core.scene
         if prediction is None or scene is None:
             raise RuntimeError("drawn: the client has not joined")
@@ -234,7 +235,7 @@ class BaseClient:
         """Called after a command has been filed, for a client that sends it at once; others send with `update`."""
 
 
-def set_link(core: Core, link: "str | Link | None") -> None:
+def set_link(core: "Core", link: "str | Link | None") -> None:
     """Puts a simulated link in front of a core, or changes it. Without a link, the simulator is not even loaded.
 
     Raises:

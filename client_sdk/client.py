@@ -9,7 +9,6 @@ with Client.connect("ws://localhost:8765", name="Ann") as client:
         draw(client.view())
 """
 
-import ssl
 import time
 from collections.abc import Iterable
 from types import TracebackType
@@ -17,18 +16,17 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 from client_sdk import addresses
 from client_sdk.base import BaseClient, set_link
-from client_sdk.compiling import COMPILER
-from client_sdk.core import Core
 from client_sdk.events import Event
-from client_sdk.transports.connection import Connection, checked_tls
-from client_sdk.transports.polling import PollingTransport
 from client_sdk.view import View
-from shared.behaviours import Behaviour
 from shared.checks import duration, finite
-from shared.scene import Scene
 
 if TYPE_CHECKING:
+    import ssl
+
+    from client_sdk.core import Core
     from client_sdk.netsim.links import Link
+    from shared.behaviours import Behaviour
+    from shared.scene import Scene
 
 
 PATIENCE_S = 30.0
@@ -62,7 +60,7 @@ class Client(BaseClient):
         transport: moves the client's messages.
     """
 
-    def __init__(self, core: Core, transport: Transport) -> None:
+    def __init__(self, core: "Core", transport: Transport) -> None:
         super().__init__(core)
         self._transport = transport
 
@@ -72,13 +70,13 @@ class Client(BaseClient):
         url: str,
         *,
         name: str = "",
-        scene: Scene | None = None,
+        scene: "Scene | None" = None,
         token: str = "",
         patience_s: float = PATIENCE_S,
         timeout: float = 5.0,
-        tls: ssl.SSLContext | None = None,
+        tls: "ssl.SSLContext | None" = None,
         link: "str | Link | None" = None,
-        behaviours: Iterable[type[Behaviour]] = (),
+        behaviours: "Iterable[type[Behaviour]]" = (),
     ) -> "Client":
         """Connects to a server. Returns as soon as the server has answered; `poll` and `update` then join the game.
 
@@ -101,6 +99,11 @@ class Client(BaseClient):
                 token, or a duration is negative, for example.
             ConnectError: there is no connection; the text says why, and what to do.
         """
+        from client_sdk.compiling import COMPILER  # here, so that an import of this class loads little
+        from client_sdk.core import Core
+        from client_sdk.transports.connection import Connection, checked_tls
+        from client_sdk.transports.polling import PollingTransport
+
         COMPILER.begin()
         core = Core(name, scene, token=token, patience_s=patience_s, behaviours=behaviours)
         set_link(core, link)

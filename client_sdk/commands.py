@@ -2,8 +2,6 @@
 
 from typing import Any
 
-import numpy as np
-
 from client_sdk.events import Answered
 from shared import edits, fields, messages, payloads
 from shared.checks import text
@@ -55,7 +53,7 @@ class SentCommands:
         A second answer to a command that was sent twice is ignored.
         """
         answers = []
-        for number, verdict in np.frombuffer(verdicts, VERDICT).tolist() if verdicts else ():
+        for number, verdict in VERDICT.iter_unpack(verdicts) if verdicts else ():
             if self._unanswered.pop(number, None) is not None:
                 text = messages.VERDICT_TEXTS[min(verdict, len(messages.VERDICT_TEXTS) - 1)]
                 text = self._reasons.pop(number, "") or text

@@ -23,7 +23,7 @@ from client_sdk.advice import advised
 from client_sdk.events import Disconnected, Joined, Left, Resumed, SegmentLoaded
 from client_sdk.handover import Handover
 from client_sdk.pending_events import GameEvents
-from client_sdk.port import Port
+from client_sdk.port import READ_BYTES, Port
 from client_sdk.program_side import ProgramSide
 from client_sdk.reconnect import Reconnect
 from client_sdk.replica import Replica
@@ -41,8 +41,6 @@ TAKEN_OVER_S = 5.0
 program."""
 NAME_MAX = 1 << 16
 """Longest name that a program may pass, in characters; only the first `fields.NAME_MAX` characters are sent."""
-READ_BYTES = 64 * 1024
-"""Number of bytes that a transport reads at once from a connection without a simulated link."""
 
 
 class Core(ProgramSide):

@@ -1,9 +1,8 @@
 """Rays and boxes among what a client draws: a guess at a hit, until the server's answer arrives."""
 
-import numpy as np
-
 from client_sdk.prediction.prediction import Prediction
 from client_sdk.view import View
+from shared.arrays import np
 from shared.checks import Cell
 from shared.hits import Targets, boxes_of
 from shared.scene import Scene
@@ -23,13 +22,14 @@ class Drawn(Targets):
     """
 
     def __init__(self, view: View, scene: Scene, prediction: Prediction) -> None:
-        others = view.others
-        kinds = [scene.index_of[other.template] for other in others]
-        places = np.array([other.position for other in others], np.float64).reshape(-1, 3)
-        box = boxes_of(scene)[kinds].reshape(-1, 2, 3)
-        low = places + box[:, 0]
-        ids = np.array([other.entity for other in others], np.int64)
-        super().__init__(ids, low, low + box[:, 1], prediction.entity)
+        boxes, low, high = boxes_of(scene), [], []
+        for other in view.others:
+            box = boxes[scene.index_of[other.template]]
+            low.append([a + b for a, b in zip(other.position, box[:3], strict=True)])
+            high.append([a + b for a, b in zip(low[-1], box[3:], strict=True)])
+        ids = np.array([other.entity for other in view.others], np.int64)
+        lows, highs = (np.array(each, np.float64).reshape(-1, 3) for each in (low, high))
+        super().__init__(ids, lows, highs, prediction.entity)
         self._blocks, self._floor = prediction.predicted.blocks, scene.origin[2] << SEGMENT_SHIFT
 
     def solid(self, cell: Cell) -> bool:

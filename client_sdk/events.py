@@ -1,10 +1,12 @@
 """The events of a client. `poll()` returns them in order; a `match` statement tells them apart."""
 
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from shared.checks import Cell
-from shared.scene import Scene
+
+if TYPE_CHECKING:
+    from shared.scene import Scene
 
 
 @dataclass(frozen=True)
@@ -17,7 +19,7 @@ class Joined:
     """
 
     entity: int
-    scene: Scene
+    scene: "Scene"
     tick: int
 
 

@@ -1,10 +1,8 @@
 """The blocks as a client shows them: single ones, segments, and which segments have changed since the last look."""
 
-import numpy as np
-import numpy.typing as npt
-
 from client_sdk.core import Core
-from shared.blocks import AIR, Blocks, checked_block, checked_segment
+from shared.arrays import PLAIN, Uint8s, np
+from shared.blocks import AIR, BLOCKS, Blocks, checked_block, checked_segment
 from shared.checks import Cell
 from shared.units import SEGMENT
 
@@ -26,13 +24,16 @@ class PictureBlocks:
         blocks = self._blocks
         return None if blocks is None else blocks.get(*checked_block(x, y, z))
 
-    def segment(self, index: Cell) -> npt.NDArray[np.uint8]:
+    def segment(self, index: Cell) -> Uint8s:
         """Returns the kinds of a segment's blocks, [z, y, x], 32 each, as a copy; air if it is not loaded."""
         cell, blocks = checked_segment(index), self._blocks
         shape = SEGMENT, SEGMENT, SEGMENT
+        if PLAIN:
+            air = memoryview(bytes(BLOCKS)).cast("B", shape)
+            return air if blocks is None or cell not in blocks else blocks.segment(cell)  # type: ignore[return-value]
         if blocks is None or cell not in blocks:
             return np.full(shape, AIR, np.uint8)
-        kinds: npt.NDArray[np.uint8] = blocks.segment(cell).reshape(shape).copy()
+        kinds: Uint8s = blocks.segment(cell).reshape(shape).copy()
         return kinds
 
     def changed(self) -> set[Cell]:

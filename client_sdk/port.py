@@ -2,6 +2,9 @@
 
 from typing import Protocol
 
+READ_BYTES = 64 * 1024
+"""Number of bytes that a transport reads at once from a connection without a simulated link."""
+
 
 class Port(Protocol):
     """The side of a core that a transport talks to: the core itself, or a simulated link in front of it."""

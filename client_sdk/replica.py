@@ -13,7 +13,7 @@ from client_sdk.controls import Controls
 from client_sdk.prediction.confirmed import Confirmed
 from client_sdk.prediction.prediction import Prediction
 from client_sdk.timing.server_clock import ServerClock
-from client_sdk.view import ViewBuilder
+from client_sdk.view_builder import ViewBuilder
 from shared.behaviours import Behaviour
 from shared.blocks import unpack
 from shared.checks import Cell

@@ -1,25 +1,10 @@
-"""The view: the own entity as predicted, all others a little in the past, corrections smoothed.
+"""The view: what to draw at one moment, as the program gets it. `client_sdk.view_builder` makes it."""
 
-Other entities are drawn as predicted, too, if their template is shown so (`shown = "predicted"` in the scene).
-"""
-
-import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-from types import MappingProxyType
 from typing import Any
 
-import numpy as np
-
-from client_sdk.interpolation import Interpolation
-from client_sdk.interpolation.smoothing import Smoothing
-from client_sdk.prediction.prediction import Prediction, Reconciled
-from client_sdk.timing.server_clock import ServerClock
-from client_sdk.timing.timeline import Timeline
 from shared.checks import Vec
-from shared.layout import CELL, ID, MOVE_X, TEMPLATE, VX, X
-from shared.scene import Scene
-from shared.units import BLOCK, SPEED
 
 
 @dataclass(frozen=True)
@@ -60,103 +45,5 @@ class View:
         return self.others if self.me is None else [*self.others, self.me]
 
 
-FACINGS_MIN = 64
-"""Number of kept directions up to which those of entities out of view are not dropped."""
 NOTHING = View(0.0, None, [])
 """The view before the client has joined."""
-NO_ATTRIBUTES: Mapping[str, Any] = MappingProxyType({})
-"""Attributes of an entity that has none."""
-
-
-class ViewBuilder:
-    """Makes views from predicted, interpolated and smoothed positions."""
-
-    def __init__(self, scene: Scene, prediction: Prediction) -> None:
-        self.interpolation = Interpolation(scene.tick_rate)
-        self._prediction = prediction
-        self._templates = [template.name for template in scene.templates]
-        self._predicted = {i for i, template in enumerate(scene.templates) if template.shown == "predicted"}
-        self._smoothing: dict[int, Smoothing] = {}
-        self._extras = scene.extras
-        self._facings: dict[int, tuple[float, float]] = {}
-        self._delay = 0.0  # the input delay of the latest view, in ticks
-        self._viewed = -math.inf  # the timeline's tick of the latest view
-
-    def advance(self, server_tick: float, now: float) -> float:
-        """Adapts the interpolation delay of the others. Returns the tick at which they are drawn."""
-        self.interpolation.advance(server_tick, now)
-        return self.interpolation.shown(server_tick)
-
-    def smooth(self, done: Reconciled, now: float) -> None:
-        """Starts to fade out the jumps that a replay made. Entities that the rules acted on jump at once."""
-        for entity in done.placed:
-            self._smoothing.pop(entity, None)
-        if not done.replayed:
-            return
-        if self._smoothing:
-            predicted = self._prediction.predicted
-            self._smoothing = {entity: old for entity, old in self._smoothing.items() if entity in predicted}
-        for entity, offset in done.offsets.items():
-            if entity not in done.acted:
-                self._smoothing.setdefault(entity, Smoothing()).add(offset, now)
-
-    def view(self, timeline: Timeline, clock: ServerClock, now: float) -> View:
-        """Returns the view at `now`."""
-        prediction = self._prediction
-        tick, server_tick = timeline.tick(now), clock.tick(now)
-        # The drawn delay grows no faster than time passes: after a longer input delay is set, the own entity stands
-        # for as many ticks, and is never drawn further back than before.
-        self._delay = min(prediction.ahead, self._delay + max(tick - self._viewed, 0.0))
-        self._viewed = tick
-        states, places = self.interpolation.sample(server_tick)
-        if len(self._facings) > 2 * len(states) + FACINGS_MIN:
-            there = set(states[:, ID].tolist())
-            self._facings = {entity: facing for entity, facing in self._facings.items() if entity in there}
-        others = []
-        for state, place in zip(states.tolist(), places.tolist(), strict=True):
-            entity = state[ID]
-            if prediction.entity <= entity <= prediction.last_own:
-                continue
-            ahead = self._ahead(entity, tick, now) if state[TEMPLATE] in self._predicted else None
-            others.append(ahead or self._figure(state, place))
-        if prediction.last_own > prediction.entity:  # what the own entity has spawned: predicted, like itself
-            own = (self._ahead(entity, tick, now) for entity in prediction.spawned())
-            others = sorted([*others, *(each for each in own if each is not None)], key=lambda each: each.entity)
-        return View(tick, self._ahead(prediction.entity, tick, now), others, self.interpolation.shown(server_tick))
-
-    def _ahead(self, entity: int, tick: float, now: float) -> EntityView | None:
-        """Returns a predicted entity to draw, one tick before `tick` and with smoothing; None if it is not predicted.
-
-        One tick back, the position lies between two predicted states.
-        """
-        prediction = self._prediction
-        if entity not in prediction.predicted:
-            return None
-        before, after, share = prediction.around(entity, tick - self._delay - 1)
-        old, new = np.array(before[X : X + 3]) / BLOCK, np.array(after[X : X + 3]) / BLOCK
-        smoothing = self._smoothing.get(entity)
-        place = old + (new - old) * share + (smoothing.offset(now) if smoothing else 0.0)
-        return self._figure(after, place.tolist())
-
-    def _figure(self, state: Sequence[int], place: list[float]) -> EntityView:
-        """Returns the entity view of a state, drawn at `place` (in blocks)."""
-        x, y, z = place
-        vx, vy, vz = (part / SPEED for part in state[VX : VX + 3])
-        attributes = self._prediction.attributes.get(state[ID], NO_ATTRIBUTES)
-        template = self._templates[state[TEMPLATE]]
-        facing = self._facing(state)
-        if not self._extras.count:
-            return EntityView(state[ID], template, (x, y, z), (vx, vy, vz), attributes, facing=facing)
-        fields = self._prediction.predicted.fields_of(state[TEMPLATE], list(state[CELL:]))
-        return EntityView(state[ID], template, (x, y, z), (vx, vy, vz), attributes, fields, facing)
-
-    def _facing(self, state: Sequence[int]) -> tuple[float, float]:
-        """Returns the direction in which an entity looks, and keeps it for when it stands still."""
-        aims = self._extras.aims and (state[CELL] or state[CELL + 1])
-        for part in (CELL if aims else MOVE_X, VX):
-            east, north = state[part], state[part + 1]
-            if east or north:
-                length = math.hypot(east, north)
-                self._facings[state[ID]] = east / length, north / length
-                break
-        return self._facings.get(state[ID], (1.0, 0.0))

@@ -2,23 +2,19 @@
 
 from collections.abc import Collection
 
-import numpy as np
-import numpy.typing as npt
-
+from shared.arrays import Float64s, Truths, np
 from shared.layout import Int64s
 from shared.units import BLOCK
 
-Floats = np.ndarray[tuple[int, int], np.dtype[np.float64]]
-
 
 def between(
-    ids: npt.NDArray[np.int64],
+    ids: Int64s,
     old: Int64s,
     new: Int64s,
-    moves: npt.NDArray[np.bool_],
+    moves: Truths,
     placed: Collection[int],
     share: float,
-) -> Floats:
+) -> Float64s:
     """Interpolates positions between two ticks, in the same floats on both sides.
 
     An entity that the rules have placed meanwhile stays at its earlier position, and is at the new one from the second
@@ -35,7 +31,7 @@ def between(
     Returns:
         Positions in blocks, [n, 3].
     """
-    places: Floats = old / BLOCK
+    places: Float64s = old / BLOCK
     if share > 0:
         if placed:
             moves &= ~np.isin(ids, list(placed))

@@ -18,12 +18,11 @@ import itertools
 import math
 import zlib
 from collections.abc import Callable, Iterable, Iterator
-from typing import TypeVar
+from typing import Any
 
-import numpy as np
-import numpy.typing as npt
-
+from shared.arrays import PLAIN, Int32s, Truths, Uint8s, Uint32s, grown, np
 from shared.checks import Cell, MissingError, SceneError, cell, shown, whole
+from shared.fields import PACKED_MAX
 from shared.layout import CELLS
 from shared.units import RANGE_BLOCKS, SEGMENT, SEGMENT_SHIFT
 
@@ -37,16 +36,13 @@ SEGMENT_MAX = RANGE_BLOCKS // SEGMENT
 """Bound of a segment's index along each axis, in segments: from `-SEGMENT_MAX` to `SEGMENT_MAX - 1`."""
 FILL_MAX = 1 << 20
 """Limit of the blocks of one `World.fill`."""
-PACKED_MAX = 48 * 1024
-"""Longest packed segment, in bytes (random blocks of 256 kinds pack to 33 KB)."""
-
 DIGEST_BYTES = 16
 """Length of a segment's digest, in bytes."""
 
-Kinds = npt.NDArray[np.uint8]
+Kinds = Uint8s
 """Kinds of blocks; for a whole segment [32768], by index z << 10 | y << 5 | x."""
 
-Large = tuple[Kinds, npt.NDArray[np.uint32], npt.NDArray[np.int32]]
+Large = tuple[Kinds, Uint32s, Int32s]
 """The arrays `kinds`, `solid` and `heads` of `Blocks`."""
 
 _versions = itertools.count(1)
@@ -80,12 +76,14 @@ def unpack(data: bytes) -> Kinds:
     return np.frombuffer(raw, np.uint8)
 
 
-def checked_kinds(kinds: npt.ArrayLike) -> Kinds:
+def checked_kinds(kinds: Any) -> Kinds:
     """Returns the blocks of a segment as [32768] kinds.
 
     Raises:
         SceneError: `kinds` are not 32768 whole numbers from 0 to 255.
     """
+    if PLAIN and getattr(kinds, "dtype", None) == np.uint8 and len(kinds) == BLOCKS:
+        return kinds  # type: ignore[no-any-return]
     found = np.asarray(kinds)
     good = found.dtype.kind in "iu" and found.size == BLOCKS
     if not good or (found.dtype != np.uint8 and not AIR <= found.min() <= found.max() <= KIND_MAX):
@@ -139,17 +137,6 @@ def offset_of(x: int, y: int, z: int) -> int:
     return (z & inside) << 10 | (y & inside) << 5 | (x & inside)
 
 
-T = TypeVar("T", bound=np.generic)
-
-
-def grown(array: npt.NDArray[T], fill: int, length: int) -> npt.NDArray[T]:
-    """Returns a copy of an array with another length; new items are `fill`."""
-    new = np.full((length, *array.shape[1:]), fill, array.dtype)
-    kept = min(len(array), length)
-    new[:kept] = array[:kept]
-    return new
-
-
 class Blocks:
     """The loaded segments of a world, each in a row of the arrays.
 
@@ -162,7 +149,8 @@ class Blocks:
         """Whether blocks of a kind are solid, by kind."""
         for kind in passable:
             self.stops[kind] = False
-        self._solid_kinds = None if sum(self.stops) == KIND_MAX else np.array(self.stops)
+        self._solid_kinds = None if sum(self.stops) == KIND_MAX else np.array(self.stops, np.bool_)
+        self._digits = bytes(b"01"[stops] for stops in self.stops)
         self.count = 1  # row 0 is layout.NOWHERE
         self.rows: dict[Cell, int] = {}
         self.kinds: Kinds = np.zeros((1, BLOCKS), np.uint8)
@@ -202,12 +190,19 @@ class Blocks:
             self.segments[row] = index
             moved = self._enter(row) or moved
         self.kinds[row] = kinds
-        self.solid[row] = np.packbits(self._solid_of(kinds), bitorder="little").view("<u4")
+        self.solid[row] = self._words(kinds)
         self._touch(row)
         self._freshen(row)
         return moved
 
-    def _solid_of(self, kinds: Kinds) -> npt.NDArray[np.bool_]:
+    def _words(self, kinds: Kinds) -> Uint32s:
+        """Returns whether each block of a segment is solid, as bits of 1,024 words, the first block lowest."""
+        if not PLAIN:
+            return np.packbits(self._solid_of(kinds), bitorder="little").view("<u4")
+        digits = kinds.tobytes().translate(self._digits)[::-1]
+        return np.frombuffer(int(digits, 2).to_bytes(BLOCKS // 8, "little"), np.uint32)
+
+    def _solid_of(self, kinds: Kinds) -> Truths:
         """Returns whether each block is solid. Where all kinds are, a comparison is faster than a table."""
         return kinds != AIR if self._solid_kinds is None else self._solid_kinds[kinds]
 
@@ -250,6 +245,8 @@ class Blocks:
             before = self.get(x0, y0, z0)
             if before is not None:
                 return [(low, before)] if before != kind else []
+        if PLAIN:
+            return self._different(low, high, kind)
         found = np.zeros((z1 - z0, y1 - y0, x1 - x0), np.uint8)
         spans = [range(a >> SEGMENT_SHIFT, (b - 1 >> SEGMENT_SHIFT) + 1) for a, b in zip(low, high, strict=True)]
         for z, y, x in itertools.product(*reversed(spans)) if found.size else ():
@@ -265,6 +262,17 @@ class Blocks:
         at = np.argwhere(found != kind)
         kinds: list[int] = found[tuple(at.T)].tolist()
         return [((x0 + x, y0 + y, z0 + z), was) for (z, y, x), was in zip(at.tolist(), kinds, strict=True)]
+
+    def _different(self, low: Cell, high: Cell, kind: int) -> list[tuple[Cell, int]]:
+        """Returns the same as `different`, block by block."""
+        found = []
+        for z, y, x in itertools.product(*(range(a, b) for a, b in zip(low[::-1], high[::-1], strict=True))):
+            was = self.get(x, y, z)
+            if was is None:
+                raise SceneError(f"block {(x, y, z)}: its segment is not loaded")
+            if was != kind:
+                found.append(((x, y, z), was))
+        return found
 
     def set(self, x: int, y: int, z: int, kind: int) -> None:
         """Changes one block of a loaded segment.
@@ -284,7 +292,10 @@ class Blocks:
         Raises:
             MissingError: the segment is not loaded.
         """
-        view: Kinds = self.kinds[self.row(index)].reshape(SEGMENT, SEGMENT, SEGMENT)
+        kinds = self.kinds[self.row(index)]
+        if PLAIN:
+            return memoryview(kinds.tobytes()).cast("B", (SEGMENT, SEGMENT, SEGMENT))  # type: ignore[return-value]
+        view: Kinds = kinds.reshape(SEGMENT, SEGMENT, SEGMENT)
         view.flags.writeable = False
         return view
 
@@ -358,7 +369,7 @@ class Blocks:
         return False
 
     def _insert(self, row: int) -> None:
-        x, y, z = (int(part) for part in self.segments[row])
+        x, y, z = self.segments[row].tolist()
         mask = len(self.table) - 1
         at = (x * 73856093 ^ y * 19349663 ^ z * 83492791) & mask
         while self.table[at]:

@@ -5,16 +5,10 @@ are accepted and returned as Python's own, which MessagePack can hold. A truth v
 """
 
 import math
+import sys
 from collections.abc import Collection, Iterable, Mapping, Set, Sized
 from contextlib import suppress
 from typing import Any
-
-import numpy as np
-
-WHOLE = (int, np.integer)
-"""Types of whole numbers (`bool` is a subclass of `int`, and has to be excluded separately)."""
-NUMBERS = (*WHOLE, float, np.floating)
-"""Types of numbers (`bool` has to be excluded separately)."""
 
 Vec = tuple[float, float, float]
 """Three numbers: x, y, z."""
@@ -43,16 +37,39 @@ def shown(value: object) -> str:
     return text if len(text) <= 80 else f"{text[:77]}..."
 
 
+def is_whole(value: object) -> bool:
+    """Returns whether a value is a whole number: Python's or numpy's, and not a truth value."""
+    if isinstance(value, int):
+        return not isinstance(value, bool)
+    return _is_numpys(value, "integer")
+
+
+def is_truth(value: object) -> bool:
+    """Returns whether a value is a truth value: Python's or numpy's."""
+    return isinstance(value, bool) or _is_numpys(value, "bool_")
+
+
+def own_number(value: Any) -> Any:
+    """Returns a number of numpy as Python's own, and any other value as it is."""
+    return value.item() if _is_numpys(value, "generic") else value
+
+
+def _is_numpys(value: object, name: str) -> bool:
+    """Returns whether a value is of a type of numpy. As long as nobody has imported numpy, no value is."""
+    numpy = sys.modules.get("numpy")
+    return numpy is not None and isinstance(value, getattr(numpy, name))
+
+
 def finite(value: object, at: str) -> float:
     """Returns a finite number as a float.
 
     Raises:
         SceneError: `value` is not a number, or not finite.
     """
-    if isinstance(value, bool) or not isinstance(value, NUMBERS):
+    if not (isinstance(value, float) or is_whole(value) or _is_numpys(value, "floating")):
         raise SceneError(f"{at} = {shown(value)}: must be a number")
     try:
-        number = float(value)
+        number = float(value)  # type: ignore[arg-type]
     except OverflowError:
         number = math.inf
     if not math.isfinite(number):
@@ -106,7 +123,7 @@ def boolean(value: object, at: str) -> bool:
     Raises:
         SceneError: `value` is not a truth value.
     """
-    if not isinstance(value, bool | np.bool_):
+    if not is_truth(value):
         raise SceneError(f"{at} = {shown(value)}: must be true or false")
     return bool(value)
 
@@ -119,9 +136,9 @@ def whole(value: object, at: str, low: int, high: int) -> int:
     """
     if type(value) is int and low <= value <= high:
         return value
-    if isinstance(value, bool) or not isinstance(value, WHOLE) or not low <= value <= high:
+    if not is_whole(value) or not low <= value <= high:  # type: ignore[operator]
         raise SceneError(f"{at} = {shown(value)}: must be a whole number from {low} to {high}")
-    return int(value)
+    return int(value)  # type: ignore[call-overload, no-any-return]
 
 
 def choice(value: object, at: str, choices: Collection[str]) -> str:

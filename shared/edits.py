@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import msgpack
 
 from shared.blocks import AIR, KIND_MAX
-from shared.checks import WHOLE, SceneError, shown, whole
+from shared.checks import SceneError, is_whole, shown, whole
 from shared.free_places import OverlapError, overlapping
 from shared.layout import X
 from shared.messages import DONE, INVALID, OUT_OF_REACH, OVERLAPS
@@ -44,7 +44,7 @@ def checked(x: object, y: object, z: object, kind: object) -> Edit:
         TypeError: a value is not a whole number.
     """
     for value, at in ((x, "x"), (y, "y"), (z, "z"), (kind, "kind")):
-        if isinstance(value, bool) or not isinstance(value, WHOLE):
+        if not is_whole(value):
             raise TypeError(f"{at} = {shown(value)}: must be a whole number")
     try:
         at_x, at_y, at_z = (whole(value, at, -FAR, FAR) for value, at in ((x, "x"), (y, "y"), (z, "z")))

@@ -20,8 +20,7 @@ little-endian.
 from collections.abc import Iterable
 from typing import TYPE_CHECKING, NamedTuple
 
-import numpy as np
-
+from shared.arrays import np
 from shared.checks import SceneError
 from shared.fields import ENTITY_MAX
 from shared.layout import CELL, COLUMNS, Int64s
@@ -108,7 +107,9 @@ class Extras:
         self.new = self.starts.copy()
         """Values of a new entity, [templates, count]: `starts`, but an entity with a behaviour has a turn at once."""
         if behaviours:
-            self.new[self.behaviour_of >= 0, self.wakes_at] = AT_ONCE
+            for kind, behaviour in enumerate(self.behaviour_of.tolist()):
+                if behaviour >= 0:
+                    self.new[kind, self.wakes_at] = AT_ONCE
 
     def widened(self, states: Int64s) -> Int64s:
         """Returns states with all columns; those with 12 columns get the start values of their templates."""

@@ -9,7 +9,6 @@ import re
 from collections.abc import Callable
 from typing import Any
 
-from shared.blocks import PACKED_MAX
 from shared.bounds import STATUSES_S, TICK_RATE_MAX, in_ticks
 
 MESSAGE_MAX = 256 * 1024
@@ -38,6 +37,8 @@ COMMAND_MAX = (1 << 32) - 1
 """Greatest number of a command."""
 PAYLOAD_MAX = 1024
 """Longest payload of a command or a game event, in bytes."""
+PACKED_MAX = 48 * 1024
+"""Longest packed segment, in bytes (random blocks of 256 kinds pack to 33 KB)."""
 SEGMENTS_MAX = 1024
 """Limit of the segments in one snapshot."""
 TOKEN_MAX = 2048

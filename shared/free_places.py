@@ -5,8 +5,6 @@ A place is occupied if a block or a solid entity overlaps the box there. Boxes t
 
 from collections.abc import Iterable
 
-import numpy as np
-
 from shared import layout
 from shared.checks import SceneError, vector
 from shared.layout import ID
@@ -39,9 +37,12 @@ def overlapping(world: WorldState, but: int, box: list[int]) -> list[int]:
     near = _near(world, but, box)
     if not len(near):
         return []
-    low, high = np.array(box[:3]), np.array(box[3:])
-    hits = (near[:, :3] < high).all(axis=1) & (near[:, 3:6] > low).all(axis=1)
-    return sorted(world.matrix[near[hits, 6], ID].tolist())
+    x0, y0, z0, x1, y1, z1 = box
+    return sorted(
+        int(world.entity_rows[row, ID])
+        for low_x, low_y, low_z, high_x, high_y, high_z, row in near.tolist()
+        if low_x < x1 and low_y < y1 and low_z < z1 and high_x > x0 and high_y > y0 and high_z > z0
+    )
 
 
 def taken(world: WorldState, row: int, kind: int, box: list[int]) -> bool:

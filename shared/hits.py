@@ -1,13 +1,11 @@
 """Queries of rays and boxes among entities and blocks: on the server in the past, on a client in what it draws."""
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from fractions import Fraction
-from typing import Any, NamedTuple
-
-import numpy as np
-import numpy.typing as npt
+from typing import NamedTuple
 
 from shared import layout
+from shared.arrays import PLAIN, Float64s, np
 from shared.checks import Cell, Vec, vector
 from shared.layout import Int64s
 from shared.rays import Ray
@@ -16,8 +14,6 @@ from shared.units import BLOCK
 
 MARGIN = 1e-3
 """Blocks by which boxes are enlarged in the quick test in floats. Boxes that pass it are tested exactly."""
-
-Floats = npt.NDArray[np.float64]
 
 
 class Hit(NamedTuple):
@@ -39,7 +35,7 @@ class Targets:
         own: entity that no query finds.
     """
 
-    def __init__(self, ids: Int64s, low: Floats, high: Floats, own: int) -> None:
+    def __init__(self, ids: Int64s, low: Float64s, high: Float64s, own: int) -> None:
         self._ids, self._low, self._high, self._own = ids, low, high, own
 
     def solid(self, cell: Cell) -> bool:
@@ -63,7 +59,7 @@ class Targets:
         ray = Ray(origin, direction, length)
         wall = ray.meets(self.solid)
         met: list[tuple[Fraction, int]] = []
-        for i in self._near(ray).tolist():
+        for i in self._near(ray):
             entity = int(self._ids[i])
             if entity == self._own or entity in but:
                 continue
@@ -81,13 +77,16 @@ class Targets:
         Raises:
             SceneError: a number is not finite.
         """
-        hits = (self._low < np.array(vector(high, "high"))).all(axis=1)
-        hits &= (self._high > np.array(vector(low, "low"))).all(axis=1)
+        hits = (self._low < np.array(vector(high, "high"), np.float64)).all(axis=1)
+        hits &= (self._high > np.array(vector(low, "low"), np.float64)).all(axis=1)
         return sorted(entity for entity in self._ids[hits].tolist() if entity != self._own)
 
-    def _near(self, ray: Ray) -> Int64s:
+    def _near(self, ray: Ray) -> Iterable[int]:
         """Returns the indices of the entities that the ray may hit, by the slab test in floats with a margin."""
         largest = max(map(abs, ray.direction))
+        if PLAIN:
+            boxes = zip(self._low.tolist(), self._high.tolist(), strict=True)
+            return (i for i, box in enumerate(boxes) if _may_hit(ray, largest, *box))
         origin, way = np.array(ray.origin), np.array(ray.direction) / largest
         low, high = self._low - origin - MARGIN, self._high - origin + MARGIN
         steep = np.abs(way) > 1e-12
@@ -96,10 +95,24 @@ class Targets:
         first = np.minimum(ends_low, ends_high).max(axis=1)
         last = np.maximum(ends_low, ends_high).min(axis=1)
         reach = ray.length + 2 * MARGIN
-        return np.flatnonzero(inside & (first <= last) & (last >= -MARGIN) & (first <= reach))
+        near: list[int] = np.flatnonzero(inside & (first <= last) & (last >= -MARGIN) & (first <= reach)).tolist()
+        return near
 
 
-def boxes_of(scene: Scene) -> Any:
-    """Returns low corner (relative to the position) and sides of the box of each template, [n, 2, 3], in blocks."""
-    rows = scene.kernel_tables()[0][:, layout.LO_X : layout.LO_X + 6]
-    return rows.reshape(-1, 2, 3) / BLOCK
+def _may_hit(ray: Ray, largest: float, low: list[float], high: list[float]) -> bool:
+    """Returns whether a ray may hit a box, as `Targets._near`."""
+    first, last = -MARGIN, ray.length + 2 * MARGIN
+    for origin, part, a, b in zip(ray.origin, ray.direction, low, high, strict=True):
+        way, a, b = part / largest, a - origin - MARGIN, b - origin + MARGIN
+        if abs(way) > 1e-12:
+            ends = sorted((a / way, b / way))
+            first, last = max(first, ends[0]), min(last, ends[1])
+        elif a > 0 or b < 0:
+            return False
+    return first <= last
+
+
+def boxes_of(scene: Scene) -> list[list[float]]:
+    """Returns low corner (relative to the position) and sides of the box of each template, in blocks."""
+    rows = scene.kernel_tables()[0].tolist()
+    return [[part / BLOCK for part in row[layout.LO_X : layout.LO_X + 6]] for row in rows]

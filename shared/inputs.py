@@ -4,10 +4,8 @@ import math
 import struct
 from typing import NamedTuple
 
-import numpy as np
-
 from shared.aim import NO_AIM, Aim, checked_aim, make_aim, normalised
-from shared.checks import SceneError, boolean, finite, shown, whole
+from shared.checks import SceneError, boolean, finite, is_truth, shown, whole
 from shared.units import rounded
 
 MOVE_MAX = 127
@@ -70,7 +68,7 @@ def _way(part: object, at: str) -> float:
     """Returns one part of a direction, checked."""
     if type(part) in (float, int) and -FAR <= part <= FAR:  # type: ignore[operator]
         return part  # type: ignore[return-value]
-    number = finite(int(part) if isinstance(part, bool | np.bool_) else part, at)
+    number = finite(int(part) if is_truth(part) else part, at)  # type: ignore[call-overload]
     if abs(number) > FAR:
         raise SceneError(f"{at} = {shown(part)}: must be finite, from -{FAR:g} to {FAR:g}")
     return number

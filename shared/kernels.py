@@ -18,15 +18,14 @@ import json
 import os
 import platform
 import sys
+from array import array
 from collections.abc import Callable, Iterator
 from importlib.machinery import EXTENSION_SUFFIXES, ExtensionFileLoader
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
 from typing import Any
 
-import numpy as np
-
-from shared import bulk, exports, freshness, kernel, numba_kernel
+from shared import bulk, exports, freshness, kernel, numba_kernel, wasm_kernel
 
 VARIABLE = "SOVEREIGN_KERNEL"
 """Name of the environment variable that forces a form."""
@@ -47,10 +46,13 @@ TARGETS = {
     ("linux", "aarch64"): "linux-arm64.so",
     ("win32", "amd64"): "windows-x86_64.pyd",
     ("darwin", "arm64"): "macos-arm64.so",
+    ("emscripten", "wasm32"): "kernel-emscripten.so",
 }
 """File name of the library for each platform (`sys.platform`, `platform.machine()`)."""
 MANIFEST = "manifest.json"
 """File name of the list of libraries with their checksums."""
+IN_BROWSER = sys.platform == "emscripten"
+"""Whether this is Pyodide."""
 CONSTANTS_CRC, CODE_CRC = range(2)
 """Arguments of a library's function `built_from`: which checksum it returns."""
 
@@ -61,7 +63,7 @@ class Kernel(SimpleNamespace):
     Attributes:
         form: one of `FORMS`.
         compiled: whether the form is a compiled one.
-        lent: returns the flat array that functions take for a numpy array; both share the memory.
+        lent: returns the flat array that functions take for an array of `shared.arrays`; both share the memory.
         bound: returns the value that functions take for the `Arrays` of a world. The caller has to keep the arrays
             alive.
     """
@@ -199,9 +201,10 @@ def _loaded(form: str) -> Kernel:
     return _kernels[form]
 
 
-def _view(array: np.ndarray[Any, Any]) -> memoryview:
+def _view(array: Any) -> memoryview:
     """Returns a flat view of an array. The plain sources read Python's own numbers from it, a library its buffer."""
-    return memoryview(array.reshape(-1))  # type: ignore[arg-type]
+    view: memoryview = array.reshape(-1).data
+    return view
 
 
 def _plain() -> Kernel:
@@ -212,18 +215,25 @@ def _plain() -> Kernel:
 def kernel_of(library: ModuleType, form: str = PREBUILT) -> Kernel:
     """Returns the kernel in a Python module that `scripts/kernels` builds."""
     functions = {name: getattr(library, name) for name in exports.functions()}
+    if IN_BROWSER:
+        return Kernel(form=form, compiled=True, lent=wasm_kernel.lent, bound=wasm_kernel.bound, **functions)
     return Kernel(form=form, compiled=True, lent=_view, bound=_table, **functions)
 
 
 def _table(arrays: Any) -> memoryview:
     """Returns a table with the address and the length of each array."""
-    words = [word for each in map(np.asarray, arrays) for word in (each.__array_interface__["data"][0], each.size)]
-    return memoryview(np.array(words, np.int64))  # type: ignore[arg-type]
+    words = array("q")
+    for view in arrays:
+        words.append(wasm_kernel.address_of(view))
+        words.append(len(view))
+    return memoryview(words)
 
 
 def _target() -> str:
     """Returns the file name of the library for this platform; empty if there is none."""
-    return TARGETS.get((sys.platform, platform.machine().lower()), "") if sys.maxsize > 1 << 32 else ""
+    if not IN_BROWSER and sys.maxsize <= 1 << 32:
+        return ""
+    return TARGETS.get((sys.platform, platform.machine().lower()), "")
 
 
 @functools.cache
@@ -236,22 +246,39 @@ def _library() -> ModuleType:
     target = _target()
     if not target:
         raise ImportError(f"no prebuilt kernel for {sys.platform} {platform.machine()}")
-    if ".abi3.so" not in EXTENSION_SUFFIXES and (os.name != "nt" or EXTENSION_SUFFIXES[0].partition("-")[0][-1] == "t"):
+    if not _loads_libraries():
         raise ImportError("no prebuilt kernel for this kind of Python: it has no stable ABI")
     known, path = _manifest(), LIBRARIES / target
     with contextlib.suppress(OSError):  # the loader reports a missing file with a better message
         if known and hashlib.sha256(path.read_bytes()).hexdigest() != known["files"][target]["sha256"]:
             raise ImportError(f"{path}: damaged")
-    loader = ExtensionFileLoader(MODULE, str(path))
-    spec = importlib.util.spec_from_file_location(MODULE, loader.path, loader=loader)
-    assert spec is not None
-    module = importlib.util.module_from_spec(spec)
-    loader.exec_module(module)
+    module = wasm_kernel.loaded(path) if IN_BROWSER else _extension(path)
     built: Callable[[int], int] = module.built_from
     if built(CONSTANTS_CRC) != constants_crc() or not _made_from_the_sources(built(CODE_CRC), known):
         raise ImportError(
             "the prebuilt kernel was not made from the present shared/kernel.py and shared/bulk.py; run scripts/kernels"
         )
+    return module
+
+
+def _loads_libraries() -> bool:
+    """Returns whether this Python can load the library of its platform."""
+    if IN_BROWSER or ".abi3.so" in EXTENSION_SUFFIXES:
+        return True
+    return os.name == "nt" and EXTENSION_SUFFIXES[0].partition("-")[0][-1] != "t"
+
+
+def _extension(path: Path) -> ModuleType:
+    """Loads the Python module in a library.
+
+    Raises:
+        ImportError: it cannot be loaded.
+    """
+    loader = ExtensionFileLoader(MODULE, str(path))
+    spec = importlib.util.spec_from_file_location(MODULE, loader.path, loader=loader)
+    assert spec is not None
+    module = importlib.util.module_from_spec(spec)
+    loader.exec_module(module)
     return module
 
 

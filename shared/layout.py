@@ -1,23 +1,19 @@
 """The memory layout of a world: the arrays that `World` and its kernel share.
 
-An entity is a row of 16 int64. The kernel sees a plain matrix and numpy a structured array; both use the column names
-below.
+An entity is a row of 16 int64, with the columns below.
 """
 
 from typing import Any, NamedTuple
 
-import numpy as np
-import numpy.typing as npt
+from shared.arrays import Int64s as Int64s
 
 COLUMNS = "id template flags x y z vx vy vz move_x move_y buttons cell next prev changed".split()
 """Names of the columns of an entity's row."""
 ID, TEMPLATE, FLAGS, X, Y, Z, VX, VY, VZ, MOVE_X, MOVE_Y, BUTTONS, CELL, NEXT, PREV, CHANGED = range(16)
-"""Columns of an entity's row; the first 12 are its state."""
-ENTITY = np.dtype([(name, np.int64) for name in COLUMNS])
-"""Type of an entity's row. `id` is 0 in a free row. Position and velocity are in grid steps. `cell` is the entity's
-cell in the entity index (-1: none), and `next` and `prev` are its neighbour rows in that cell. `changed` is
-`tick << EVENT_BITS | events`: the tick that last changed the entity, and the events of that tick, which a client cannot
-extrapolate (`kernel.advance`)."""
+"""Columns of an entity's row; the first 12 are its state. `id` is 0 in a free row. Position and velocity are in grid
+steps. `cell` is the entity's cell in the entity index (-1: none), and `next` and `prev` are its neighbour rows in that
+cell. `changed` is `tick << EVENT_BITS | events`: the tick that last changed the entity, and the events of that tick,
+which a client cannot extrapolate (`kernel.advance`)."""
 
 WIDTH_SHIFT = 4
 """Shift from an entity's row to its start in the kernel's flat view: row r begins at r << WIDTH_SHIFT."""
@@ -83,8 +79,6 @@ RIDER = 2
 """Number of columns of an entry of `Arrays.riders`."""
 NOWHERE = 0
 """Segment row whose cells hold the entities of all segments that are not loaded; these are still obstacles."""
-
-Int64s = npt.NDArray[np.int64]
 
 
 class Arrays(NamedTuple):

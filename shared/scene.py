@@ -12,11 +12,11 @@ from pathlib import Path
 from typing import Any
 
 import msgpack
-import numpy as np
 
 from shared import behaviours as behaviour_classes
 from shared import layout
 from shared.aim import NO_AIM, Aim
+from shared.arrays import np
 from shared.behaviours import BehaviourEntry, checked_entries
 from shared.block_kind import BlockKind, numbered, numbered_fill
 from shared.bounds import TICK_RATE_MAX
@@ -323,20 +323,19 @@ class Scene(SceneCopies):
     def kernel_tables(self) -> tuple[layout.Int64s, layout.Int64s, layout.Int64s]:
         """Returns templates, walk velocities and parameters for `layout.Arrays`; each number is rounded once."""
         rows = [[*t.row(), *t.rates(self.gravity, self.tick_rate), t.carries] for t in self.templates]
-        templates = np.array(rows, np.int64)
-        walk = np.array([_walk_velocities(template.walk_speed) for template in self.templates], np.int64)
-        p = np.zeros(layout.PARAMETERS, np.int64)
-        p[layout.GRAVITY] = (templates[:, layout.WEIGHT] > 0).any()
+        walk = [_walk_velocities(template.walk_speed) for template in self.templates]
+        p = [0] * layout.PARAMETERS
+        p[layout.GRAVITY] = any(row[layout.WEIGHT] > 0 for row in rows)
         p[layout.TERMINAL] = to_velocity(self.terminal_speed, "terminal_speed")
         p[layout.RATE] = self.tick_rate
         p[layout.EXACT] = 128 // self.tick_rate if 128 % self.tick_rate == 0 else 0
         p[layout.MEAN] = self.integrator == "mean"
         p[layout.PAIRS] = self.entity_collision
         p[layout.FLOOR] = self.origin[2] * SEGMENT
-        low, high = templates[:, :3], templates[:, :3] + templates[:, 3:6]
-        p[layout.REACH_LO : layout.REACH_LO + 3] = (-low).max(axis=0)
-        p[layout.REACH_HI : layout.REACH_HI + 3] = high.max(axis=0)
-        return templates, walk, p
+        for axis in range(3):
+            p[layout.REACH_LO + axis] = max(-row[layout.LO_X + axis] for row in rows)
+            p[layout.REACH_HI + axis] = max(row[layout.LO_X + axis] + row[layout.SIZE_X + axis] for row in rows)
+        return np.array(rows, np.int64), np.array(walk, np.int64), np.array(p, np.int64)
 
 
 def load_scene(name_or_path: str | Path) -> Scene:

@@ -27,13 +27,14 @@ entity that was written, or has changed its segment, is sent as a row. So is eve
 more than one tick.
 """
 
+import functools
 import hashlib
+import struct
 from collections.abc import Collection, Sequence
 from typing import Any, NamedTuple
 
-import numpy as np
-
 from shared import bulk, kernels
+from shared.arrays import np
 from shared.checks import Cell
 from shared.fields import ENTITY_MAX, shown
 from shared.kernels import Kernel
@@ -53,30 +54,25 @@ from shared.messages import ProtocolError, pack
 from shared.units import BLOCK, SEGMENT
 from shared.world import World
 
-ROW = np.dtype(
-    [("id", "<u4"), ("template", "u1"), ("flags", "u1")]
-    + [(name, "<i4") for name in ("x", "y", "z", "vx", "vy", "vz")]
-    + [("move_x", "i1"), ("move_y", "i1"), ("buttons", "u1")]
-)
-"""Layout of a row of `rows`."""
-ROW_BYTES = ROW.itemsize
+ROW = struct.Struct("<IBB6i2bB")
+"""Format of a row of `rows`."""
+ROW_BYTES = ROW.size
 """Length of a row, in bytes."""
 FLAGS_AT = 5
 """Place of the flags within a row, in bytes."""
-ROW_BY_SIZE = np.dtype([("id", "<u4"), ("kind", "u1", 2), ("place", "<i4", 6), ("move", "i1", 2), ("buttons", "u1")])
-"""Layout of a row as runs of fields of equal size, each of which is converted at once."""
 COLUMNS_BY_SIZE = (
     (ID, "id"), (slice(TEMPLATE, X), "kind"), (slice(X, MOVE_X), "place"), (slice(MOVE_X, BUTTONS), "move"),
     (BUTTONS, "buttons"),
 )  # fmt: skip
-"""Columns of a state for each field of `ROW_BY_SIZE`."""
-HEAD = np.dtype([("id", "<u4"), ("events", "u1")])
-"""Layout of an entry of `heads`."""
-VERDICT = np.dtype([("number", "<u4"), ("verdict", "u1")])
-"""Layout of an entry of `Snapshot.verdicts`."""
-EDIT = np.dtype([("block", "<u2"), ("kind", "u1")])
-"""Layout of an entry of `edits`."""
-NO_EDITS = np.zeros(0, EDIT)
+"""Columns of a state for each field of `row_by_size`."""
+HEAD = struct.Struct("<IB")
+"""Format of an entry of `heads`: id and events."""
+VERDICT = struct.Struct("<IB")
+"""Format of an entry of `Snapshot.verdicts`: the number of a command, and its verdict."""
+EDIT = struct.Struct("<HB")
+"""Format of an entry of `edits`: block and kind."""
+DROP = struct.Struct("<3i")
+"""Format of an entry of `Snapshot.drops`: the index of a segment."""
 NO_STATES = np.zeros((0, CELL), np.int64)
 NO_TURNS = np.zeros((0, TURN), np.int64)
 NO_FIELDS: list[Any] = [b"", b"", b"", b"", 0, b"", [], b""]
@@ -87,7 +83,7 @@ FIELDS = ("id", "template", "flags", "x", "y", "z", "vx", "vy", "vz", "move_x", 
 """Names of the columns of a state."""
 assert len(FIELDS) == CELL == BUTTONS + 1
 assert SIDE & (SIDE - 1) == 0
-assert (HEAD.itemsize, ROW_BYTES) == (bulk.HEAD_BYTES, bulk.ROW_BYTES)
+assert (HEAD.size, ROW_BYTES) == (bulk.HEAD_BYTES, bulk.ROW_BYTES)
 FAR = 1 << 23
 """Bound of a segment's index along each axis, in segments: from `-FAR` to `FAR - 1`."""
 
@@ -114,18 +110,25 @@ STATE_HIGH = np.array(
 class DecodedDelta(NamedTuple):
     """A decoded part of a snapshot.
 
-    `entities` is the number of the part's states, `gone` has ids, and `edits` has `EDIT` records. The other fields are
-    those of the wire format; `Extras.decode` reads `fields`.
+    `entities` is the number of the part's states, `gone` has ids, and `edits` has pairs of block and kind. The other
+    fields are those of the wire format; `Extras.decode` reads `fields`.
     """
 
     segment: Cell
     ago: int
     entities: int
     gone: list[int]
-    edits: np.ndarray[Any, np.dtype[Any]]
+    edits: list[tuple[int, int]]
     check: int
     attributes: list[tuple[int, dict[str, Any]]]
     fields: bytes
+
+
+@functools.cache
+def row_by_size() -> "np.dtype[Any]":
+    """Returns numpy's layout of a row as runs of fields of equal size, each of which is converted at once."""
+    runs = [("id", "<u4"), ("kind", "u1", 2), ("place", "<i4", 6), ("move", "i1", 2), ("buttons", "u1")]
+    return np.dtype(runs)
 
 
 def encode_rows(rows: Int64s, acted: Collection[int] = (), placed: Collection[int] = ()) -> bytes:
@@ -136,7 +139,7 @@ def encode_rows(rows: Int64s, acted: Collection[int] = (), placed: Collection[in
         acted: ids that get the flag `ACTED`.
         placed: ids that get the flags `ACTED` and `PLACED`.
     """
-    packed = np.empty(len(rows), ROW_BY_SIZE)
+    packed = np.empty(len(rows), row_by_size())
     for columns, name in COLUMNS_BY_SIZE:
         packed[name] = rows[:, columns]
     flags = packed["kind"][:, 1]
@@ -256,8 +259,8 @@ def join_part(
     extra: bytes = b"",
 ) -> bytes:
     """Returns a segment's part like `encode_part`, from `packed`: its heads, tails and rows."""
-    packed_gone = np.array(gone, "<u4").tobytes() if gone else b""
-    packed_edits = np.array(edits, EDIT).tobytes() if edits else b""
+    packed_gone = struct.pack(f"<{len(gone)}I", *gone) if gone else b""
+    packed_edits = b"".join(EDIT.pack(*edit) for edit in edits) if edits else b""
     fields = [*packed, packed_gone, check, packed_edits, attributes, extra]
     while fields and not fields[-1]:
         del fields[-1]
@@ -319,7 +322,7 @@ def _decode_rows(rows: bytes, corners: list[int], templates: int, kernel: Kernel
 
 
 def _decode_turns(heads: bytes, tails: bytes, kernel: Kernel) -> Int64s:
-    turns = np.empty((len(heads) // HEAD.itemsize, TURN), np.int64)
+    turns = np.empty((len(heads) // HEAD.size, TURN), np.int64)
     if not kernel.read_turns(heads, tails, kernel.lent(turns)):
         raise ProtocolError("segment.tails: too many or too few bytes for the heads")
     return turns
@@ -342,7 +345,7 @@ def _decode_part(part: Any, corners: list[int], packed: tuple[list[bytes], ...])
     if not (
         type(heads) is type(tails) is type(rows) is type(gone) is type(edits) is type(fields) is bytes
         and max(len(heads), len(tails), len(rows), len(gone), len(edits), len(fields)) <= PART_MAX
-        and len(heads) % HEAD.itemsize == len(rows) % ROW_BYTES == len(gone) % 4 == len(edits) % EDIT.itemsize == 0
+        and len(heads) % HEAD.size == len(rows) % ROW_BYTES == len(gone) % 4 == len(edits) % EDIT.size == 0
     ):
         raise ProtocolError(
             "segment: heads, tails, rows, gone, edits or fields are not bytes, too long, or of a wrong length"
@@ -353,10 +356,10 @@ def _decode_part(part: Any, corners: list[int], packed: tuple[list[bytes], ...])
     all_heads.append(heads)
     all_tails.append(tails)
     all_rows.append(rows)
-    edited = np.frombuffer(edits, EDIT) if edits else NO_EDITS
-    if edits and int(edited["block"].max()) >= SEGMENT**3:
+    edited = list(EDIT.iter_unpack(edits)) if edits else []
+    if edits and max(edited)[0] >= SEGMENT**3:
         raise ProtocolError("segment.edits: a block is out of range")
-    left = np.frombuffer(gone, "<u4").tolist() if gone else []
+    left = list(struct.unpack(f"<{len(gone) // 4}I", gone)) if gone else []
     tables = _decode_attributes(attributes) if attributes != [] else []
     entities = len(rows) // ROW_BYTES
     corners += (x * SIDE, y * SIDE, z * SIDE, entities)

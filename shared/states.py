@@ -1,9 +1,12 @@
-"""Checks of entities' states. The kernel does not check its rows, and a wrong value would make it read any memory."""
+"""Checks of entities' states. The kernel does not check its rows, and a wrong value would make it read any memory.
+
+The functions need numpy. A client does not call them.
+"""
 
 from collections.abc import Iterable
+from typing import Any
 
-import numpy as np
-
+from shared.arrays import np
 from shared.checks import SceneError, shown
 from shared.extras import Extras
 from shared.inputs import BUTTONS_MAX, MOVE_MAX
@@ -54,6 +57,35 @@ def checked_states(states: Iterable[tuple[int, ...]] | Int64s, templates: int, e
     if len(np.unique(matrix[:, ID])) < len(matrix):
         raise SceneError("states: two rows have the same id")
     return matrix
+
+
+def to_positions(values: Any, field: str) -> Int64s:
+    """Converts positions [n, 3] in blocks to grid steps.
+
+    Args:
+        values: the positions.
+        field: name of the field, for the error.
+
+    Raises:
+        SceneError: the shape is another one, or a value is not finite or outside +-2^28 blocks.
+    """
+    try:
+        given = np.asarray(values)
+    except (TypeError, ValueError) as error:  # rows of different lengths
+        raise SceneError(f"{field} = {shown(values)}: must be rows of three numbers") from error
+    if given.dtype.kind not in "iuf":
+        raise SceneError(f"{field} = {shown(values)}: must be rows of three numbers")
+    blocks = given.astype(np.float64)
+    if blocks.ndim != 2 or blocks.shape[1] != 3:
+        raise SceneError(f"{field}: must be rows of three numbers, not of shape {blocks.shape}")
+    bad = np.flatnonzero(~(np.abs(blocks) <= RANGE_BLOCKS).all(axis=1))
+    if len(bad):
+        raise SceneError(f"{field}[{bad[0]}] = {blocks[bad[0]].tolist()}: outside of +-{RANGE_BLOCKS} blocks")
+    size = np.abs(blocks) * BLOCK
+    whole = np.floor(size)
+    whole += size - whole >= 0.5
+    steps: Int64s = np.where(blocks >= 0, whole, -whole).astype(np.int64)
+    return steps
 
 
 _LOW, _HIGH = np.zeros(STATES, np.int64), np.zeros(STATES, np.int64)

@@ -3,9 +3,7 @@
 from dataclasses import dataclass, fields
 from typing import Any
 
-import numpy as np
-
-from shared.checks import SceneError, Vec, boolean, choice, finite, text, vector
+from shared.checks import SceneError, Vec, boolean, choice, finite, own_number, text, vector
 from shared.units import to_position, to_velocity
 
 BOX_MAX = 32.0
@@ -20,8 +18,8 @@ def own_numbers(owner: Any) -> None:
     """Replaces numpy's numbers in the fields of a dataclass by Python's own, because MessagePack holds no others."""
     for f in fields(owner):
         value = getattr(owner, f.name)
-        if isinstance(value, np.generic):
-            object.__setattr__(owner, f.name, value.item())
+        if (own := own_number(value)) is not value:
+            object.__setattr__(owner, f.name, own)
 
 
 @dataclass(frozen=True)

@@ -14,9 +14,7 @@ changes are not reported to the world's observer, because a replay of a recordin
 from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING, NamedTuple
 
-import numpy as np
-import numpy.typing as npt
-
+from shared.arrays import PLAIN, Truths, np
 from shared.body import Body
 from shared.body_fields import body_class
 from shared.checks import SceneError
@@ -26,7 +24,7 @@ from shared.layout import BUTTONS, CELL, FALLING, FLAGS, ID, MOVE_X, MOVE_Y, TEM
 if TYPE_CHECKING:
     from shared.world_turns import TurnWorld
 
-FEW = 16
+FEW = 1 << 31 if PLAIN else 16
 """Number of entities with behaviours up to which Python looks for the active ones; numpy takes about 10 us at least."""
 FAILURES_MAX = 64
 """Limit of the failed turns that a world keeps until they are taken."""
@@ -205,11 +203,11 @@ class Turns:
             self._few = self.rows.tolist() if len(self.rows) <= FEW else None
         return self.rows
 
-    def _active(self, rows: Int64s, inputs: Mapping[int, Input]) -> npt.NDArray[np.bool_]:
+    def _active(self, rows: Int64s, inputs: Mapping[int, Input]) -> Truths:
         """Returns for each row whether its entity may be active."""
         world = self._world
         states, wakes = world.entity_rows[rows], world.extra_rows[rows, world.extras.wakes_at]
-        active: npt.NDArray[np.bool_] = (
+        active: Truths = (
             (states[:, VX:CELL] != 0).any(axis=1)
             | (states[:, FLAGS] & FALLING != 0)
             | ((wakes > 0) & (wakes <= world.tick + 1))

@@ -7,10 +7,7 @@ program (blocks and blocks/s) are rounded once, when they enter.
 
 import math
 
-import numpy as np
-import numpy.typing as npt
-
-from shared.checks import SceneError, finite, shown
+from shared.checks import SceneError, finite
 
 BLOCK_SHIFT = 24
 """Shift from a position in grid steps to blocks."""
@@ -54,35 +51,6 @@ def to_position(value: object, field: str) -> int:
     if abs(blocks) > RANGE_BLOCKS:
         raise SceneError(f"{field} = {value!r}: outside of +-{RANGE_BLOCKS} blocks")
     return rounded(blocks * BLOCK)
-
-
-def to_positions(values: npt.ArrayLike, field: str) -> npt.NDArray[np.int64]:
-    """Converts positions [n, 3] in blocks to grid steps.
-
-    Args:
-        values: the positions.
-        field: name of the field, for the error.
-
-    Raises:
-        SceneError: the shape is another one, or a value is not finite or outside +-2^28 blocks.
-    """
-    try:
-        given = np.asarray(values)
-    except (TypeError, ValueError) as error:  # rows of different lengths
-        raise SceneError(f"{field} = {shown(values)}: must be rows of three numbers") from error
-    if given.dtype.kind not in "iuf":
-        raise SceneError(f"{field} = {shown(values)}: must be rows of three numbers")
-    blocks = given.astype(np.float64)
-    if blocks.ndim != 2 or blocks.shape[1] != 3:
-        raise SceneError(f"{field}: must be rows of three numbers, not of shape {blocks.shape}")
-    bad = np.flatnonzero(~(np.abs(blocks) <= RANGE_BLOCKS).all(axis=1))
-    if len(bad):
-        raise SceneError(f"{field}[{bad[0]}] = {blocks[bad[0]].tolist()}: outside of +-{RANGE_BLOCKS} blocks")
-    size = np.abs(blocks) * BLOCK
-    whole = np.floor(size)
-    whole += size - whole >= 0.5
-    steps: npt.NDArray[np.int64] = np.where(blocks >= 0, whole, -whole).astype(np.int64)
-    return steps
 
 
 def to_velocity(value: object, field: str) -> int:

@@ -15,18 +15,17 @@ changes it for the behaviours of a scene. This module checks the arguments.
 """
 
 from collections.abc import Iterable, Mapping
+from typing import Any
 
-import numpy as np
-import numpy.typing as npt
-
-from shared import blocks, layout, terrain
+from shared import blocks, layout
+from shared.arrays import np
 from shared.checks import Cell, SceneError, boolean, shown, vector, whole
 from shared.extras import Record
 from shared.free_places import OverlapError, box_at, free_place, taken
 from shared.inputs import Input
 from shared.layout import FLAGS, ID, MOVE_X, TEMPLATE, VX, X
-from shared.states import ID_MAX, STATES, checked_states
-from shared.units import BLOCK, SPEED, SPEED_MAX, to_positions, to_velocity
+from shared.states import ID_MAX, STATES, checked_states, to_positions
+from shared.units import BLOCK, SPEED, SPEED_MAX, to_velocity
 from shared.world_turns import TurnWorld
 
 __all__ = ["OverlapError", "World"]
@@ -51,6 +50,8 @@ class World(TurnWorld):
 
     def load_terrain(self, indices: Iterable[Cell] | None = None) -> None:
         """Generates segments with the scene's terrain generator; all segments of the scene by default."""
+        from shared import terrain  # here, because a client gets its terrain from a server
+
         for index in self.scene.segments() if indices is None else indices:
             segment = blocks.checked_segment(index)
             self._load(segment, terrain.generate(self.scene.terrain, segment))
@@ -141,7 +142,7 @@ class World(TurnWorld):
         self._put([(entity, kind, self._thrown(kind, speed[2]), *at, *speed, 0, 0, 0, *more)])
         return entity
 
-    def spawn_many(self, template: str, positions: npt.ArrayLike) -> range:
+    def spawn_many(self, template: str, positions: Any) -> range:
         """Adds entities at rest, as `spawn` would one after the other; all of them, or none if it raises an error.
 
         Args:

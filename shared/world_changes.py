@@ -8,10 +8,9 @@ an entity aside) is not reported by itself.
 from collections.abc import Iterable, Mapping
 from typing import Protocol
 
-import numpy as np
-
 from shared import blocks, layout
 from shared.aim import NO_AIM
+from shared.arrays import np
 from shared.checks import Cell, SceneError, shown
 from shared.extras import RESERVED
 from shared.free_places import OverlapError, box_at, free_place, overlapping

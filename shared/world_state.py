@@ -13,13 +13,11 @@ import struct
 from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-import numpy.typing as npt
-
 from shared import blocks, kernels, layout
+from shared.arrays import Uint8s, grown, np
 from shared.behaviours import Field
-from shared.checks import Cell, MissingError, SceneError, shown, whole
-from shared.layout import ENTITY, FALLING, FLAGS, ID, NEXT, TEMPLATE, VX, Arrays, X
+from shared.checks import Cell, MissingError, SceneError, is_whole, shown, whole
+from shared.layout import FALLING, FLAGS, ID, NEXT, TEMPLATE, VX, Arrays, X
 from shared.scene import Scene
 from shared.states import ID_MAX, STATES
 from shared.units import BLOCK, SPEED
@@ -87,12 +85,13 @@ class WorldState:
         return len(self._row_of)
 
     def __contains__(self, entity: object) -> bool:
-        return isinstance(entity, int | np.integer) and not isinstance(entity, bool) and entity in self._row_of
+        return (type(entity) is int or is_whole(entity)) and entity in self._row_of
 
     @property
-    def entities(self) -> np.ndarray[Any, np.dtype[Any]]:
-        """A copy of all entities as a structured array (`layout.ENTITY`, in grid steps), ascending by id."""
-        return self.rows(sorted(self._row_of)).view(ENTITY).reshape(-1)
+    def entities(self) -> "np.ndarray[Any, np.dtype[Any]]":
+        """A copy of all entities as a structured array of numpy (`layout.COLUMNS`, in grid steps), ascending by id."""
+        kind = np.dtype([(name, np.int64) for name in layout.COLUMNS])
+        return self.rows(sorted(self._row_of)).view(kind).reshape(-1)
 
     def rows(self, entities: Iterable[int]) -> layout.Int64s:
         """Returns a copy of some entities as an int64 matrix [n, 16], in the given order (columns as in `layout`)."""
@@ -322,18 +321,18 @@ class WorldState:
 
     def _allocate(self, rows: int) -> None:
         """Makes room for `rows` entities, and keeps the present ones."""
-        self._entities = blocks.grown(self._entities, 0, rows)
+        self._entities = grown(self._entities, 0, rows)
         if self.extras.count:
-            self._extra = blocks.grown(self._extra, 0, rows)
+            self._extra = grown(self._extra, 0, rows)
         for name in ("_awake", "_next_awake", "_woken", "_later", "_changed", "_fell"):
-            setattr(self, name, blocks.grown(getattr(self, name), 0, rows + 1))
+            setattr(self, name, grown(getattr(self, name), 0, rows + 1))
         self.candidates = np.zeros((rows + 1, layout.CANDIDATE), np.int64)
         self._riders = np.zeros((rows + 1, layout.RIDER), np.int64)
 
     def _bind(self) -> None:
         """Passes the arrays to the kernel; called whenever one has moved in memory."""
         b = self.blocks
-        arrays: tuple[np.ndarray[Any, Any], ...] = (
+        arrays: tuple[Any, ...] = (
             self._entities, self.templates, self._walk, self.parameters, b.solid, b.segments, b.table, b.heads,
             self._awake, self._next_awake, self._woken, self._later, self.candidates, self._changed, self._fell,
             self._lengths, b.near, self._riders,
@@ -373,7 +372,7 @@ class WorldState:
         return row
 
 
-def hash_of(tick: int, segments: layout.Int64s, digests: npt.NDArray[np.uint8], states: layout.Int64s) -> bytes:
+def hash_of(tick: int, segments: layout.Int64s, digests: Uint8s, states: layout.Int64s) -> bytes:
     """Returns the state hash of a world, computed from its parts.
 
     Args:

@@ -3,8 +3,6 @@
 from dataclasses import replace
 from typing import Any
 
-import numpy as np
-
 from server.config.limits import Limits
 from server.game import Game
 from server.game.session import Session
@@ -121,7 +119,7 @@ def ids(snapshot: Snapshot) -> list[int]:
     """Returns the numbers of all entities in a snapshot."""
     found: list[int] = []
     for part in map(whole, snapshot.segments):
-        found += np.frombuffer(part[4], HEAD)["id"].tolist() + np.frombuffer(part[6], ROW)["id"].tolist()
+        found += [entry[0] for form, at in ((HEAD, 4), (ROW, 6)) for entry in form.iter_unpack(part[at])]
     return found
 
 

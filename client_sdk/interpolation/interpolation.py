@@ -13,9 +13,7 @@ their velocities for less than a tick, because the next snapshot may change anyt
 import math
 from collections import deque
 
-import numpy as np
-import numpy.typing as npt
-
+from shared.arrays import Float64s, np
 from shared.between import between
 from shared.layout import ID, VX, Int64s, X
 from shared.units import BLOCK, SPEED
@@ -34,7 +32,7 @@ LONG_FALL, LONG_SHARE, LONG_CALM_S, FALL_MAX = 0.05, 0.5, 1.0, 1.0
 """Fall of a delay above `LONG_S`: it begins after `LONG_CALM_S` seconds without a late snapshot. Its speed in seconds
 per second is `LONG_FALL` plus `LONG_SHARE` times the seconds above `LONG_S`, at most `FALL_MAX`."""
 
-Positions = npt.NDArray[np.float64]
+Positions = Float64s
 """Positions in blocks, [n, 3]."""
 Entry = tuple[int, Int64s, frozenset[int]]
 """An entry of the history: the tick of a snapshot, the states at its end, and the entities that the rules placed since
@@ -103,7 +101,7 @@ class Interpolation:
     def sample(self, server_tick: float) -> tuple[Int64s, Positions]:
         """Returns states ([n, 12]) and positions (blocks, [n, 3]) of all entities at the tick `shown(server_tick)`."""
         if not self._states:
-            return np.zeros((0, 12), np.int64), np.zeros((0, 3))
+            return np.zeros((0, 12), np.int64), np.zeros((0, 3), np.float64)
         at = self.shown(server_tick)
         before = after = self._states[-1]
         for entry in reversed(self._states):

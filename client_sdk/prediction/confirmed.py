@@ -5,17 +5,17 @@ edits. States are written; turns are applied to entities that changed their moti
 extrapolated by the rules in `shared.snapshot`. Checksums in the snapshots show if the result differs from the server's.
 """
 
+from collections.abc import Iterable
 from typing import Any
 
-import numpy as np
-
+from shared.arrays import Uint8s
 from shared.bounds import bounds
 from shared.checks import Cell
 from shared.layout import FALLING, FLAGS, ID, Int64s, X
 from shared.messages import ProtocolError, Snapshot
 from shared.ring import Ring
 from shared.scene import Scene
-from shared.snapshot import ACTED, KEYFRAME, PLACED, DecodedDelta, checksum, decode_parts
+from shared.snapshot import ACTED, DROP, KEYFRAME, PLACED, DecodedDelta, checksum, decode_parts
 from shared.units import SEGMENT, TO_SEGMENT
 from shared.world import World
 
@@ -55,7 +55,7 @@ class Confirmed:
             raise ProtocolError(f"Terrain: the scene has no segment {segment}")
         self._coming, self._early = segment, {}
 
-    def load_segment(self, segment: Cell, kinds: np.ndarray[tuple[int, ...], np.dtype[np.uint8]]) -> None:
+    def load_segment(self, segment: Cell, kinds: Uint8s) -> None:
         """Takes the blocks of a whole segment, and applies the edits that arrived while it was being sent."""
         self.world.load_segment(segment, kinds)
         if segment == self._coming:
@@ -79,7 +79,7 @@ class Confirmed:
             raise ProtocolError("segment.heads: turns without a snapshot of the tick before")
         drops: set[Cell] = set()
         if snapshot.drops:
-            drops = {(x, y, z) for x, y, z in np.frombuffer(snapshot.drops, "<i4").reshape(-1, 3).tolist()}
+            drops = {(x, y, z) for x, y, z in DROP.iter_unpack(snapshot.drops)}
         if drops or any(part.gone or part.ago == KEYFRAME for part in parts):
             self._take_away(parts, drops, set(states[:, ID].tolist()))
         if len(states):
@@ -90,7 +90,7 @@ class Confirmed:
         for part in parts:
             if part.fields:
                 there &= world.write_fields(world.extras.decode(part.fields))
-            if len(part.edits):
+            if part.edits:
                 self._edit(part)
             if part.attributes:
                 self.attributes.update((entity, values) for entity, values in part.attributes if entity in world)
@@ -128,24 +128,28 @@ class Confirmed:
 
     def _edit(self, part: DecodedDelta) -> None:
         """Writes the changed blocks of a segment."""
-        changes = part.edits["block"].tolist(), part.edits["kind"].tolist()
+        offsets, kinds = zip(*part.edits, strict=True)
         if part.segment in self.world.blocks:
-            self.world.write_blocks(part.segment, *changes)
+            self.world.write_blocks(part.segment, offsets, kinds)
             self.terrain_changed = True
-            self.edited_near |= self._near(part.segment, part.edits["block"].astype(np.int64))
+            self.edited_near |= self._near(part.segment, offsets)
         if part.segment == self._coming:
-            self._early.update(zip(*changes, strict=True))
+            self._early.update(part.edits)
 
-    def _near(self, segment: Cell, offsets: Int64s) -> bool:
+    def _near(self, segment: Cell, offsets: Iterable[int]) -> bool:
         """Returns whether one of these blocks is within `NEAR_BLOCKS` of the own entity, along every axis."""
         if self.entity not in self.world:
             return False
         inside = SEGMENT - 1
-        blocks = (
-            np.stack((offsets & inside, offsets >> 5 & inside, offsets >> 10), axis=1) + np.array(segment) * SEGMENT
+        x, y, z = (
+            part * SEGMENT - place for part, place in zip(segment, self.world.position(self.entity), strict=True)
         )
-        ways = np.abs(blocks - np.array(self.world.position(self.entity)))
-        return bool((ways.max(axis=1) < NEAR_BLOCKS).any())
+        return any(
+            abs(x + (at & inside)) < NEAR_BLOCKS
+            and abs(y + (at >> 5 & inside)) < NEAR_BLOCKS
+            and abs(z + (at >> 10)) < NEAR_BLOCKS
+            for at in offsets
+        )
 
     def _take_away(self, parts: list[DecodedDelta], drops: set[Cell], here: set[int]) -> None:
         """Removes entities that have left the client's view.

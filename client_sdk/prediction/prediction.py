@@ -21,15 +21,13 @@ never corrected as long as inputs arrive in time.
 import math
 from dataclasses import dataclass
 
-import numpy as np
-import numpy.typing as npt
-
 from client_sdk.controls import Controls
 from client_sdk.events import Corrected
 from client_sdk.prediction.announcements import Announcements
 from client_sdk.prediction.confirmed import Confirmed
 from shared import edits
 from shared.aim import NO_AIM
+from shared.arrays import Truths, np
 from shared.bounds import bounds
 from shared.edits import Edit
 from shared.inputs import NEUTRAL, Input, row
@@ -350,14 +348,14 @@ class Prediction:
         own = states[states[:, ID] == self.entity]
         if not len(own):
             return states
-        ways = np.abs(states[:, X : X + 3] - own[0, X : X + 3])
+        ways = abs(states[:, X : X + 3] - own[0, X : X + 3])
         near = (ways < MEET_BLOCKS * BLOCK).all(axis=1)
         counting: Int64s = states[near | (self._shown_ahead[states[:, TEMPLATE]] != 0) | self._mine(states[:, ID])]
         if self.confirmed.extras.aims:
             counting[~self._mine(counting[:, ID]), CELL : CELL + len(NO_AIM)] = 0
         return counting
 
-    def _mine(self, ids: Int64s) -> npt.NDArray[np.bool_]:
+    def _mine(self, ids: Int64s) -> Truths:
         """Returns for each entity whether it is the own one, or one that this has spawned."""
         return (ids >= self.entity) & (ids <= self.last_own)
 
@@ -369,9 +367,10 @@ class Prediction:
         )
         if not len(mine) or not len(was) or np.array_equal(mine, was):
             return None
-        way = (mine[0, X : X + 3] - was[0, X : X + 3]) / BLOCK
-        names = self.confirmed.extras.names
-        return tuple(names[k] for k in np.flatnonzero(mine[0] != was[0])), float(np.sqrt((way * way).sum()))
+        now, before = mine[0].tolist(), was[0].tolist()
+        x, y, z = ((a - b) / BLOCK for a, b in zip(now[X : X + 3], before[X : X + 3], strict=True))
+        differing = zip(self.confirmed.extras.names, now, before, strict=True)
+        return tuple(name for name, a, b in differing if a != b), math.sqrt(x * x + y * y + z * z)
 
     def _others_differ(self, predicted_states: Int64s, confirmed_states: Int64s) -> bool:
         return not np.array_equal(

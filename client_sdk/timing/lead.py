@@ -30,9 +30,6 @@ from bisect import bisect_left, insort
 from collections import deque
 from typing import Protocol
 
-import numpy as np
-import numpy.typing as npt
-
 from client_sdk.timing.server_clock import ServerClock
 
 FASTER, HURRY = 0.10, 0.50
@@ -138,7 +135,6 @@ class PricedLead:
         self._fresh = 0  # number of further inputs for which `_calmest` stays one of the newest `_calm` needs
         self._excess: deque[float] = deque()  # excesses, oldest first
         self._ordered = array("d")  # excesses, ascending
-        self._prices: npt.NDArray[np.float64] = np.zeros(0)  # price of n late inputs, at index n
         self._base = 0.0
         self._level = 0.0
         self._review = 0
@@ -246,10 +242,15 @@ class PricedLead:
     def _best(self) -> float:
         """Returns the best cover: the excess with the least sum of itself and the price of the excesses above it."""
         ordered, known = self._ordered, len(self._ordered)
-        if len(self._prices) != known:
-            self._prices = self._price * (np.arange(known) / max(known, FIRST_S * self._rate))
-        # More late inputs than `most` cost more than any cover can save, so only these candidates are compared: 10 of
-        # 3,840, for example (1.6 us; all of them would take 11 us).
-        most = int(self._prices.searchsorted(ordered[-1] - ordered[0], "right")) + 1
-        falling = np.frombuffer(ordered)[: -most - 1 : -1]
-        return float(falling[(falling + self._prices[:most]).argmin()])
+        price, shown = self._price, max(known, FIRST_S * self._rate)
+        # Late inputs that cost more than any cover can save end the search: 10 of 3,840, for example.
+        save = ordered[-1] - ordered[0]
+        best, least = ordered[-1], ordered[-1]
+        for late in range(1, known):
+            cost = price * (late / shown)
+            cover = ordered[-1 - late]
+            if cover + cost < least:
+                best, least = cover, cover + cost
+            if cost > save:
+                break
+        return best

@@ -10,7 +10,6 @@ The library websockets does the framing (its Sans-I/O `ClientProtocol`). This mo
 in common, so that each of them adds only a socket. Nothing is compressed: the client offers no extension.
 """
 
-import math
 import ssl
 from dataclasses import replace
 from urllib.parse import urlsplit, urlunsplit
@@ -23,36 +22,13 @@ from websockets.uri import WebSocketURI, parse_uri
 
 from client_sdk.advice import TLS_ALERT, untrusted
 from client_sdk.core import Core
+from client_sdk.transports.common import ADDRESS_HINT, CLOSE_S, SILENCE_S, UNSENT_MAX, ConnectError, Silence, sendable
 from shared.checks import shown
 from shared.fields import MESSAGE_MAX, REASON_MAX
 from shared.messages import TEXT, TOO_SLOW
 
-UNSENT_MAX = 64 * 1024
-"""Limit of the bytes that wait for a server that does not read: about 90 s of 32 inputs per second. Beyond it, the
-client gives the connection up."""
-SILENCE_S = 10.0
-"""Time without any bytes from the server after which the connection counts as lost, in seconds. TCP alone may take 15
-minutes to report a server that is gone."""
-LOOK_S = 1.0
-"""Longest time between two calls of `Connection.look` that counts as silence, in seconds: a program that was busy or
-asleep could not receive anything."""
-CLOSE_S = 2.0
-"""Time that a server gets to finish the closing handshake, in seconds; then the client closes the stream anyway."""
 REFUSALS = (400, 403, 404, 409, 429, 503)
 """HTTP statuses with which a server refuses a client and sends the reason as text."""
-REASON_BYTES_MAX = 123
-"""Room for the reason in a close frame, in bytes (RFC 6455)."""
-
-
-class ConnectError(ConnectionError):
-    """The client could not connect; the text says why, and what to do.
-
-    `wait_s` is the time after which the server asks to try again, in seconds; negative if it does not ask.
-    """
-
-    def __init__(self, text: str, wait_s: float = -1.0) -> None:
-        super().__init__(text)
-        self.wait_s = wait_s
 
 
 class Connection:
@@ -84,8 +60,7 @@ class Connection:
         self._began = b""  # the first bytes of the server's answer, at most two
         self._fragments = bytearray()
         self._ending_since: float | None = None
-        self._looked = math.inf
-        self._silent_s = 0.0
+        self._silence = Silence()
 
     @property
     def opened(self) -> bool:
@@ -101,7 +76,7 @@ class Connection:
     def receive(self, data: bytes | bytearray | memoryview, now: float) -> None:
         """Takes bytes that have arrived on the stream. Call `data_to_send` afterwards."""
         protocol = self._protocol
-        self._silent_s = 0.0
+        self._silence.heard()
         if protocol.reader.eof:
             return
         self._began = self._began or bytes(data[:2])
@@ -118,11 +93,10 @@ class Connection:
 
         Call it at least once per second, after all bytes that have arrived were passed to `receive`.
         """
-        self._silent_s += min(max(now - self._looked, 0.0), LOOK_S)
-        self._looked = now
+        silent = self._silence.look(now)
         if self.core.port.appetite == 0 or not self.opened or self._ending_since is not None:
-            self._silent_s = 0.0
-        elif self._silent_s > SILENCE_S:
+            self._silence.heard()
+        elif silent:
             self.broke(f"nothing received for {SILENCE_S:g} s", now)
 
     def receive_eof(self, now: float) -> None:
@@ -151,7 +125,7 @@ class Connection:
                 protocol.send_binary(message)
             if self.core.close_request is not None:
                 code, reason = self.core.close_request
-                protocol.send_close(code, reason.encode()[:REASON_BYTES_MAX].decode(errors="ignore"))
+                protocol.send_close(code, sendable(reason))
                 self._check(now)
         writes = protocol.data_to_send()
         return b"".join(writes) if writes else b""
@@ -231,16 +205,15 @@ def checked_tls(tls: object) -> ssl.SSLContext | None:
 
 
 def parsed(url: object) -> WebSocketURI:
-    hint = "a server's address looks like ws://localhost:8765"
     if not isinstance(url, str):
-        raise ConnectError(f"url = {shown(url)}: must be a text; {hint}")
+        raise ConnectError(f"url = {shown(url)}: must be a text; {ADDRESS_HINT}")
     try:
         uri = parse_uri(url)
         urlsplit(url).port  # noqa: B018  # raises ValueError for an invalid port
     except InvalidURI as error:
-        raise ConnectError(f"{url!r}: {error.msg}; {hint}") from error
+        raise ConnectError(f"{url!r}: {error.msg}; {ADDRESS_HINT}") from error
     except ValueError as error:
-        raise ConnectError(f"{url!r}: {error}; {hint}") from error
+        raise ConnectError(f"{url!r}: {error}; {ADDRESS_HINT}") from error
     return uri
 
 

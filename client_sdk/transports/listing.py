@@ -1,16 +1,16 @@
 """The list of the public worlds of a server, which it serves over HTTP."""
 
 import json
-import ssl
 import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from client_sdk.transports.connection import ConnectError, checked_tls, parsed
+from client_sdk.transports.common import ConnectError
 from shared.checks import duration, shown
 
 if TYPE_CHECKING:
     import http.client
+    import ssl
 
 LIST_BYTES_MAX = 16 * 1024 * 1024
 """Limit of the list, in bytes."""
@@ -45,7 +45,7 @@ FIELDS: dict[str, tuple[type, ...]] = {
 
 
 def list_worlds(
-    url: str, kind: str | None = None, timeout: float = 5.0, *, tls: ssl.SSLContext | None = None
+    url: str, kind: str | None = None, timeout: float = 5.0, *, tls: "ssl.SSLContext | None" = None
 ) -> list[WorldEntry]:
     """Returns the public worlds of a server, in the order in which they were made. Blocks until the server answers.
 
@@ -60,6 +60,8 @@ def list_worlds(
         ConnectError: the server cannot be reached, or has no list of worlds.
     """
     import http.client  # here, because few programs need it, and it takes some ms
+
+    from client_sdk.transports.connection import checked_tls, parsed
 
     uri, tls = parsed(url), checked_tls(tls)
     until = time.monotonic() + duration(timeout, "timeout")

@@ -9,8 +9,9 @@ import socket
 import ssl
 import time
 
-from client_sdk.core import READ_BYTES
-from client_sdk.transports.connection import UNSENT_MAX, Connection, insecure, stalled, unreachable
+from client_sdk.port import READ_BYTES
+from client_sdk.transports.common import UNSENT_MAX
+from client_sdk.transports.connection import Connection, insecure, stalled, unreachable
 
 READS_MAX = 32
 """Limit of the reads per poll, together 2 MiB, so that one poll stays short after a long pause of the game."""

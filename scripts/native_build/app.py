@@ -27,7 +27,7 @@ MODULES = (
     "client_sdk/netsim/links.py", "client_sdk/prediction/confirmed.py", "client_sdk/prediction/prediction.py",
     "client_sdk/program_side.py", "client_sdk/reconnect.py", "client_sdk/replica.py", "client_sdk/stats.py",
     "client_sdk/timing/lead.py", "client_sdk/timing/server_clock.py", "client_sdk/timing/timeline.py",
-    "client_sdk/view.py", "client_sdk/worlds.py", "server/game/clocks.py", "server/game/commands.py",
+    "client_sdk/view_builder.py", "client_sdk/worlds.py", "server/game/clocks.py", "server/game/commands.py",
     "server/game/connections.py", "server/game/game.py", "server/game/joining.py", "server/game/roster.py",
     "server/game/session.py", "server/net/admission.py", "server/net/gateway.py", "server/net/websocket.py",
     "server/observability/counters.py", "server/players/input_queue.py", "server/players/player.py",

@@ -11,7 +11,6 @@ from collections import Counter
 from typing import Any
 
 import msgpack
-import numpy as np
 
 from client_sdk.prediction.confirmed import Confirmed
 from client_sdk.replica import check_scene
@@ -190,7 +189,7 @@ class Honest:
         self.progress.see(asyncio.get_running_loop().time(), self.used)
         if self._copy is not None and (wrong := self._copy.apply(snapshot)):
             self.unexplained.append(wrong)
-        for number, verdict in np.frombuffer(snapshot.verdicts, VERDICT).tolist():
+        for number, verdict in VERDICT.iter_unpack(snapshot.verdicts):
             asked = self._waiting.pop(number, None)
             if asked is not None:
                 self.cells.answered(asked[0], asked[1], verdict)

@@ -8,7 +8,7 @@ from collections import Counter
 from client_sdk.async_client import AsyncClient
 from client_sdk.core import Core
 from client_sdk.events import Diverged, Left
-from client_sdk.transports.connection import ConnectError
+from client_sdk.transports.common import ConnectError
 from scripts.soak_test.progress import Progress
 from shared.inputs import make_input
 

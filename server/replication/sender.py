@@ -121,7 +121,7 @@ class Sender:
         verdicts = b""
         if player.verdicts:
             answers = player.verdicts[: fields.VERDICTS_MAX]
-            verdicts = np.array(answers, VERDICT).tobytes()
+            verdicts = b"".join(VERDICT.pack(*answer) for answer in answers)
             for number in [number for number, _ in answers if number in player.reasons] if player.reasons else ():
                 stream.send(encode(messages.Refusal(number, player.reasons[number])))
             del player.verdicts[: fields.VERDICTS_MAX]

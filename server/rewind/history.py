@@ -63,7 +63,7 @@ class Rewind:
         self._undo: deque[_Undo] = deque()
         self._placed_at = -math.inf
         """Newest tick in which an entity was placed."""
-        self._boxes = boxes_of(world.scene)
+        self._boxes = np.array(boxes_of(world.scene)).reshape(-1, 2, 3)
         self._tick = -1
         self._alive = 0
         self._now = np.zeros((0, len(KEPT)), np.int64)

@@ -25,7 +25,7 @@ from client_sdk.async_client import AsyncClient
 from client_sdk.bots import POLICIES, Bot, Policy
 from client_sdk.events import Left
 from client_sdk.stats import Stats
-from client_sdk.transports.connection import ConnectError
+from client_sdk.transports.common import ConnectError
 from server.observability.histogram import Histogram
 from server.rules import Rules, load_rules
 from shared import kernels

@@ -14,7 +14,7 @@ os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
 import pygame
 
 from client_sdk.client import Client
-from client_sdk.transports.connection import ConnectError
+from client_sdk.transports.common import ConnectError
 from server.rules import Rules, RulesError, load_rules
 from server.runtime.reload import folder_of
 from shared.messages import WRONG_SCENE

@@ -12,7 +12,7 @@ from collections.abc import Iterator, Sequence
 
 from client_sdk.async_client import AsyncClient
 from client_sdk.bots import Bot, Wander
-from client_sdk.transports.connection import ConnectError
+from client_sdk.transports.common import ConnectError
 from server.rules import Rules, load_rules
 from sovereign_netcode.stderr import Stderr
 

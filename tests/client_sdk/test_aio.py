@@ -15,7 +15,7 @@ from client_sdk.bots import Bot, Wander
 from client_sdk.core import Core
 from client_sdk.events import Answered, Event, Joined, Left
 from client_sdk.transports import connection
-from client_sdk.transports.connection import ConnectError
+from client_sdk.transports.common import ConnectError
 from shared import messages
 from tests.client_sdk.servers import accept, real_server, request, scripted_server, silent_server
 from tests.lengths import long

@@ -5,7 +5,8 @@ from websockets.frames import Close, CloseCode, Frame, Opcode
 
 from client_sdk.core import Core
 from client_sdk.events import Left
-from client_sdk.transports.connection import CLOSE_S, LOOK_S, SILENCE_S, ConnectError, Connection
+from client_sdk.transports.common import CLOSE_S, LOOK_S, SILENCE_S, ConnectError
+from client_sdk.transports.connection import Connection
 from shared import fields, messages
 from shared.messages import Bye, Hello, decode_from_client, encode
 from tests.client_sdk.servers import Peer

@@ -12,10 +12,11 @@ import pytest
 from client_sdk.async_client import AsyncClient
 from client_sdk.base import set_link
 from client_sdk.client import Client
-from client_sdk.core import READ_BYTES, Core
+from client_sdk.core import Core
 from client_sdk.events import Happened, Joined, Left
 from client_sdk.netsim.linked import SLOW_READ_BYTES, LinkedPort
 from client_sdk.netsim.links import PRESETS, Link
+from client_sdk.port import READ_BYTES
 from shared import messages, payloads
 from shared.messages import Bye, Hello, Inputs, Ping, decode_from_client, encode
 from shared.scene import load_scene

@@ -11,7 +11,8 @@ from client_sdk.client import Client
 from client_sdk.core import Core
 from client_sdk.events import Answered, Event, Joined, Left
 from client_sdk.transports import connection
-from client_sdk.transports.connection import UNSENT_MAX, ConnectError, Connection
+from client_sdk.transports.common import UNSENT_MAX, ConnectError
+from client_sdk.transports.connection import Connection
 from client_sdk.transports.polling import PollingTransport
 from shared import messages
 from shared.messages import Bye, encode

@@ -6,7 +6,6 @@ import random
 from typing import Any
 
 import msgpack
-import numpy as np
 import pytest
 
 from client_sdk.core import Core
@@ -193,7 +192,7 @@ def test_a_late_result_of_the_old_world_is_not_taken_for_one_of_the_new() -> Non
     server.follow()
     server.taken()
     server.welcome()
-    verdicts = np.array([(number, messages.DONE)], VERDICT).tobytes()
+    verdicts = VERDICT.pack(number, messages.DONE)
     server.send(Snapshot(11, -1, b"", 0, verdicts, b"", b"", ()))
     assert [event for event in server.taken() if isinstance(event, Answered)] == []
 

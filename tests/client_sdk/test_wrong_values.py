@@ -11,7 +11,7 @@ import pytest
 from client_sdk import AsyncClient, Client, Loopback
 from client_sdk.core import Core
 from client_sdk.netsim.links import Link
-from client_sdk.transports.connection import ConnectError
+from client_sdk.transports.common import ConnectError
 from server.game import Game
 from shared.inputs import Input
 from shared.scene import load_scene

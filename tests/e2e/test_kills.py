@@ -10,7 +10,6 @@ import time
 from collections.abc import AsyncIterator, Callable
 from pathlib import Path
 
-import numpy as np
 import pytest
 from websockets.asyncio.client import ClientConnection, connect
 from websockets.exceptions import ConnectionClosed
@@ -103,7 +102,7 @@ class Editor:
             (state,) = [state for state in self.states(snapshot) if state[ID] == self.entity]
             x, y, z = (part // BLOCK for part in state[X : X + 3])
             self.own = [(x, y, z + 3), (x, y, z + 4), (x, y + 1, z + 3)]
-        for number, verdict in np.frombuffer(snapshot.verdicts, VERDICT).tolist():
+        for number, verdict in VERDICT.iter_unpack(snapshot.verdicts):
             self.verdicts.append(verdict)
             self.cells.answered(*self.waiting.pop(number), verdict)
 

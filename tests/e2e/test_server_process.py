@@ -18,7 +18,7 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import ClientConnection, connect
 
 from client_sdk.client import Client
-from client_sdk.transports.connection import ConnectError
+from client_sdk.transports.common import ConnectError
 from server.auth.tokens import issue
 from shared.messages import UNAUTHORISED, VERSION, Bye, Hello, Inputs, Message, Welcome, decode_from_server, encode
 from tests.e2e.processes import (

@@ -72,7 +72,7 @@ class Recorded:
         for state in states.tolist():
             state[FLAGS] &= FALLING
             assert tuple(state) == self.world.state(state[ID])
-        return states[:, ID].tolist() + turns[:, 0].tolist(), part.gone, part.edits.tolist()
+        return states[:, ID].tolist() + turns[:, 0].tolist(), part.gone, part.edits
 
 
 @pytest.fixture
@@ -326,7 +326,7 @@ class Model:
         self.world = World(scene)
         self.blocks: dict[Cell, Kinds] = {}
         self.coming: dict[Cell, bytearray] = {}
-        self.edits: dict[Cell, list[np.ndarray]] = {}
+        self.edits: dict[Cell, list[list[tuple[int, int]]]] = {}
         self.tick = -1
         self.stuck = False
         self.turns = 0
@@ -385,8 +385,9 @@ class Model:
             for edits in self.edits.pop(segment, []):
                 self.write(segment, edits)
 
-    def write(self, segment: Cell, edits: np.ndarray) -> None:
-        self.blocks[segment][edits["block"]] = edits["kind"]
+    def write(self, segment: Cell, edits: list[tuple[int, int]]) -> None:
+        for block, kind in edits:
+            self.blocks[segment][block] = kind
 
 
 def home_of(state: list[int]) -> Cell:

@@ -3,6 +3,7 @@
 import inspect
 import json
 import re
+import struct
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -108,16 +109,14 @@ def test_the_snapshot_example_is_as_described() -> None:
     assert list(snapshot.statuses) == [messages.USED, messages.REPEATED]
     (part,), states, turns = decode_parts(snapshot.segments, 1)
     assert turns.tolist() == [[12, layout.TOLD | layout.STOP_X, 0, 127, 0, 10 << 24, 0, 0]]
-    assert (part.gone, part.edits["block"].tolist()) == ([9], [0x33E3])
+    assert (part.gone, [block for block, _ in part.edits]) == ([9], [0x33E3])
     assert offset_of(3, 31, 12) == 0x33E3
     ((_, text),) = blocks("row")
     packed = b"".join(raw for raw, _ in lines(text))
     assert packed == snapshot.segments[0][6]
     told = [note.split(" = ") for _, note in lines(text)]
-    assert [len(raw) for raw, _ in lines(text)] == [ROW[name].itemsize for name in FIELDS]
-    assert [(name, int(value)) for name, value in told] == list(
-        zip(FIELDS, np.frombuffer(packed, ROW)[0].item(), strict=True)
-    )
+    assert [len(raw) for raw, _ in lines(text)] == [struct.calcsize(kind) for kind in "IBBiiiiiibbB"]
+    assert [(name, int(value)) for name, value in told] == list(zip(FIELDS, ROW.unpack(packed), strict=True))
     x, y, z = (states[0, 3:6] / 2**24).tolist()
     assert (x, y, z, states[0, 6] / 2**16) == (259.5, 252.25, 12.0, 3.0)
 

@@ -1,0 +1,269 @@
+"""The transport of a client in a browser: the browser's own WebSocket. Nothing blocks, and there is no thread.
+
+    opening   the browser connects; what the core sends waits
+    open      messages go both ways
+    (none)    the core decides when to connect again
+
+A page cannot read why a server refused a connection, and it cannot let bytes wait in the socket: messages that the core
+does not want yet (`Port.appetite`) wait here.
+"""
+
+import time
+from collections import deque
+from collections.abc import Callable
+from typing import Any, Protocol
+from urllib.parse import urlsplit, urlunsplit
+
+from client_sdk.core import Core
+from client_sdk.transports.common import (
+    ADDRESS_HINT,
+    BROKE_OFF,
+    SILENCE_S,
+    UNSENT_MAX,
+    ConnectError,
+    Silence,
+    sendable,
+)
+from shared.checks import shown
+from shared.messages import TEXT, TOO_SLOW
+
+CLOSED_BY_US = 1000
+"""Close code that a page may send, besides 3000 to 4999."""
+OWN_CODES = range(3000, 5000)
+"""Further close codes that a page may send."""
+
+
+class Socket(Protocol):
+    """A WebSocket of the browser, or of Node.js."""
+
+    @property
+    def bufferedAmount(self) -> int:  # noqa: N802 - the browser's name
+        """The bytes that wait to be sent."""
+        ...
+
+    def send(self, data: Any) -> None:
+        """Sends a binary message."""
+
+    def close(self, code: int, reason: str) -> None:
+        """Closes the connection."""
+
+
+class Listener(Protocol):
+    """The target of a socket's events."""
+
+    def opened(self) -> None:
+        """Takes the end of the handshake."""
+
+    def received(self, data: bytes | str) -> None:
+        """Takes a message."""
+
+    def closed(self, code: int, reason: str) -> None:
+        """Takes the end of the connection, or the failure of the handshake."""
+
+
+OpenSocket = Callable[[str, Listener], Socket]
+"""A function that opens a socket to an address."""
+
+
+class BrowserTransport:
+    """The connections of one core.
+
+    Args:
+        core: the client's state machine.
+        url: address of the server, like ws://host:8765; its path is the first one of the core.
+        open_socket: opens a socket.
+        timeout: longest time of a handshake, in seconds.
+        clock: returns the time of events, on the clock of the calls' `now`.
+
+    Raises:
+        ConnectError: `url` is not the address of a server.
+    """
+
+    def __init__(
+        self,
+        core: Core,
+        url: str,
+        open_socket: OpenSocket,
+        timeout: float = 5.0,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._core, self._open_socket, self._timeout, self._clock = core, open_socket, timeout, clock
+        self._address = checked_address(url)
+        parts = urlsplit(url)
+        first = urlunsplit(("", "", parts.path or "/", parts.query, ""))
+        core.travel.path = core.travel.path or first
+        self._line: _Line | None = None
+        self._dial(clock())
+
+    def poll(self, now: float) -> None:
+        """Passes on what waits, and connects anew if it is time to."""
+        core, line = self._core, self._line
+        if core.dials(now):
+            core.reconnect.trying()
+            self._dial(now)
+        elif line is not None and not line.open and now > line.until:
+            self._ended(line, BROKE_OFF, f"{self._url}: no answer in time", now)
+        elif line is not None:
+            line.read(now)
+            silent = line.silence.look(now)
+            if core.port.appetite == 0 or not line.open:
+                line.silence.heard()
+            elif silent:
+                self._ended(line, BROKE_OFF, f"nothing received for {SILENCE_S:g} s", now)
+        self.send(now)
+
+    def send(self, now: float) -> None:
+        """Sends the messages that wait in the core."""
+        core, line = self._core, self._line
+        if line is None or not line.open:
+            if line is not None and core.state == "closed":
+                self._dropped(line, CLOSED_BY_US, "")
+            return
+        for message in core.port.outgoing():
+            line.socket.send(message)
+        if core.close_request is not None:
+            code, reason = core.close_request
+            self._dropped(line, code, reason)
+            core.port.lost(code, reason, now)
+        elif line.socket.bufferedAmount > UNSENT_MAX:
+            text = f"the server has stopped reading ({UNSENT_MAX >> 10} KiB wait for it)"
+            self._ended(line, TOO_SLOW, text, now)
+
+    def close(self, timeout: float) -> None:
+        """Sends what waits and closes the connection. The browser finishes it."""
+        self.send(self._clock())
+
+    @property
+    def _url(self) -> str:
+        return f"{self._address}{self._core.travel.path}"
+
+    def _dial(self, now: float) -> None:
+        if self._line is not None:
+            self._dropped(self._line, CLOSED_BY_US, "")
+        line = self._line = _Line(self, self._core, self._clock, now + self._timeout)
+        line.socket = self._open_socket(self._url, line)
+
+    def _ended(self, line: "_Line", code: int, reason: str, now: float) -> None:
+        """Takes the end of a connection, which the core is notified of."""
+        if line is self._line:
+            self._dropped(line, code, reason)
+            self._core.port.lost(code, reason, now)
+
+    def _dropped(self, line: "_Line", code: int, reason: str) -> None:
+        """Closes a socket and ignores it from then on."""
+        if line is self._line:
+            self._line = None
+        line.over = True
+        allowed = code == CLOSED_BY_US or code in OWN_CODES
+        line.socket.close(code if allowed else CLOSED_BY_US, sendable(reason))
+
+
+class _Line:
+    """One socket and its messages."""
+
+    socket: Socket
+
+    def __init__(self, transport: BrowserTransport, core: Core, clock: Callable[[], float], until: float) -> None:
+        self._transport, self._core, self._clock = transport, core, clock
+        self.until = until
+        """Local time at which the handshake has failed, in seconds."""
+        self.open = self.over = False
+        self.silence = Silence()
+        self._inbox: deque[bytes] = deque()
+
+    def opened(self) -> None:
+        if self.over:
+            return
+        now = self._clock()
+        self.open = True
+        self._core.port.open(now)
+        self._transport.send(now)
+
+    def received(self, data: bytes | str) -> None:
+        if self.over:
+            return
+        now = self._clock()
+        if isinstance(data, str):
+            url = self._transport._url
+            self._transport._ended(self, TEXT, f"{url} is not a Sovereign Netcode server: it sends text", now)
+            return
+        self.silence.heard()
+        self._inbox.append(data)
+        self.read(now)
+        self._transport.send(now)
+
+    def closed(self, code: int, reason: str) -> None:
+        if self.over:
+            return
+        now = self._clock()
+        while self._inbox and not self.over:
+            self._core.port.receive(self._inbox.popleft(), now)
+        if not self.open:
+            url = self._transport._url
+            reason = f"{url}: no connection; is the address right, is a server there, and does it allow this page?"
+        self._transport._ended(self, code, reason or "the connection broke off", now)
+
+    def read(self, now: float) -> None:
+        """Passes on the messages that the core wants now."""
+        while self._inbox and not self.over and self._core.port.appetite:
+            self._core.port.receive(self._inbox.popleft(), now)
+
+
+def checked_address(url: object) -> str:
+    """Returns scheme, host and port of a server's address.
+
+    Raises:
+        ConnectError: it is no address.
+    """
+    try:
+        parts = urlsplit(url if isinstance(url, str) else "")
+        if parts.scheme in ("ws", "wss") and parts.hostname and parts.port != 0:
+            return f"{parts.scheme}://{parts.netloc}"
+    except ValueError:
+        pass
+    raise ConnectError(f"url = {shown(url)}: must be an address; {ADDRESS_HINT}")
+
+
+def browser_socket(url: str, listener: Listener) -> Socket:
+    """Opens a WebSocket of the browser, from Python in Pyodide."""
+    import js  # type: ignore[import-not-found]
+    from pyodide.ffi import create_proxy, to_js  # type: ignore[import-not-found]
+
+    socket = js.WebSocket.new(url)
+    socket.binaryType = "arraybuffer"
+
+    def message(event: Any) -> None:
+        data = event.data
+        listener.received(data if isinstance(data, str) else data.to_bytes())
+
+    def close(event: Any) -> None:
+        listener.closed(int(event.code), str(event.reason))
+        for proxy in proxies:
+            proxy.destroy()
+
+    handlers = {"open": lambda _: listener.opened(), "message": message, "close": close}
+    proxies = []
+    for name, handler in handlers.items():
+        proxy = create_proxy(handler)
+        proxies.append(proxy)
+        setattr(socket, f"on{name}", proxy)
+    return _JsSocket(socket, to_js)
+
+
+class _JsSocket:
+    """A JavaScript WebSocket as `Socket`."""
+
+    def __init__(self, socket: Any, to_js: Callable[[Any], Any]) -> None:
+        self._socket, self._to_js = socket, to_js
+
+    @property
+    def bufferedAmount(self) -> int:  # noqa: N802 - the browser's name
+        return int(self._socket.bufferedAmount)
+
+    def send(self, data: bytes) -> None:
+        """Sends a binary message; the browser copies it."""
+        self._socket.send(self._to_js(data))
+
+    def close(self, code: int, reason: str) -> None:
+        """Closes the connection."""
+        self._socket.close(code, reason)

@@ -1,0 +1,1 @@
+"""The Python client for a page: its sources as one archive (`bundle`)."""
