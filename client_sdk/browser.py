@@ -11,6 +11,7 @@ prediction going without drawing.
 
 import base64
 import json
+import math
 import time
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import fields, is_dataclass
@@ -229,7 +230,19 @@ def event_table(event: "Event") -> dict[str, Any]:
 
 
 def _json(value: object) -> str:
-    return json.dumps(value, default=_other, separators=(",", ":"))
+    """Returns a value as JSON, which has no numbers that are not finite: null stands for them."""
+    try:
+        return json.dumps(value, default=_other, separators=(",", ":"), allow_nan=False)
+    except ValueError:
+        return json.dumps(_finite(value), default=_other, separators=(",", ":"))
+
+
+def _finite(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {name: _finite(each) for name, each in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(each) for each in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def _other(value: object) -> object:

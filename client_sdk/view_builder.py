@@ -100,7 +100,7 @@ class ViewBuilder:
     def _figure(self, state: Sequence[int], place: list[float]) -> EntityView:
         """Returns the entity view of a state, drawn at `place` (in blocks)."""
         x, y, z = place
-        vx, vy, vz = (part / SPEED for part in state[VX : VX + 3])
+        vx, vy, vz = state[VX] / SPEED, state[VX + 1] / SPEED, state[VX + 2] / SPEED
         attributes = self._prediction.attributes.get(state[ID], NO_ATTRIBUTES)
         template = self._templates[state[TEMPLATE]]
         facing = self._facing(state)

@@ -187,6 +187,8 @@ class Vector(ndarray):
 
     def reshape(self, *shape: Any) -> Any:
         """Returns a view with other dimensions, at most two."""
+        if shape == (-1,):
+            return self
         sides = shape[0] if isinstance(shape[0], tuple) else shape
         return view_of(self.data, sides_of(sides, len(self)))
 
@@ -291,6 +293,8 @@ class Matrix(ndarray):
     def reshape(self, *shape: Any) -> Any:
         """Returns a view with other dimensions, at most two. The rows have to be in one run of memory."""
         assert self._packed
+        if shape == (-1,):
+            return Vector(self._run())
         sides = shape[0] if isinstance(shape[0], tuple) else shape
         return view_of(self._run(), sides_of(sides, self.size))
 

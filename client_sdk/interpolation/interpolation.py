@@ -13,7 +13,7 @@ their velocities for less than a tick, because the next snapshot may change anyt
 import math
 from collections import deque
 
-from shared.arrays import Float64s, np
+from shared.arrays import PLAIN, Float64s, np
 from shared.between import between
 from shared.layout import ID, VX, Int64s, X
 from shared.units import BLOCK, SPEED
@@ -125,6 +125,23 @@ def _between(before: Entry, after: Entry, at: float) -> tuple[Int64s, Positions]
     ids, places = states[:, ID], states[:, X : X + 3]
     if not len(new):
         return states, places / BLOCK
+    if PLAIN:
+        return states, np.array(_between_lists(states.tolist(), new.tolist(), after[2], share), np.float64)
     row = np.searchsorted(new[:, ID], ids)
     row[row == len(new)] = 0
     return states, between(ids, places, new[row, X : X + 3], new[row, ID] == ids, after[2], share)
+
+
+def _between_lists(
+    states: list[list[int]], new: list[list[int]], placed: frozenset[int], share: float
+) -> list[list[float]]:
+    """Returns the same as `between`, in plain Python."""
+    newer = {state[ID]: state for state in new if state[ID] not in placed}
+    places = []
+    for state in states:
+        place = [part / BLOCK for part in state[X : X + 3]]
+        then = newer.get(state[ID])
+        if then is not None:
+            place = [was + (part / BLOCK - was) * share for was, part in zip(place, then[X : X + 3], strict=True)]
+        places.append(place)
+    return places

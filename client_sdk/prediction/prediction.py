@@ -265,8 +265,8 @@ class Prediction:
         states = self._states.get(tick)
         if states is None:
             return None
-        mine = states[states[:, ID] == entity]
-        return tuple(mine[0].tolist()) if len(mine) else None
+        ids = states[:, ID].tolist()
+        return tuple(states[ids.index(entity)].tolist()) if entity in ids else None
 
     def sync_test(self) -> tuple[int, Int64s, Int64s] | None:
         """Runs the sync test: replays everything since the confirmed world. Changes nothing unless state is hidden.

@@ -62,7 +62,7 @@ class Listener(Protocol):
 
 
 OpenSocket = Callable[[str, Listener], Socket]
-"""A function that opens a socket to an address."""
+"""A function that opens a socket to an address. It raises an `OSError` if the browser does not allow it."""
 
 
 class BrowserTransport:
@@ -140,8 +140,13 @@ class BrowserTransport:
     def _dial(self, now: float) -> None:
         if self._line is not None:
             self._dropped(self._line, CLOSED_BY_US, "")
-        line = self._line = _Line(self, self._core, self._clock, now + self._timeout)
-        line.socket = self._open_socket(self._url, line)
+        line = _Line(self, self._core, self._clock, now + self._timeout)
+        try:
+            line.socket = self._open_socket(self._url, line)
+        except OSError as error:
+            self._core.port.lost(BROKE_OFF, f"{self._url}: {error}", now)
+        else:
+            self._line = line
 
     def _ended(self, line: "_Line", code: int, reason: str, now: float) -> None:
         """Takes the end of a connection, which the core is notified of."""
@@ -225,11 +230,18 @@ def checked_address(url: object) -> str:
 
 
 def browser_socket(url: str, listener: Listener) -> Socket:
-    """Opens a WebSocket of the browser, from Python in Pyodide."""
-    import js  # type: ignore[import-not-found]
-    from pyodide.ffi import create_proxy, to_js  # type: ignore[import-not-found]
+    """Opens a WebSocket of the browser, from Python in Pyodide.
 
-    socket = js.WebSocket.new(url)
+    Raises:
+        OSError: the browser does not allow this address.
+    """
+    import js  # type: ignore[import-not-found]
+    from pyodide.ffi import JsException, create_proxy, to_js  # type: ignore[import-not-found]
+
+    try:
+        socket = js.WebSocket.new(url)
+    except JsException as error:
+        raise OSError(str(error)) from error
     socket.binaryType = "arraybuffer"
 
     def message(event: Any) -> None:

@@ -1,14 +1,21 @@
 """Plays a tape (`taped.py`) again and returns what came of it, as a table of texts and numbers.
 
+    python -m tests.browser.replayed TAPE [behaves] [--no-numpy]
+
 It uses the client alone, so it runs natively, without numpy, and in a browser.
 """
 
 import hashlib
+import json
 import sys
 import time
 from collections import Counter
 from collections.abc import Iterable
-from typing import Any
+from pathlib import Path
+from typing import Any, NamedTuple
+
+if "--no-numpy" in sys.argv:
+    sys.modules["numpy"] = None  # type: ignore[assignment]
 
 import msgpack
 
@@ -16,25 +23,35 @@ from sovereign_netcode.client_sdk.core import Core
 from sovereign_netcode.client_sdk.view import View
 from sovereign_netcode.shared.inputs import Input
 
+SAME = (
+    "sent", "bytes", "views", "drawn", "events", "state", "confirmed", "predicted", "corrections", "by_cause",
+    "replayed", "divergences",
+)  # fmt: skip
+"""Names of the results that must be the same everywhere."""
 
-def replayed(tape: bytes, behaviours: Iterable[Any] = (), *, link: str = "", patience_s: float = 0.0) -> dict[str, Any]:
+
+class Tape(NamedTuple):
+    """A tape, and whether its scene has the behaviours of `tests.acrobat`."""
+
+    data: bytes
+    behaves: bool
+
+
+def replayed(tape: bytes, behaviours: Iterable[Any] = ()) -> dict[str, Any]:
     """Plays a tape again.
 
     Args:
         tape: the tape.
         behaviours: the classes of the game's behaviours.
-        link: the simulated link, for a tape whose core had one.
-        patience_s: as for `Core`.
 
     Returns:
-        Checksums of all messages sent, of all views and of both worlds; events by type; corrections and replays.
+        Checksums of all messages sent, of all views and of both worlds; events by type; corrections and replays; and
+        how long it took.
     """
-    core = Core("taped", behaviours=behaviours, patience_s=patience_s)
+    core = Core("taped", behaviours=behaviours, patience_s=10.0)
     sent, drawn = hashlib.sha256(), hashlib.sha256()
     bytes_sent = views = 0
-    events: Counter[str] = Counter()
-    worst = spent = 0.0
-    frames: list[float] = []
+    took: dict[str, list[float]] = {"update": [], "receive": [], "view": []}
     for name, *arguments in msgpack.unpackb(tape):
         began = time.perf_counter()
         if name == "set_input":
@@ -46,55 +63,61 @@ def replayed(tape: bytes, behaviours: Iterable[Any] = (), *, link: str = "", pat
             for message in core.outgoing():
                 sent.update(message)
                 bytes_sent += len(message)
-        elif name == "view":
-            drawn.update(repr(plain(core.view(*arguments))).encode())
-            views += 1
         else:
-            getattr(core, name)(*arguments)
-        took = time.perf_counter() - began
-        spent += took
-        if name == "update":
-            frames.append(took)
-    for event in core.events():
-        events[type(event).__name__] += 1
+            result = getattr(core, name)(*arguments)
+            if name in took:
+                took[name].append(time.perf_counter() - began)
+            if name == "view":
+                drawn.update(repr(plain(result)).encode())
+                views += 1
     prediction = core.prediction
-    frames.sort()
-    worst = frames[int(len(frames) * 0.99)] if frames else 0.0
+    assert prediction is not None
     return {
         "sent": sent.hexdigest(),
         "bytes": bytes_sent,
         "views": views,
         "drawn": drawn.hexdigest(),
-        "events": dict(sorted(events.items())),
+        "events": dict(sorted(Counter(type(event).__name__ for event in core.events()).items())),
         "state": core.state,
-        "confirmed": prediction.confirmed.state_hash().hex() if prediction else "",
-        "predicted": prediction.predicted.state_hash().hex() if prediction else "",
+        "confirmed": prediction.confirmed.state_hash().hex(),
+        "predicted": prediction.predicted.state_hash().hex(),
         "corrections": core.stats.corrections,
         "by_cause": dict(sorted(core.stats.corrections_by_cause.items())),
         "replayed": core.stats.replayed_ticks,
         "divergences": core.stats.divergences,
         "kernel": core.stats.kernel,
         "numpy": sys.modules.get("numpy") is not None,
-        "seconds": spent,
-        "update_p99_ms": 1000 * worst,
+        "ms": {name: figures(each) for name, each in took.items()},
     }
+
+
+def figures(seconds: list[float]) -> list[float]:
+    """Returns mean, median and 99th percentile in milliseconds."""
+    ordered = sorted(seconds)
+    n = len(ordered)
+    return [1000 * each for each in (sum(ordered) / n, ordered[n // 2], ordered[n * 99 // 100])]
 
 
 def plain(view: View) -> list[Any]:
     """Returns a view as lists of numbers and texts."""
-    drawn = [*view.others, *([view.me] if view.me else [])]
     entities = [
         (
             each.entity, each.template, each.position, each.velocity, sorted(each.attributes.items()),
             sorted(each.fields.items()), each.facing,
         )
-        for each in drawn
+        for each in view.figures
     ]  # fmt: skip
     return [view.tick, view.seen, entities]
 
 
-SAME = (
-    "sent", "bytes", "views", "drawn", "events", "state", "confirmed", "predicted", "corrections", "by_cause",
-    "replayed", "divergences",
-)  # fmt: skip
-"""Names of the results that must be the same everywhere."""
+def main() -> None:
+    classes: Iterable[Any] = ()
+    if "behaves" in sys.argv:
+        from tests.acrobat import CLASSES
+
+        classes = CLASSES
+    print(json.dumps(replayed(Path(sys.argv[1]).read_bytes(), classes)))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,1 +1,0 @@
-"""The Python client for a page: its sources as one archive (`bundle`)."""
