@@ -27,7 +27,7 @@ from typing import Any, cast
 
 import msgpack
 
-from server import app
+from server import serving
 from server.config.settings import Settings
 from server.game import Game
 from server.game.front import Front
@@ -184,7 +184,7 @@ class Stopwatch:
     def __init__(self, game: Game) -> None:
         self.ticks, self.before_step, self.collections = Histogram(), Histogram(), Histogram()
         self._plain_tick, self._plain_step = game.tick, game.world.step
-        cast("Any", app).Ticker = lambda rate, tick, *more, **options: Ticker(rate, self._tick, *more, **options)
+        cast("Any", serving).Ticker = lambda rate, tick, *more, **options: Ticker(rate, self._tick, *more, **options)
         self._tick_began = self._collection_began = 0.0
         self.full_collection_s: float | None = None
         """CPU time of the collection that SIGUSR1 requested, in seconds; None until it is done."""
@@ -227,8 +227,8 @@ class Stopwatch:
 
 
 VARIANTS: dict[str, tuple[ModuleType, str, Callable[[], Any]]] = {
-    "default": (app, "freeze", lambda: None),
-    "off": (app, "freeze", gc.disable),
+    "default": (serving, "freeze", lambda: None),
+    "off": (serving, "freeze", gc.disable),
     "asyncio": (event_loop, "loop_factory", lambda: asyncio.new_event_loop),
 }
 """Function of the product that a variant replaces (module and name), and the replacement."""
@@ -242,7 +242,7 @@ def in_view(game: Game) -> float:
     return sum(views) / max(len(views), 1)
 
 
-class Measured(app.Server):
+class Measured(serving.Server):
     """The product's server with more figures in /stats."""
 
     def __init__(self, settings: Settings, game: Game, more: Sequence[Callable[[], dict[str, Any]]]) -> None:

@@ -95,6 +95,7 @@ class EdgePart(Part):
     async def run(self) -> None:
         following = self.following
         await following.catch_up()
+        self.began()
         self.core = EdgeServer(self.name, following.replica, self._limits, self._authenticate)
         self.faults = self.core.faults
         self._alarm = best_alarm(asyncio.get_running_loop(), self._ring)
@@ -137,22 +138,18 @@ class EdgePart(Part):
         return {**super().stats(), **({} if core is None else core.stats()), **figures, "sheds": self.sheds}
 
     def shut_down(self, reason: str, wait: float) -> None:
-        """Closes the connections of all clients. Arguments as for `Game.shut_down`."""
-        if self.core is not None:
-            self.core.connections.shut_down(reason, wait, messages.GOING_AWAY)
+        if self.core is not None:  # at another edge, a client can go on at once
+            self.core.connections.shut_down(reason, 0.0 if self.others() else wait, messages.GOING_AWAY)
 
     def open(self, link: Any, now: float) -> Session:
-        """Handles an open WebSocket (`server.net.gateway.Events`)."""
         assert self.core is not None
         return self.core.open(link, now)
 
     def receive(self, session: Session, data: bytes, now: float) -> None:
-        """Handles one message of a client."""
         assert self.core is not None
         self.core.receive(session, data, now)
 
     def lost(self, session: Session, now: float) -> None:
-        """Handles the end of a WebSocket."""
         assert self.core is not None
         self.core.lost(session, now)
 

@@ -1,6 +1,7 @@
 """The basis of the parts of a world: a process with a replica that follows the log, and its figures."""
 
 import time
+from collections.abc import Callable
 from typing import Any
 
 from server.cluster.bus import Bus
@@ -39,6 +40,8 @@ class Part:
         self.ticks = 0
         self.latest = -1e9
         """Time in seconds of the newest tick."""
+        self.began: Callable[[], object] = lambda: None
+        """Function that is called once the replica has caught up."""
 
     @property
     def world(self) -> RecordedWorld:
@@ -54,6 +57,21 @@ class Part:
     def players(self) -> dict[int, Player]:
         """All players of the world by entity."""
         return self.kept.players
+
+    def shut_down(self, reason: str, wait: float) -> None:
+        """Closes the connections of all clients, if the part has any. Arguments as for `Game.shut_down`."""
+
+    def open(self, link: Any, now: float) -> Any:
+        """Handles an open WebSocket. Only an edge has any."""
+        raise NotImplementedError
+
+    def receive(self, session: Any, data: bytes, now: float) -> None:
+        """Handles one message of a client. Only an edge has any."""
+        raise NotImplementedError
+
+    def lost(self, session: Any, now: float) -> None:
+        """Handles the end of a WebSocket. Only an edge has any."""
+        raise NotImplementedError
 
     def unready(self) -> str:
         """Returns the reason why the part does not do its work; empty if it does."""
@@ -85,6 +103,9 @@ class Part:
             PartError: the part has to end.
         """
         raise NotImplementedError
+
+    async def leave(self) -> None:
+        """Notes on the bus that the part is about to end."""
 
     def stop(self) -> None:
         """Ends the work of the part."""

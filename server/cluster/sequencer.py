@@ -85,6 +85,7 @@ class SequencerPart(Part):
         following = self.following
         try:
             await following.catch_up()
+            self.began()
             self._saved_tick = self.world.tick
             self._heard = time.monotonic()
             while (begin := await self._follow()) is None:

@@ -32,6 +32,8 @@ ADDRESSES = ("none", "loopback", "private", "all")
 """Groups of client addresses, each including the one before; choices of the setting `figures`."""
 KEY_VARIABLE, OPERATOR_VARIABLE = "SOVEREIGN_AUTH_KEY", "SOVEREIGN_OPERATOR_TOKEN"
 """Environment variables with secrets. They have no flags, because every user of a machine can read flags."""
+ROLES = ("server", "sequencer", "edge", "standby")
+"""Choices of the setting `role`."""
 LOG_FORMATS = ("pretty", "json")
 """Choices of the setting `log_format`."""
 LOG_LEVELS = ("debug", "info", "warning", "error")
@@ -137,6 +139,18 @@ class Settings:
     checkpoint_s: float = setting(
         60.0, Option(float, "seconds between two checkpoints of the saved world", "S", 0.1, 3600)
     )
+    role: str = setting(
+        "server",
+        Option(str, "server: all of it; the others: one part of a world on many processes", choices=ROLES),
+    )
+    bus: str | None = setting(
+        None, Option(str, "address of the NATS servers that join the parts: nats://HOST:PORT,...", "URL")
+    )
+    world: str = setting("world", Option(str, "name of the world on the bus", "NAME"))
+    bus_replicas: int = setting(1, Option(int, "NATS servers that each store the log of the world", "N", 1, 5))
+    public_url: str | None = setting(
+        None, Option(str, "address of an edge for clients (default: ws://, its host and port)", "URL")
+    )
     limits: Limits = field(default_factory=Limits)
     options: Mapping[str, object] = field(default_factory=dict)
     """Options of the game by name, as the operator gave them; `server.rules` checks them."""
@@ -169,6 +183,7 @@ GROUPS = {
     "network": ("host", "port", "tls_cert", "tls_key", "allowed_origins", "allowed_hosts"),
     "access": ("auth", "auth_key_file"),
     "saving": ("data", "durability", "checkpoint_s", "record"),
+    "many processes": ("role", "bus", "world", "bus_replicas", "public_url"),
     "operation": ("log_level", "log_format", "figures", "page", "restart_s", "drain_s", "operator_token_file"),
 }
 """Groups of settings as `--help` shows them, the ones for beginners first. Settings in no group are shown as limits."""
@@ -255,6 +270,7 @@ def _check_together(settings: Settings) -> None:
                 f"allowed_hosts = {name!r} (from {settings.origins['allowed_hosts']}): must be a host name, without "
                 f"scheme and port, or {ANY} for all"
             )
+    _check_role(settings)
     if settings.options and settings.game is None:
         name = next(iter(settings.options))
         raise SettingsError(
@@ -265,6 +281,27 @@ def _check_together(settings: Settings) -> None:
     if (settings.tls_cert is None) != (settings.tls_key is None):
         given, missing = ("tls_cert", "tls_key") if settings.tls_key is None else ("tls_key", "tls_cert")
         raise SettingsError(f"{given} (from {settings.origins[given]}): needs {missing} as well")
+
+
+def _check_role(settings: Settings) -> None:
+    """Checks the settings of a part of a world on many processes.
+
+    Raises:
+        SettingsError: a combination cannot be used.
+    """
+    if settings.role == "server":
+        for name, given in (("bus", settings.bus), ("public_url", settings.public_url)):
+            if given is not None:
+                raise SettingsError(f"{name} (from {settings.origins[name]}): needs role as well")
+        return
+    role = f"role = {settings.role!r} (from {settings.origins['role']})"
+    if settings.bus is None:
+        raise SettingsError(f"{role}: needs bus as well")
+    if settings.public_url is not None and settings.role != "edge":
+        raise SettingsError(f"public_url (from {settings.origins['public_url']}): is for role edge only")
+    for name, given in (("data", settings.data), ("reload", settings.reload), ("worlds", settings.worlds)):
+        if given:
+            raise SettingsError(f"{role}: excludes {name}; the world is saved on the bus")
 
 
 def _entries(config: str) -> Iterator[tuple[str, object]]:

@@ -19,7 +19,7 @@ from functools import cache, partial
 from http import HTTPStatus
 from itertools import islice
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
@@ -28,11 +28,13 @@ from server.observability.pages import JSON, Page
 from shared.blocks import AIR, Kinds
 from shared.fields import NAME_MAX
 from shared.layout import ID, TEMPLATE, Int64s, X, Y, Z
+from shared.scene import Scene
 from shared.units import BLOCK, SEGMENT
 from shared.world import World
 
 if TYPE_CHECKING:
-    from server.game import Game
+    from server.players.persisted_state import PersistedState
+    from server.players.player import Player
 
 ANSWERS_PER_S = 8
 """Maximum number of times per second that `/live` is computed."""
@@ -129,6 +131,27 @@ class Relief:
         return int.from_bytes(hashlib.sha256(self._blocks.digests[rows].tobytes()).digest()[:VERSION_BYTES])
 
 
+class Shown(Protocol):
+    """A game, or a part of a world on many processes, as the live page shows it."""
+
+    scene: Scene
+
+    @property
+    def world(self) -> World:
+        """The world."""
+        ...
+
+    @property
+    def kept(self) -> "PersistedState":
+        """The persisted state."""
+        ...
+
+    @property
+    def players(self) -> "dict[int, Player]":
+        """Players by entity."""
+        ...
+
+
 class Live:
     """The live pages of one game.
 
@@ -139,7 +162,7 @@ class Live:
     """
 
     def __init__(
-        self, game: "Game", figures: Callable[[], Mapping[str, Any]], durations: Callable[[], Mapping[str, Histogram]]
+        self, game: Shown, figures: Callable[[], Mapping[str, Any]], durations: Callable[[], Mapping[str, Histogram]]
     ) -> None:
         self._game, self._figures, self._durations = game, figures, durations
         self._relief = Relief(game.world)

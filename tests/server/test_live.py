@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from server.app import Server
 from server.config.settings import load
 from server.net.admission import Request
 from server.observability.histogram import Histogram
 from server.observability.live import ANSWERS_PER_S, SHOWN_MAX, SIDE_MAX, TILE, Live, Relief, html_page
+from server.serving import Server
 from shared.messages import VERSION, Hello, Inputs
 from shared.world import World
 from tests.tables import Table

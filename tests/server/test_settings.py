@@ -287,3 +287,19 @@ def test_help_and_scenes(capsys: pytest.CaptureFixture[str]) -> None:
     named = {line.split()[0]: line for line in listed.splitlines() if not line.startswith(" ")}
     assert named.keys() >= {"flat", "hills", "arena", "topdown", "meadow"}
     assert named["flat"].endswith("A plain: one floor, nothing in the way")
+
+
+@pytest.mark.parametrize(
+    ("flags", "reason"),
+    [
+        ({"role": "edge"}, "role = 'edge' .*needs bus"),
+        ({"bus": "nats://127.0.0.1:4222"}, "bus .*needs role"),
+        ({"public_url": "ws://x"}, "public_url .*needs role"),
+        ({"role": "edge", "bus": "nats://x", "data": "there"}, "role = 'edge' .*excludes data"),
+        ({"role": "standby", "bus": "nats://x", "public_url": "ws://x"}, "public_url .*role edge only"),
+        ({"role": "king", "bus": "nats://x"}, "role = 'king' .*one of server, sequencer, edge, standby"),
+    ],
+)
+def test_settings_of_parts_that_exclude_or_need_each_other(flags: dict[str, str], reason: str) -> None:
+    with pytest.raises(SettingsError, match=reason):
+        load(flags, {})

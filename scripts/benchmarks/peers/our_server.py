@@ -20,7 +20,7 @@ from typing import Any, cast
 
 from scripts.benchmarks.busy_server import in_view
 from scripts.environment import ROOT
-from server import app
+from server import serving
 from server.config.settings import Settings
 from server.game import Game, roster
 from server.players.input_queue import InputQueue
@@ -101,7 +101,7 @@ class Measured(Game):
         return {"first": self.first, "ticks": self.began, "inputs": inputs}
 
 
-class Reporting(app.Server):
+class Reporting(serving.Server):
     """The product's server, which also answers commands on stdin."""
 
     def __init__(self, settings: Settings, game: Measured) -> None:

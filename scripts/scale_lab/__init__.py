@@ -1,0 +1,1 @@
+"""One world on real processes: a NATS server, a sequencer, edges, standbys and bots, which are killed and measured."""

@@ -1,0 +1,429 @@
+"""The bus on NATS with JetStream: the only module that uses nats-py.
+
+Theory of operation. A world has a stream `WORLD_name` with the subject `world.name.log`. The server of the bus
+accepts a record only behind the one that its header names (`Nats-Expected-Last-Msg-Id`). It republishes what it has
+accepted to `world.name.told`, which a part subscribes to: a subscription of the stream's own subject would also show
+what was refused. A part finds missing records by their sequence numbers, and fetches them. Batches go over
+`world.name.in` without the stream. Checkpoints are in the object store `CHECKPOINTS_name`; the key `name.checkpoint`
+names the newest. Keys of all worlds are in the bucket `worlds`.
+"""
+
+import asyncio
+import contextlib
+import json
+import logging
+import re
+import time
+from collections.abc import AsyncIterator, Callable
+from typing import Any
+
+import nats
+from nats.aio.client import Client
+from nats.aio.msg import Msg
+from nats.errors import Error as NatsError
+from nats.js import JetStreamContext
+from nats.js.api import Header, ObjectStoreConfig, RePublish, StreamConfig
+from nats.js.errors import APIError, KeyNotFoundError, KeyWrongLastSequenceError, NotFoundError
+from nats.js.kv import KeyValue
+
+from server.cluster.bus import BusError, ConflictError, PurgedError, RefusedError, Revised, Snapshot, Stored
+from server.scale.writer import EMPTY, Entry
+
+ACK_S = 0.5
+"""Seconds to wait for the acknowledgement of a record."""
+ANSWER_S = 2.0
+"""Seconds to wait for other answers."""
+CONNECT_S = 5.0
+"""Seconds to wait for a connection at the start."""
+RECONNECT_S = 0.1
+"""Seconds between two attempts to reconnect."""
+FETCHED_MAX = 256
+"""Maximum number of missing records that are fetched at once."""
+ATTEMPTS = 20
+"""Attempts to fetch a record that the stream has, and that did not come."""
+WRONG_LAST_ID, NAME_IN_USE = 10070, 10058
+"""Error codes of JetStream: the newest message has another id; a stream of that name has another configuration."""
+WORLD = re.compile("[A-Za-z0-9_-]{1,32}")
+"""Pattern of the name of a world on the bus."""
+BUCKET = "worlds"
+"""Name of the bucket of keys."""
+
+logger = logging.getLogger(__name__)
+
+
+class NatsBus:
+    """One world's part of a NATS server. Create it with `NatsBus.connect`."""
+
+    def __init__(self, client: Client, connection: "_Connection", world: str) -> None:
+        self._client, self._connection, self._world = client, connection, world
+        self._js: JetStreamContext = client.jetstream(timeout=ANSWER_S)
+        self._stream, self._subject = f"WORLD_{world}", f"world.{world}"
+        self._kv: KeyValue | None = None
+        self._store: Any = None
+        self._tasks: set[asyncio.Task[None]] = set()
+        self.bytes_out = self.bytes_in = 0
+        """Bytes of batches and records that were sent and received."""
+
+    @classmethod
+    async def connect(cls, url: str, world: str, *, replicas: int = 1) -> "NatsBus":
+        """Connects to a NATS server, and makes the stream and the stores of a world if they do not exist.
+
+        Args:
+            url: address, nats://HOST:PORT; several are separated by commas.
+            world: name of the world.
+            replicas: number of servers that store the log, the checkpoints and the keys.
+
+        Raises:
+            BusError: there is no connection, or the server has no JetStream.
+        """
+        if not WORLD.fullmatch(world):
+            raise BusError(f"world = {world!r}: must be 1 to 32 letters, digits, - and _")
+        connection = _Connection()
+        try:
+            client = await asyncio.wait_for(
+                nats.connect(
+                    url.split(","),
+                    name=f"sovereign {world}",
+                    max_reconnect_attempts=-1,
+                    reconnect_time_wait=RECONNECT_S,
+                    connect_timeout=2,
+                    ping_interval=2,
+                    error_cb=connection.failed,
+                    disconnected_cb=connection.lost,
+                    reconnected_cb=connection.back,
+                ),
+                CONNECT_S,
+            )
+        except (NatsError, OSError, TimeoutError) as error:
+            raise BusError(f"bus = {url!r}: no connection ({_said(error)})") from error
+        bus = cls(client, connection, world)
+        try:
+            await bus._prepare(replicas)
+        except (NatsError, OSError, TimeoutError) as error:
+            await client.close()
+            raise BusError(f"bus = {url!r}: cannot be used; is JetStream on (-js)? ({_said(error)})") from error
+        return bus
+
+    async def _prepare(self, replicas: int) -> None:
+        config = StreamConfig(
+            name=self._stream,
+            subjects=[f"{self._subject}.log"],
+            republish=RePublish(src=f"{self._subject}.log", dest=f"{self._subject}.told"),
+            allow_direct=True,
+            num_replicas=replicas,
+        )
+        with _unless(NAME_IN_USE):
+            await self._js.add_stream(config)
+        with _unless(NAME_IN_USE):
+            await self._js.create_key_value(bucket=BUCKET, history=1, replicas=replicas)
+        with _unless(NAME_IN_USE):
+            name = f"CHECKPOINTS_{self._world}"
+            await self._js.create_object_store(name, config=ObjectStoreConfig(bucket=name, replicas=replicas))
+        self._kv = await self._js.key_value(BUCKET)
+        self._store = await self._js.object_store(f"CHECKPOINTS_{self._world}")
+
+    # -- batches -----------------------------------------------------------------------------------------------
+
+    def publish(self, batch: bytes) -> None:
+        if self._client.is_connected:
+            self.bytes_out += len(batch)
+            self._begin(self._client.publish(f"{self._subject}.in", batch))
+
+    async def receive(self, take: Callable[[bytes], None]) -> None:
+        async def handle(message: Msg) -> None:
+            self.bytes_in += len(message.data)
+            take(message.data)
+
+        await self._client.subscribe(f"{self._subject}.in", cb=handle)
+
+    # -- the log -----------------------------------------------------------------------------------------------
+
+    async def append(self, entry: Entry) -> int:
+        headers = {Header.MSG_ID.value: entry.id}
+        if entry.after != EMPTY:
+            headers[Header.EXPECTED_LAST_MSG_ID.value] = entry.after
+        else:
+            headers[Header.EXPECTED_LAST_SEQUENCE.value] = "0"
+        self.bytes_out += len(entry.data)
+        try:
+            answer = await self._client.request(f"{self._subject}.log", entry.data, timeout=ACK_S, headers=headers)
+            told: dict[str, Any] = json.loads(answer.data)
+        except (NatsError, OSError, ValueError) as error:
+            raise BusError(f"no acknowledgement ({_said(error)})") from error
+        error_code = told.get("error", {}).get("err_code")
+        if error_code is None:
+            return int(told["seq"])
+        if error_code == WRONG_LAST_ID or entry.after == EMPTY:
+            seq, last = await self.end()
+            if last == entry.id:  # it was stored before, and only its acknowledgement was lost
+                return seq
+            raise RefusedError(last)
+        raise BusError(f"not stored ({told['error'].get('description', error_code)})")
+
+    async def end(self) -> tuple[int, str]:
+        try:
+            message = await self._js.get_last_msg(self._stream, f"{self._subject}.log")
+        except NotFoundError:
+            return 0, EMPTY
+        except (NatsError, OSError, TimeoutError) as error:
+            raise BusError(_said(error)) from error
+        return message.seq or 0, _id_of(message.headers)
+
+    async def follow(self, seq: int) -> "NatsReader":
+        reader = NatsReader(self, seq)
+        await reader.begin(self._client, f"{self._subject}.told")
+        return reader
+
+    async def fetch(self, first: int, last: int) -> list[Stored]:
+        """Returns records of the stream by their sequence numbers.
+
+        Raises:
+            PurgedError: the stream does not have the first one any more.
+            BusError: there was no answer.
+        """
+        try:
+            found = await asyncio.gather(*(self._stored(seq) for seq in range(first, last + 1)))
+        except NotFoundError as error:
+            info = await self._js.stream_info(self._stream)
+            if first < info.state.first_seq:
+                raise PurgedError(f"record {first} is not in the log any more") from error
+            raise BusError("a record is missing") from error
+        except (NatsError, OSError, TimeoutError) as error:
+            raise BusError(_said(error)) from error
+        return found
+
+    async def _stored(self, seq: int) -> Stored:
+        message = await self._js.get_msg(self._stream, seq=seq, direct=True)
+        self.bytes_in += len(message.data or b"")
+        return Stored(seq, _id_of(message.headers), message.data or b"")
+
+    # -- checkpoints -------------------------------------------------------------------------------------------
+
+    async def checkpoint(self) -> Snapshot | None:
+        for _ in range(ATTEMPTS):
+            known = await self.get(f"{self._world}.checkpoint")
+            if known is None:
+                return None
+            named = json.loads(known.value)
+            try:
+                return Snapshot(named["seq"], (await self._store.get(named["object"])).data or b"")
+            except NotFoundError:  # a newer one has replaced it
+                await asyncio.sleep(RECONNECT_S)
+            except (NatsError, OSError, TimeoutError) as error:
+                raise BusError(_said(error)) from error
+        raise BusError("the newest checkpoint cannot be found")
+
+    async def put_checkpoint(self, snapshot: Snapshot, keep: int) -> None:
+        key = f"{self._world}.checkpoint"
+        known = await self.get(key)
+        former = {"seq": 0} if known is None else json.loads(known.value)
+        if former["seq"] >= snapshot.seq:
+            return
+        name = f"{snapshot.seq}-{time.time_ns()}"
+        await self._store.put(name, snapshot.data)
+        value = json.dumps({"object": name, "seq": snapshot.seq}).encode()
+        try:
+            await self.put(key, value, 0 if known is None else known.revision)
+        except ConflictError:
+            await self._store.delete(name)
+            return
+        if "object" in former:
+            with contextlib.suppress(NotFoundError):
+                await self._store.delete(former["object"])
+        await self._js.purge_stream(self._stream, seq=max(snapshot.seq - keep, 1))
+
+    # -- keys --------------------------------------------------------------------------------------------------
+
+    async def get(self, key: str) -> Revised | None:
+        assert self._kv is not None
+        try:
+            entry = await self._kv.get(key)
+        except KeyNotFoundError:
+            return None
+        except (NatsError, OSError, TimeoutError) as error:
+            raise BusError(_said(error)) from error
+        return Revised(entry.value or b"", entry.revision or 0)
+
+    async def put(self, key: str, value: bytes, revision: int | None = None) -> int:
+        assert self._kv is not None
+        try:
+            if revision is None:
+                return await self._kv.put(key, value)
+            if revision == 0:
+                return await self._kv.create(key, value)
+            return await self._kv.update(key, value, last=revision)
+        except KeyWrongLastSequenceError as error:
+            raise ConflictError(f"{key}: has another revision than {revision}") from error
+        except (NatsError, OSError, TimeoutError) as error:
+            raise BusError(_said(error)) from error
+
+    async def delete(self, key: str) -> None:
+        assert self._kv is not None
+        try:
+            await self._kv.delete(key)
+        except (NatsError, OSError, TimeoutError) as error:
+            raise BusError(_said(error)) from error
+
+    async def watch(self, prefix: str) -> AsyncIterator[tuple[str, bytes | None]]:
+        head, changed = f"$KV.{BUCKET}.", asyncio.Queue[str]()
+        known: dict[str, bytes] = {}
+
+        async def note(message: Msg) -> None:  # also of a change that was refused, so the value is read
+            changed.put_nowait(message.subject.removeprefix(head))
+
+        subscription = await self._client.subscribe(f"{head}>", cb=note)
+        try:
+            listed_at = -ANSWER_S
+            while True:
+                if time.monotonic() - listed_at > ANSWER_S:  # changes may have been missed during a reconnect
+                    with contextlib.suppress(BusError):
+                        for key in {*await self._keys(prefix), *known}:
+                            changed.put_nowait(key)
+                        listed_at = time.monotonic()
+                try:
+                    key = await asyncio.wait_for(changed.get(), ANSWER_S)
+                    found = await self.get(key) if key.startswith(prefix) else None
+                except (TimeoutError, BusError):
+                    continue
+                value = None if found is None else found.value
+                if key.startswith(prefix) and known.get(key) != value:
+                    known.pop(key, None)
+                    if value is not None:
+                        known[key] = value
+                    yield key, value
+        finally:
+            with contextlib.suppress(NatsError):
+                await subscription.unsubscribe()
+
+    async def _keys(self, prefix: str) -> list[str]:
+        head = f"$KV.{BUCKET}."
+        try:
+            info = await self._js.stream_info(f"KV_{BUCKET}", subjects_filter=f"{head}>")
+        except (NatsError, OSError, TimeoutError) as error:
+            raise BusError(_said(error)) from error
+        subjects = [subject.removeprefix(head) for subject in info.state.subjects or {}]
+        return [key for key in subjects if key.startswith(prefix)]
+
+    # -- the connection ----------------------------------------------------------------------------------------
+
+    async def close(self) -> None:
+        self._connection.closing = True
+        with contextlib.suppress(NatsError, TimeoutError, OSError):
+            await asyncio.wait_for(self._client.close(), ANSWER_S)
+
+    def _begin(self, sending: Any) -> None:
+        async def sent() -> None:
+            with contextlib.suppress(NatsError, OSError):
+                await sending
+
+        task = asyncio.get_running_loop().create_task(sent())
+        self._tasks.add(task)
+        task.add_done_callback(self._tasks.discard)
+
+
+class NatsReader:
+    """A stream of the records of a world. Missing ones are fetched."""
+
+    def __init__(self, bus: NatsBus, seq: int) -> None:
+        self._bus, self._next = bus, seq
+        self._come: dict[int, Stored] = {}
+        self._newest = seq - 1
+        self._news = asyncio.Event()
+        self._subscription: Any = None
+        self._closing: asyncio.Task[None] | None = None
+
+    async def begin(self, client: Client, subject: str) -> None:
+        """Subscribes to what the stream has accepted."""
+        self._subscription = await client.subscribe(subject, cb=self._take)
+
+    @property
+    def waiting(self) -> int:
+        return max(self._newest - self._next + 1, 0)
+
+    async def take(self, wait_s: float) -> Stored | None:
+        until = time.monotonic() + wait_s
+        while self._next not in self._come:
+            if self._newest < self._next:
+                self._news.clear()
+                try:
+                    await asyncio.wait_for(self._news.wait(), max(until - time.monotonic(), 0.001))
+                except TimeoutError:
+                    await self._look_at_the_end()
+            if self._newest >= self._next and self._next not in self._come:
+                await self._fetch()
+            if time.monotonic() >= until and self._next not in self._come:
+                return None
+        self._next += 1
+        return self._come.pop(self._next - 1)
+
+    def close(self) -> None:
+        if self._subscription is not None:
+            subscription, self._subscription = self._subscription, None
+
+            async def end() -> None:
+                with contextlib.suppress(NatsError):
+                    await subscription.unsubscribe()
+
+            self._closing = asyncio.get_running_loop().create_task(end())
+
+    async def _take(self, message: Msg) -> None:
+        headers = message.headers or {}
+        seq = int(headers.get("Nats-Sequence", 0))
+        self._bus.bytes_in += len(message.data)
+        if seq >= self._next:
+            self._come[seq] = Stored(seq, _id_of(headers), message.data)
+            self._newest = max(self._newest, seq)
+            self._news.set()
+
+    async def _look_at_the_end(self) -> None:
+        """Asks for the newest record, because it may have been missed."""
+        with contextlib.suppress(BusError):
+            self._newest = max(self._newest, (await self._bus.end())[0])
+
+    async def _fetch(self) -> None:
+        """Fetches the records that are missing before the first one that has come."""
+        last = min([*self._come, self._newest + 1]) - 1
+        try:
+            for stored in await self._bus.fetch(self._next, min(last, self._next + FETCHED_MAX - 1)):
+                self._come[stored.seq] = stored
+        except BusError:
+            await asyncio.sleep(RECONNECT_S)
+
+
+class _Connection:
+    """Logs what becomes of a connection."""
+
+    def __init__(self) -> None:
+        self.closing = False
+
+    async def failed(self, error: Exception) -> None:
+        """Logs an error. There is one for each attempt to reconnect."""
+        logger.debug("the bus: %s", _said(error))
+
+    async def lost(self) -> None:
+        """Logs that the connection is lost, unless it is closed here."""
+        if not self.closing:
+            logger.warning("the connection to the bus is lost")
+
+    async def back(self) -> None:
+        """Logs that there is a connection again."""
+        logger.info("the connection to the bus is back")
+
+
+class _unless(contextlib.AbstractContextManager[None]):  # noqa: N801 - reads as a word
+    """Ignores an error of JetStream by its code."""
+
+    def __init__(self, code: int) -> None:
+        self._code = code
+
+    def __exit__(self, kind: Any, error: BaseException | None, trace: Any) -> bool:
+        return isinstance(error, APIError) and error.err_code == self._code
+
+
+def _id_of(headers: Any) -> str:
+    return str((headers or {}).get(Header.MSG_ID.value, EMPTY))
+
+
+def _said(error: BaseException) -> str:
+    """Returns the text of an error, or its kind if it has none."""
+    return str(error) or type(error).__name__
