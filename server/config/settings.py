@@ -299,8 +299,8 @@ def _check_role(settings: Settings) -> None:
         raise SettingsError(f"{role}: needs bus as well")
     if settings.public_url is not None and settings.role != "edge":
         raise SettingsError(f"public_url (from {settings.origins['public_url']}): is for role edge only")
-    for name, given in (("data", settings.data), ("reload", settings.reload), ("worlds", settings.worlds)):
-        if given:
+    for name in ("data", "reload", "worlds"):
+        if getattr(settings, name):
             raise SettingsError(f"{role}: excludes {name}; the world is saved on the bus")
 
 
