@@ -30,6 +30,9 @@ FOLDERS = ("client_sdk", "server", "shared")
 ALIAS = "_checkout.py"
 """The file in the folder `PACKAGE` that is of use in a checkout only."""
 
+BROWSER, RUNTIME = Path("build/browser"), Path("server/play/runtime")
+"""Folder of Python for browsers, if `scripts/browser` has made it, and its place in the wheel."""
+
 _NAMES = "|".join(FOLDERS)
 _IN_TEXT = re.compile(rf"(?<=`)(?=(?:{_NAMES})\.[a-z_])|(?<=python -m )(?=(?:{_NAMES})\b)")
 """Matches where a docstring, comment or message names a module. Neither alternative can occur in other code."""
@@ -83,6 +86,8 @@ def stage(root: Path, place: Path) -> None:
         source = file.read_text("utf-8")
         text = docstring_alone(source) if target == Path("__init__.py") else rewritten(source, str(target), modules)
         copy.write_text(text, "utf-8", newline="\n")
+    if (root / BROWSER / "stamp.json").is_file():
+        shutil.copytree(root / BROWSER, place / RUNTIME)
 
 
 def refuse_stale_kernels(root: Path) -> None:

@@ -16,6 +16,7 @@ from server.config.options import SettingsError, nearest
 from server.config.settings import Settings, parse
 from server.game import Game
 from server.persistence.database import StoreError
+from server.play.play import play_pages
 from server.rules import Rules, RulesError, load_rules, prepared
 from server.runtime import healthcheck, log, reload
 from server.runtime.event_loop import (
@@ -141,4 +142,6 @@ def run(settings: Settings) -> int:
             authenticate=authenticate,
         )
         more = Declared(kinds, terrain, token) if kinds else None
-        return runner.run(Server(settings, game, store, more).serve())
+        others = [(kind.name, kind.scene, kind.rules()) for kind in kinds.values()] if settings.play else []
+        play = play_pages(settings, [(settings.game or scene.name, scene, rules), *others])
+        return runner.run(Server(settings, game, store, more, play).serve())

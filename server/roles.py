@@ -21,6 +21,7 @@ from server.net.addresses import bracketed, reachable
 from server.net.gateway import Events
 from server.observability.histogram import Histogram
 from server.observability.pages import Page, line
+from server.play.play import PlayPages, play_pages
 from server.rules import Rules
 from server.runtime.event_loop import freeze, loop_factory
 from server.runtime.keeping import recorded
@@ -40,13 +41,14 @@ class PartServer(Serving):
     Args:
         settings: the settings.
         part: the part.
+        play: the page to play on, of an edge; None: there is none.
     """
 
-    def __init__(self, settings: Settings, part: Part) -> None:
+    def __init__(self, settings: Settings, part: Part, play: PlayPages | None = None) -> None:
         self.part = part
         self._files = contextlib.ExitStack()
         self._work: asyncio.Task[None] | None = None
-        super().__init__(settings, part, routes=True)
+        super().__init__(settings, part, routes=True, play=play)
 
     def _begin(self, loop: asyncio.AbstractEventLoop, tasks: Tasks, port: int) -> None:
         settings, part = self.settings, self.part
@@ -140,8 +142,10 @@ async def _run(
             await join_world(bus, settings.world, identity)
             common: dict[str, Any] = {"name": name, "world": settings.world, "limits": settings.limits}
             part: Part
+            play: PlayPages | None = None
             if settings.role == "edge":
                 part = EdgePart(bus, world, authenticate=authenticate, **common)
+                play = play_pages(settings, [(settings.game or scene.name, scene, rules)])
             else:
                 part = SequencerPart(
                     bus,
@@ -154,7 +158,7 @@ async def _run(
                 )
                 if settings.durability == "power":
                     logger.info("an edit survives a power cut only if the bus has sync_interval: always")
-            return await PartServer(settings, part).serve()
+            return await PartServer(settings, part, play).serve()
         finally:
             await bus.close()
     except (BusError, IdentityError) as error:

@@ -26,6 +26,7 @@ from server.observability.live import Live
 from server.observability.metrics import metrics_page
 from server.observability.pages import Page, PageRequest, Pages, json_page, line, ready_page
 from server.persistence.store import Store
+from server.play.play import PlayPages
 from server.players.persisted_state import PersistedState
 from server.players.player import Player
 from server.runtime.event_loop import freeze, on_signals, raise_descriptors, rss_mb
@@ -102,10 +103,13 @@ class Serving:
         settings: the settings.
         served: what it serves.
         routes: whether `_route` decides where a WebSocket leads, and `_page` answers requests for further pages.
+        play: the page to play on; None: there is none.
     """
 
-    def __init__(self, settings: Settings, served: Served, *, routes: bool = False) -> None:
-        self.settings, self.served = settings, served
+    def __init__(
+        self, settings: Settings, served: Served, *, routes: bool = False, play: PlayPages | None = None
+    ) -> None:
+        self.settings, self.served, self._play = settings, served, play
         self.faults = served.faults
         live = Live(served, self.stats, self._durations).pages() if settings.page else {}
         self.admission = Admission(
@@ -118,7 +122,7 @@ class Serving:
                     **live,
                 },
                 self.faults.report,
-                self._page if routes else None,
+                self._any_page if routes or play else None,
             ),
             figures=settings.figures,
             origins=settings.allowed_origins,
@@ -149,6 +153,8 @@ class Serving:
             print(f"listening on ws{secure}://{bracketed(host)}:{port}", flush=True)
             if self.settings.page and self.admission.trusted(reachable(address)):
                 print(f"live page at http{secure}://{bracketed(reachable(host))}:{port}/", flush=True)
+            if self._play is not None and self._play.ready:
+                print(f"play in a browser at http{secure}://{bracketed(reachable(host))}:{port}/play", flush=True)
             reason, code = await self._stop
         self.watchdog.stop()
         tasks.stop()
@@ -210,6 +216,10 @@ class Serving:
         """Yields further metrics."""
         yield from ()
 
+    def _any_page(self, request: PageRequest) -> Page | None:
+        page = None if self._play is None else self._play.get(request)
+        return page or self._page(request)
+
     def _page(self, request: PageRequest) -> Page | None:
         return None
 
@@ -249,16 +259,22 @@ class Server(Serving):
         game: the game of the default world.
         store: the store of the default world; None: it is not saved.
         declared: what further worlds need; None: there are none.
+        play: the page to play on; None: there is none.
     """
 
     def __init__(
-        self, settings: Settings, game: Game, store: Store | None = None, declared: Declared | None = None
+        self,
+        settings: Settings,
+        game: Game,
+        store: Store | None = None,
+        declared: Declared | None = None,
+        play: PlayPages | None = None,
     ) -> None:
         self.game, self.store, self._declared = game, store, declared
         self.hosting: Hosting | None = None
         """The worlds besides the default one, from the start on; None: there are none."""
         self.ticker: Ticker | None = None
-        super().__init__(settings, game, routes=declared is not None)
+        super().__init__(settings, game, routes=declared is not None, play=play)
 
     def _begin(self, loop: asyncio.AbstractEventLoop, tasks: Tasks, port: int) -> None:
         if self.store is not None:

@@ -52,10 +52,12 @@ class Tab:
             if told.get("method") in ("Runtime.exceptionThrown", "Runtime.consoleAPICalled", "Log.entryAdded"):
                 self.said.append(json.dumps(told["params"])[:2000])
 
-    def open(self, url: str, width: int, height: int, *, scale: float = 1.0, dark: bool = False) -> None:
-        """Goes to a page, in a window of `width` x `height` pixels."""
+    def open(
+        self, url: str, width: int, height: int, *, scale: float = 1.0, dark: bool = False, phone: bool = False
+    ) -> None:
+        """Goes to a page, in a window of `width` x `height` pixels, or on a phone with such a screen."""
         self.call(
-            "Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=scale, mobile=False
+            "Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=scale, mobile=phone
         )
         scheme = {"name": "prefers-color-scheme", "value": "dark" if dark else "light"}
         self.call("Emulation.setEmulatedMedia", features=[scheme])

@@ -89,6 +89,7 @@ class Settings:
         "private", Option(str, "addresses that may read /stats, /metrics and the live page", choices=ADDRESSES)
     )
     page: bool = setting(True, Option(bool, "serve the live page at /: the world and its players in a browser"))
+    play: bool = setting(True, Option(bool, "serve the page /play, on which everybody can play in a browser"))
     allowed_origins: tuple[str, ...] = setting(
         (),
         Option(
@@ -184,7 +185,7 @@ GROUPS = {
     "access": ("auth", "auth_key_file"),
     "saving": ("data", "durability", "checkpoint_s", "record"),
     "many processes": ("role", "bus", "world", "bus_replicas", "public_url"),
-    "operation": ("log_level", "log_format", "figures", "page", "restart_s", "drain_s", "operator_token_file"),
+    "operation": ("log_level", "log_format", "figures", "page", "play", "restart_s", "drain_s", "operator_token_file"),
 }
 """Groups of settings as `--help` shows them, the ones for beginners first. Settings in no group are shown as limits."""
 SECTIONS: dict[str, dict[str, Option]] = {"": kinds_of(Settings), "limits": kinds_of(Limits)}

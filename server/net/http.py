@@ -76,9 +76,12 @@ def _answer(
     if page is None and upgrade and request.method == "GET":
         page = route(request.path)
     protocol.send_response(protocol.accept(request) if page is None else _response(page))
+    if page is not None and page.body:
+        protocol.writes.insert(1, page.body)  # after the head, before the end: all connections share these bytes
 
 
 def _response(page: Page) -> Response:
+    """Returns the head of the answer."""
     status = HTTPStatus(page.status)
     fixed = (("Connection", "close"), ("Content-Length", str(len(page.body))), ("Content-Type", page.content_type))
-    return Response(status.value, status.phrase, Headers(fixed + page.headers), page.body)
+    return Response(status.value, status.phrase, Headers(fixed + page.headers))

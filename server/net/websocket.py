@@ -40,6 +40,8 @@ if TYPE_CHECKING:
 
 CLOSE_S = 2.0
 """Seconds in which a peer must finish closing before it is aborted."""
+SLOWEST_BYTES_PER_S = 32 * 1024
+"""Bytes per second at which a peer must read a page; it gets the time for it on top of `CLOSE_S`."""
 EXTRAS_PER_S = 256
 """Pings, pongs and fragments per second, at 6 us each, beyond which a peer is aborted."""
 DEAF_BYTES_MAX = 64 * 1024
@@ -328,10 +330,11 @@ class Connection(AcceptedSocket):
             self._gateway.faults.report("lost")
 
     def _last_limit(self) -> None:
-        """Aborts the connection in `CLOSE_S` seconds, regardless of what the peer does meanwhile."""
+        """Aborts the connection in `CLOSE_S` seconds and the time for what waits, whatever the peer does meanwhile."""
         if not self._timer_is_last:
             self._timer_is_last = True
-            self._abort_in(CLOSE_S)
+            waiting = 0 if self._transport is None else self._transport.get_write_buffer_size()
+            self._abort_in(CLOSE_S + (0.0 if self.opened else waiting / SLOWEST_BYTES_PER_S))
 
     def _abort_in(self, seconds: float) -> None:
         if self._timer is not None:

@@ -65,7 +65,7 @@ def last_words(link: ClientConnection) -> Message:
 
 
 def test_it_serves_and_sends_a_bye_at_its_end() -> None:
-    with running("--port", "0", "--scene", "flat", "--tick-rate", "64") as server:
+    with running("--play", "false", "--port", "0", "--scene", "flat", "--tick-rate", "64") as server:
         address = server.address()
         assert page(address, "/healthz") == "ok\n"
         until(lambda: status(address, "/readyz") == (200, "ready\n"))

@@ -98,7 +98,7 @@ PAGE_IS = [
 def test_it_says_where_its_live_page_is(flags: tuple[str, ...], shown: str | None) -> None:
     if "::" in "".join(flags) and not socket.has_dualstack_ipv6():
         pytest.skip("no IPv6")
-    with running("--port", "0", "--scene", "flat", *flags) as server:
+    with running("--port", "0", "--scene", "flat", "--play", "false", *flags) as server:
         host, port = server.address()
         assert host == (flags[1] if "--host" in flags else "127.0.0.1")
         if shown is not None:

@@ -124,3 +124,16 @@ def test_files_that_are_no_sources_are_carried_as_they_are(tmp_path: Path) -> No
     found = {file.relative_to(place).as_posix() for file in place.rglob("*") if file.is_file()}
     assert found == {"__init__.py", "server/a.py", "client_sdk/a.py", "shared/deep/kernel.so"}
     assert (place / "shared/deep/kernel.so").read_bytes() == content
+
+
+def test_python_for_browsers_is_carried_once_it_is_complete(tmp_path: Path) -> None:
+    root, place = tmp_path / "root", tmp_path / "place"
+    for name in ("sovereign_netcode/__init__.py", "build/browser/python_stdlib.zip.gz"):
+        (root / name).parent.mkdir(parents=True, exist_ok=True)
+        (root / name).write_bytes(b'"""A module."""\n')
+    hatch_build.stage(root, place)
+    assert not (place / "server").exists()
+    (root / "build/browser/stamp.json").write_text("{}", "utf-8")
+    hatch_build.stage(root, place)
+    found = {file.name for file in (place / "server/play/runtime").iterdir()}
+    assert found == {"python_stdlib.zip.gz", "stamp.json"}

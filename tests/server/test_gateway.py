@@ -22,7 +22,7 @@ from server.net import websocket as module
 from server.net.admission import SPARE_PER_ADDRESS, Admission
 from server.net.gateway import Gateway
 from server.net.websocket import Connection
-from server.observability.pages import Pages, json_page
+from server.observability.pages import Page, Pages, json_page
 from shared.fields import CLIENT_MESSAGE_MAX
 from tests.lengths import examples
 
@@ -120,7 +120,11 @@ class Bench:
     def __init__(self) -> None:
         self.notes = Notes()
         self.figures: Callable[[], Mapping[str, Any]] = lambda: {"tick": 7}
-        pages = Pages(private={"/stats": json_page(lambda: self.figures())}, failed=lambda path: self.failed(path))
+        self.large = b"x"
+        public = {"/large": lambda: Page(200, self.large)}
+        pages = Pages(
+            public, private={"/stats": json_page(lambda: self.figures())}, failed=lambda path: self.failed(path)
+        )
         self.gateway = Gateway(self.notes, Admission(Limits(handshake_s=HANDSHAKE_S), pages))
         self.address = ("", 0)
         self.peers: list[Peer] = []
@@ -592,6 +596,19 @@ async def test_pages(bench: Bench) -> None:
 )
 async def test_pages_are_for_the_servers_own_names(bench: Bench, host: str, status: int) -> None:
     assert (await get(bench, "/stats", host=host))[0] == status
+
+
+@pytest.mark.parametrize(("bytes_per_s", "whole"), [(1 << 20, True), (1 << 40, False)])
+async def test_a_slow_reader_of_a_large_page_gets_the_time_for_its_bytes(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch, bytes_per_s: int, whole: bool
+) -> None:
+    monkeypatch.setattr(module, "CLOSE_S", 0.05)
+    monkeypatch.setattr(module, "SLOWEST_BYTES_PER_S", bytes_per_s)
+    bench.large = bytes(range(256)) * (64 << 10)  # more than the buffers of both sockets
+    peer = await bench.connect(b"GET /large HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n", limit=1 << 10)
+    await peer.line()
+    await asyncio.sleep(0.2)  # longer than CLOSE_S
+    assert (await peer.end() == bench.large) == whole
 
 
 async def test_stats_that_fail_are_our_mistake(bench: Bench) -> None:
