@@ -15,7 +15,7 @@ from shared.units import SEGMENT
 from shared.world import OverlapError, World
 
 ROOT = Path(__file__).parent.parent.parent
-TICKS = 6_000
+TICKS = 7_000
 SCENES = ("arena", "hills", "topdown")
 PLAYERS = 6
 
