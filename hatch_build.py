@@ -103,9 +103,11 @@ def refuse_stale_kernels(root: Path) -> None:
     spec.loader.exec_module(freshness)
     folder = root / "shared" / "prebuilt"
     manifest = json.loads((folder / "manifest.json").read_text("utf-8"))
-    texts = freshness.sources(root / "shared" / name for name in ("kernel.py", "bulk.py"))
+    texts = freshness.sources(root / "shared" / name for name in ("kernel.py", "bulk.py", "traffic.py"))
     if freshness.code_crc(texts) != manifest["code_crc"]:
-        raise StaleError("shared/prebuilt is not made from shared/kernel.py and shared/bulk.py: run scripts/kernels")
+        raise StaleError(
+            "shared/prebuilt is not made from shared/kernel.py, bulk.py and traffic.py: run scripts/kernels"
+        )
     for name, told in manifest["files"].items():
         if hashlib.sha256((folder / name).read_bytes()).hexdigest() != told["sha256"]:
             raise StaleError(f"shared/prebuilt/{name} differs from its hash in manifest.json: run scripts/kernels")

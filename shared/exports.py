@@ -9,7 +9,7 @@ from shared.layout import Arrays
 
 WORLD, NUMBER, TRUTH = "w", "n", "?"
 """Kinds of arguments: the `Arrays` of a world, a whole number, and a truth value."""
-ARRAYS = {"q": ("int64", 8), "i": ("int32", 4), "u": ("uint32", 4), "b": ("uint8", 1)}
+ARRAYS = {"q": ("int64", 8), "i": ("int32", 4), "u": ("uint32", 4), "b": ("uint8", 1), "d": ("float64", 8)}
 """Kinds of flat arrays: type and size in bytes of their elements. A capital letter is an array that is written to."""
 
 EXPORTS = {
@@ -34,17 +34,29 @@ EXPORTS = {
         "muster": "qiQBn",
         "recall": "qqQQn",
     },
+    "traffic": {
+        "take_messages": "QDQbqdBqd",
+        "take_inputs": "QQQnnn",
+        "write_snapshots": "QDqqqbBQqd",
+    },
 }
 """Argument kinds of each function, by source: one letter per argument. A function returns nothing, a truth value, or a
 whole number that fits into 32 bits."""
+SERVER_SOURCES = frozenset({"traffic"})
+"""Sources that only servers use. The libraries for browsers do not have their functions."""
 
 FIELDS = {name: {"solid": "u", "heads": "i"}.get(name, "q") for name in Arrays._fields}
 """Kind of each array of a world (`layout.Arrays`), by name."""
 
 
-def functions() -> dict[str, str]:
-    """Returns the argument kinds of all functions, by name."""
-    return {name: kinds for of_source in EXPORTS.values() for name, kinds in of_source.items()}
+def functions(*, server: bool = True) -> dict[str, str]:
+    """Returns the argument kinds of all functions, by name.
+
+    Args:
+        server: whether to include those of `SERVER_SOURCES`.
+    """
+    sources = [EXPORTS[name] for name in EXPORTS if server or name not in SERVER_SOURCES]
+    return {name: kinds for source in sources for name, kinds in source.items()}
 
 
 def of(source: ModuleType) -> dict[str, str]:

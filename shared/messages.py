@@ -271,7 +271,14 @@ CLIENT_KINDS = frozenset({1, 2, 3, 4, 5, 6, 7})
 SERVER_KINDS = frozenset({4, 17, 18, 19, 20, 21, 22, 23, 24, 25, 26, 27, 28})
 """Kinds of messages that a server may send."""
 _KIND_OF = {kind: number for number, (kind, _) in KINDS.items()}
-_INPUTS_HEAD = bytes((0x94, _KIND_OF[Inputs]))
+
+
+def head_of(kind: type[Message]) -> bytes:
+    """Returns the first two bytes of every message of a kind with at most 14 fields: the list's length, the kind."""
+    return bytes((0x91 + len(kind._fields), _KIND_OF[kind]))
+
+
+_INPUTS_HEAD = head_of(Inputs)
 _SNAPSHOT_HEAD, _SNAPSHOT_KIND = b"\xdc", bytes((_KIND_OF[Snapshot],))
 pack: Callable[[Any], bytes] = msgpack.Packer().pack
 """Packer of MessagePack values. It takes half the time of `msgpack.packb`, which creates a packer and a buffer for each

@@ -61,7 +61,7 @@ def loaded(path: Path) -> ModuleType:
     except OSError as error:
         raise ImportError(f"{path}: {error}") from error
     module = ModuleType(path.stem)
-    for name, kinds in {**exports.functions(), "built_from": exports.NUMBER}.items():
+    for name, kinds in {**exports.functions(server=False), "built_from": exports.NUMBER}.items():
         setattr(module, name, _function(getattr(library, name), kinds))
     return module
 

@@ -117,11 +117,13 @@ def build(out: Path, targets: Sequence[str] = tuple(TARGETS), *, link: bool = Tr
         print(f"{name} ...", flush=True)
         machine = ir.Machine(target.triple, target.cpu, target.features)
         more, visible = (python, (python_module.INIT,)) if target.python else ("", ())
-        module, target_machine = ir.linked(sources, code_crc, machine, more, visible)
+        names = exports.functions(server=target.python)
+        used = [source for source in sources if source.name in names]
+        module, target_machine = ir.linked(used, code_crc, machine, more, visible)
         code = target_machine.emit_object(module)
         files[name] = {"object": _sha256(code)}
         if link:
-            library = _linked(name, code, list(exports.functions()))
+            library = _linked(name, code, list(names))
             (out / name).write_bytes(library)
             files[name] |= {"sha256": _sha256(library), "bytes": len(library)}
     manifest = {

@@ -21,6 +21,8 @@ from shared import kernels
 FAILED = -(1 << 31)
 """Result of a function that found an index out of bounds, in a build that checks indices."""
 SPEED_LEVEL = 3
+FLOATS_USED = "_fltused"
+"""Symbol that code with floats needs on Windows; otherwise it comes with the C library."""
 
 
 @dataclass(frozen=True)
@@ -197,10 +199,12 @@ def linked(
     target_machine = machine.target_machine()
     ours = "".join(EXPORT.format(name=each.name, symbol=each.symbol, failed=FAILED) for each in sources)
     ours += BUILT_FROM.format(which=kernels.CONSTANTS_CRC, constants=kernels.constants_crc(), code=code_crc)
+    if "windows" in machine.triple:
+        ours += f"@{FLOATS_USED} = constant i32 1\n"
     whole = _parsed(ours, machine, target_machine)
     for text in (*(each.text for each in sources), more):
         whole.link_in(_parsed(text, machine, target_machine))
-    keep = visible or ("built_from", *(each.name for each in sources))
+    keep = (*(visible or ("built_from", *(each.name for each in sources))), FLOATS_USED)
     for value in (*whole.functions, *whole.global_variables):
         if not value.is_declaration and value.name not in keep:
             value.linkage = "internal"

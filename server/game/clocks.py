@@ -31,7 +31,8 @@ class Clocks:
     def __init__(self, rate: int, limits: Limits, connections: Connections, roster: Roster) -> None:
         self._rate, self._limits, self._connections, self._roster = rate, limits, connections, roster
         self._catch_up = catch_up_ticks(rate)
-        self._burst = in_ticks(BURST_S, rate, BURST_TICKS_MIN) * limits.messages_per_tick
+        self.burst = in_ticks(BURST_S, rate, BURST_TICKS_MIN) * limits.messages_per_tick
+        """Number of messages of a burst."""
         self._deadline: float | None = None
         self._ticked: float | None = None
 
@@ -46,23 +47,32 @@ class Clocks:
         if paused_s > AWAY_S:
             credit = paused_s * self._rate * self._limits.messages_per_tick
             for session in self._connections.sessions:
+                session.recall()
                 session.opened = session.received_at = session.stream.sent_at = now
                 session.allowance += credit
             self._roster.excuse(paused_s, now)
         self._deadline, self._ticked = deadline, now
 
+    @property
+    def deadline(self) -> float:
+        """The time in seconds at which the latest tick was due."""
+        assert self._deadline is not None
+        return self._deadline
+
     def allow(self, session: Session, now: float) -> bool:
         """Counts one message of a client. Returns False if these are more than the client may send."""
         session.received_at = now
         session.allowance -= 1
-        return session.allowance >= -self._burst or self._owes(session, now)
+        return session.allowance >= -self.burst or self._owes(session, now)
 
     def refill(self) -> None:
-        """Lets each client send further messages, those of one tick."""
+        """Lets each client send further messages, those of one tick. The fast path does it for its sessions."""
         most = self._limits.messages_per_tick
         for session in self._connections.sessions:
+            if session.row >= 0:
+                continue
             if session.allowance < 0:  # messages beyond the burst were allowed because of late ticks
-                session.allowance = min(max(session.allowance, -self._burst) + most, 0.0)
+                session.allowance = min(max(session.allowance, -self.burst) + most, 0.0)
             elif session.allowance:  # credit for messages that waited during a pause of the server
                 session.allowance = max(session.allowance - most, 0.0)
 
@@ -70,7 +80,7 @@ class Clocks:
         """Closes the connections of clients that have exceeded a time limit."""
         limits, kick = self._limits, self._connections.kick
         for session in tuple(self._connections.sessions):
-            if session.closed:
+            if session.row >= 0 or session.closed:
                 continue
             if not session.entity:
                 if session.hello is None and not session.loading and now - session.opened > limits.hello_s:
@@ -94,4 +104,4 @@ class Clocks:
     def _owes(self, session: Session, now: float) -> bool:
         """Returns whether the ticks that are late now explain why a session exceeds its allowance of messages."""
         behind = 0.0 if self._ticked is None else max((now - self._ticked) * self._rate - 1, 0.0)
-        return session.allowance >= -self._burst - behind * self._limits.messages_per_tick
+        return session.allowance >= -self.burst - behind * self._limits.messages_per_tick

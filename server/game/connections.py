@@ -38,6 +38,7 @@ class Connections:
 
     def lost(self, session: Session, now: float) -> None:
         """Removes a session whose connection is gone. Its player may reconnect."""
+        session.recall()
         session.closed = True
         if session in self.sessions:
             self.sessions.remove(session)

@@ -6,6 +6,7 @@ from typing import Any, Protocol
 from server.config.limits import Limits
 from server.game.clocks import Clocks
 from server.game.connections import Connections
+from server.game.fast_path import FastPath
 from server.game.session import Session
 from server.game_api.shared_values import SharedValues
 from server.journal.recorded_world import RecordedWorld
@@ -64,6 +65,8 @@ class Front:
     commands: Files
     world: RecordedWorld
     scene: Scene
+    fast_path: FastPath | None = None
+    """Serves the sessions that have nothing special to do; None: there is no compiled kernel."""
     _row_bytes: int
 
     @property
@@ -88,9 +91,11 @@ class Front:
 
     def stats(self) -> dict[str, Any]:
         """Returns all counters, including the inputs of the present players, and the size of the game."""
+        if self.fast_path is not None:
+            self.fast_path.count()
         totals = dataclasses.replace(self.counters)
         for player in self.players.values():
-            totals.add(player.inputs)
+            totals.add(player.counts)
         return dataclasses.asdict(totals) | {
             "tick": self.world.tick,
             "tick_rate": self.scene.tick_rate,
@@ -113,9 +118,13 @@ class Front:
 
     def receive(self, session: Session, data: bytes, now: float) -> None:
         """Checks one message of a client and queues it, or closes the connection if it is not allowed."""
+        if session.row >= 0:
+            assert self.fast_path is not None
+            if self.fast_path.post(session, data, now):
+                return
         if session.closed:
             return
-        if not self.clocks.allow(session, now):
+        if session.row < 0 and not self.clocks.allow(session, now):
             self.connections.kick(session, messages.MALFORMED, "too many messages")
             return
         if len(data) > self.limits.message_bytes_max:
@@ -163,13 +172,18 @@ class Front:
 
     def _send(self, values: SharedValues, now: float) -> None:
         """Sends each client that has joined what is due: its welcome, or the newest snapshot and events."""
+        fast_path = self.fast_path
+        if fast_path is not None:
+            fast_path.send(values.version, now)
         for session in tuple(self.sessions):
-            if session.entity and not session.closed:
+            if session.row < 0 and session.entity and not session.closed:
                 try:
                     values.show(session.stream)
                     if session.greeting is None or self.joining.greet(session, *session.greeting):
                         assert session.player is not None
                         self.sender.serve(session.stream, session.player, now)
+                        if fast_path is not None:
+                            fast_path.consider(session, values.version)
                     else:  # the welcome waits for the disk, which is not a stall of the client
                         session.stream.sent_at = now
                 except Exception:

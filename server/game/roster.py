@@ -138,7 +138,7 @@ class Roster:
         """
         wanted = self._digest(token)
         for player in self._api.players.values() if token else ():
-            if player.session is not None and player.session.stream.acked >= 0:
+            if player.session is not None and player.session.acknowledged:
                 player.drop_older_tokens()
             if wanted in player.tokens and player.subject == subject:
                 player.tokens[:] = [wanted]  # an older token is used up, and the client never got a newer one
@@ -156,8 +156,8 @@ class Roster:
         player = session.player
         if player is None or player.session is not session:
             return
-        known = session.stream.acked >= 0 or len(player.tokens) > 1
-        if session.stream.acked >= 0:
+        known = session.acknowledged or len(player.tokens) > 1
+        if session.acknowledged:
             player.drop_older_tokens()
             if session.reserved is not None:
                 session.reserved.settled = True

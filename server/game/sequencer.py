@@ -10,6 +10,7 @@ from typing import Protocol
 
 from server.game.commands import Commands
 from server.game.connections import Connections
+from server.game.fast_path import FastPath
 from server.game.roster import Roster
 from server.game_api.api import GameApi
 from server.journal.recorded_world import RecordedWorld
@@ -51,6 +52,8 @@ class Sequencer:
     ) -> None:
         self._world, self._api, self._rewind, self._roster = world, api, rewind, roster
         self._joining, self._commands, self._connections = joining, commands, connections
+        self.fast_path: FastPath | None = None
+        """Takes the inputs of sessions on the fast path; None: there is none."""
 
     def advance(self, now: float) -> Outcome:
         """Computes the next tick. Returns its outcome, which is valid until the next call."""
@@ -86,7 +89,11 @@ class Sequencer:
     def take_inputs(self) -> dict[int, Input]:
         """Takes the input of each player for the coming step, and the inputs that the rules have set."""
         tick, api = self._world.tick + 1, self._api
-        inputs = {entity: player.inputs.take(tick) for entity, player in api.players.items()}
+        taken = [] if self.fast_path is None else self.fast_path.take(tick)
+        inputs = {
+            entity: player.inputs.take(tick) if player.row < 0 else taken[player.row]
+            for entity, player in api.players.items()
+        }
         inputs.update(api.steered)
         api.steered.clear()
         return inputs

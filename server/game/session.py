@@ -6,14 +6,19 @@ from typing import TYPE_CHECKING, Any
 from server.players.input_queue import InputQueue
 from server.players.player import SETTLED_MAX, Player
 from server.replication.client_stream import ClientStream, Transport
+from server.replication.flow_control import FlowControl
 from shared.messages import Hello
 
 if TYPE_CHECKING:
+    from server.game.fast_path import FastPath
     from server.worlds.seats import Seat
 
 
 class Session:
     """One connection, from the handshake to its end.
+
+    While a session is on the fast path (`server.game.fast_path`), a part of its state is in a row there. Reading
+    `stream` or `inputs` takes it off the fast path first; reading `received_at` and `allowance` does not.
 
     Args:
         link: the connection.
@@ -22,12 +27,18 @@ class Session:
 
     def __init__(self, link: Transport, now: float) -> None:
         self.link = link
-        self.stream = ClientStream(link, now)
+        self.row = -1
+        """Number of its row on the fast path; -1: it is not on it."""
+        self.fast_path: FastPath | None = None
+        """The fast path that it is or was on."""
+        self.plain, self.patience, self.enrolled = 0, 0, -1
+        """Ticks in a row that needed nothing special; how many of them lead to the fast path (0: not known yet); the
+        tick in which it came to the fast path."""
+        self._stream = ClientStream(link, now)
         self.player: Player | None = None
         self.entity = 0
         """Number of the player's entity; 0 before the client has joined."""
-        self.inputs = InputQueue()
-        """Input queue of the player."""
+        self._inputs = InputQueue()
         self.loading = False
         """Whether `Rules.load_player` runs for the client."""
         self.loaded: Any = None
@@ -51,25 +62,60 @@ class Session:
         self.corrections = -1
         """Number of corrections that the client has reported; -1: none yet."""
 
+    @property
+    def stream(self) -> ClientStream:
+        """State of sending."""
+        self.recall()
+        return self._stream
+
+    @property
+    def flow(self) -> FlowControl:
+        """Flow control. On the fast path, it lacks what is in the row."""
+        return self._stream.flow
+
+    @property
+    def inputs(self) -> InputQueue:
+        """Input queue of the player."""
+        self.recall()
+        return self._inputs
+
+    @property
+    def acknowledged(self) -> bool:
+        """Whether the client has acknowledged a snapshot."""
+        return self.row >= 0 or self._stream.acked >= 0
+
+    def recall(self) -> None:
+        """Takes the session off the fast path, if it is on it."""
+        if self.row >= 0:
+            assert self.fast_path is not None
+            self.fast_path.recall(self)
+
     def seat(self, player: Player) -> None:
         """Makes this the connection of a player."""
-        self.player, self.entity, self.inputs = player, player.entity, player.inputs
+        self.player, self.entity, self._inputs = player, player.entity, player.inputs
         player.session, player.reconnect_until = self, math.inf
         del player.verdicts[:-SETTLED_MAX]  # bounds them for a client that reconnects again and again without reading
         self.hello = None
 
     def vacate(self) -> None:
         """Undoes `seat`."""
+        self.recall()
         if self.player is not None:
             self.player.session = None
-        self.player, self.entity, self.inputs = None, 0, InputQueue()
+        self.player, self.entity, self._inputs = None, 0, InputQueue()
 
     def send(self, message: bytes) -> None:
-        """Hands a message to the link."""
-        self.stream.send(message)
+        """Hands a message to the link. A session on the fast path stays there."""
+        if self.row >= 0:
+            assert self.fast_path is not None
+            self.fast_path.sent(self.row, len(message))
+            self.link.send(message)
+        else:
+            self._stream.send(message)
 
     def close(self, code: int, reason: str) -> None:
         """Closes the connection. Later messages in both directions are ignored."""
         if not self.closed:
+            self.recall()
             self.closed = True
             self.link.close(code, reason)

@@ -123,7 +123,7 @@ class InputApi:
         """Returns the input of an existing entity for the tick that is about to be computed."""
         player = self._players.get(entity)
         if player is not None:
-            return player.inputs.coming(self._world.tick + 1)
+            return player.coming(self._world.tick + 1)
         if entity in self.steered:
             return self.steered[entity]
         return held_input(self._world, entity)

@@ -21,7 +21,8 @@ class SharedValues:
 
     def __init__(self, world: RecordedWorld, table: dict[str, Any]) -> None:
         self._world, self._table = world, table
-        self._version = int(bool(table))
+        self.version = int(bool(table))
+        """Version of the values; it grows with each change."""
         self._message = encode(Shared(table))
 
     def copy(self) -> Mapping[str, Any]:
@@ -45,11 +46,11 @@ class SharedValues:
 
     def renew(self) -> None:
         """Takes note of a change of the table: all clients are sent the values again."""
-        self._version += 1
+        self.version += 1
         self._message = encode(Shared(self._table))
 
     def show(self, stream: ClientStream) -> None:
         """Queues the values for a client if they have changed since it got them."""
-        if stream.shared != self._version:
-            stream.shared = self._version
+        if stream.shared != self.version:
+            stream.shared = self.version
             stream.shared_due = self._message

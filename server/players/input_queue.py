@@ -23,7 +23,7 @@ assert sys.byteorder == "little", "margins lie in memory as they go over the wir
 
 
 @lru_cache(4096)
-def _input(row: bytes) -> Input:
+def decoded(row: bytes) -> Input:
     """Decodes and clamps an input. The cache helps because a key is held for many ticks, so most rows repeat."""
     return clamp(unpacked(row))
 
@@ -39,10 +39,14 @@ class InputQueue:
     def __init__(self, bounds: Bounds = DEFAULT, row_bytes: int = INPUT_ROW_BYTES) -> None:
         self._bounds, self._row_bytes = bounds, row_bytes
         self._margin_one = bounds.margin_one
-        self._waiting: dict[int, Input] = {}  # inputs for later ticks, by tick, at most `bounds.ahead` ticks ahead
-        self._held = NEUTRAL  # the input that is repeated: the newest one used or late
-        self._missing = 0  # ticks since an input was used or arrived late
-        self._accepted = -1  # the newest tick of which an input was accepted
+        self.waiting: dict[int, Input] = {}
+        """Inputs for later ticks, by tick, at most `bounds.ahead` ticks ahead."""
+        self.held = NEUTRAL
+        """The input that is repeated: the newest one used or late."""
+        self.missing = 0
+        """Number of ticks since an input was used or arrived late."""
+        self.accepted = -1
+        """Newest tick of which an input was accepted."""
         self.first = self.newest = -1
         self.margins = array("h")
         """Arrival margins that are not sent yet, in the units of the wire; the last one is that of `newest`. At most
@@ -64,7 +68,7 @@ class InputQueue:
         at, _, rows = message
         row_bytes = self._row_bytes
         for start in range(0, len(rows), row_bytes):
-            if at <= self._accepted:  # a duplicate, or an order that TCP cannot produce
+            if at <= self.accepted:  # a duplicate, or an order that TCP cannot produce
                 self.refused += 1
             else:
                 if at <= self.newest:  # it was refused before because it came too early
@@ -81,9 +85,9 @@ class InputQueue:
         """Removes the unused inputs for tick `at` and later, because the client is going to send them again."""
         if self.first < 0 or at > self.newest:
             return
-        for tick in [tick for tick in self._waiting if tick >= at]:
-            del self._waiting[tick]
-        self._accepted = min(self._accepted, at - 1)
+        for tick in [tick for tick in self.waiting if tick >= at]:
+            del self.waiting[tick]
+        self.accepted = min(self.accepted, at - 1)
         self._forget(at)
 
     def _forget(self, at: int) -> None:
@@ -96,13 +100,13 @@ class InputQueue:
         if at > tick + self._bounds.ahead:
             self.refused += 1
             return MARGIN_REFUSED
-        self._accepted = at
+        self.accepted = at
         margin = math.floor((at - tick - 1 + ahead) * self._margin_one)
         if at > tick:
-            self._waiting[at] = _input(row)
+            self.waiting[at] = decoded(row)
         else:
             self.late += 1
-            self._held, self._missing = _input(row), 0
+            self.held, self.missing = decoded(row), 0
             margin = min(margin, -1)
         return margin if abs(margin) < -MARGIN_REFUSED else max(MARGIN_REFUSED + 1, min(margin, -MARGIN_REFUSED - 1))
 
@@ -120,31 +124,31 @@ class InputQueue:
         """Returns the input that `take` would take for a tick now. Changes nothing."""
         if self.override is not None:
             return self.override
-        input_ = self._waiting.get(tick)
+        input_ = self.waiting.get(tick)
         if input_ is not None:
             return input_
         idle = self.first < 0 or tick < self.first
-        return self._held if idle or self._bounds.stands_in(self._missing + 1) else NEUTRAL
+        return self.held if idle or self._bounds.stands_in(self.missing + 1) else NEUTRAL
 
     def take(self, tick: int) -> Input:
         """Takes the input for the tick that is about to be computed, or a substitute, and notes the input status."""
         if self.override is not None:
             self.used += 1
             return self.override
-        input_ = self._waiting.pop(tick, None)
+        input_ = self.waiting.pop(tick, None)
         if input_ is not None:
-            status, self._missing, self._held = USED, 0, input_
+            status, self.missing, self.held = USED, 0, input_
             self.used += 1
         elif self.first < 0 or tick < self.first:
             status = IDLE
         else:
-            self._missing += 1
+            self.missing += 1
             self.substituted += 1
-            status = REPEATED if self._bounds.stands_in(self._missing) else NEUTRALISED
+            status = REPEATED if self._bounds.stands_in(self.missing) else NEUTRALISED
         self.statuses.append(status)
         if len(self.statuses) > self._bounds.statuses:
             del self.statuses[0]
-        return NEUTRAL if status == NEUTRALISED else self._held
+        return NEUTRAL if status == NEUTRALISED else self.held
 
     def take_feedback(self) -> tuple[bytes, bytes]:
         """Takes the margins and statuses for the next snapshot, as on the wire. They count as sent."""

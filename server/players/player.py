@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 from server.players.input_queue import InputQueue
 from server.players.outbox import Outbox
+from shared.inputs import Input
 from shared.messages import Command
 
 if TYPE_CHECKING:
@@ -29,6 +30,8 @@ class Player:
 
     def __init__(self, entity: int, name: str = "", subject: str = "", inputs: InputQueue | None = None) -> None:
         self.entity = entity
+        self.row = -1
+        """Number of the row of the player's session on the fast path (`server.game.fast_path`); -1: none."""
         self.name = name
         self.subject = subject
         self.announced = True
@@ -37,13 +40,12 @@ class Player:
         """Result of `Rules.load_player`; not saved."""
         self.handed: Any = None
         """Data that the rules of another world handed over with the player (`GameApi.send_away`); not saved."""
-        self.inputs = inputs or InputQueue()
+        self._inputs = inputs or InputQueue()
         self.commands: deque[Command] = deque()
         """Commands that wait for their tick."""
         self.command = -1
         """Highest number of a command so far."""
-        self.verdicts: list[tuple[int, int]] = []
-        """Numbers and verdicts of commands, to be sent."""
+        self._verdicts: list[tuple[int, int]] = []
         self.settled: dict[int, int] = {}
         """Latest verdicts by the number of the command. A client that lost its connection before it received a verdict
         sends the command again and gets the same verdict."""
@@ -57,11 +59,49 @@ class Player:
         """Time in seconds at which a player without a connection leaves."""
         self.session: Session | None = None
         """Present connection; None: the connection is lost."""
-        self.outbox = Outbox()
-        """Game events that wait to be sent."""
+        self._outbox = Outbox()
 
     def __repr__(self) -> str:
         return f"<Player {self.name!r}, entity {self.entity}>"
+
+    @property
+    def inputs(self) -> InputQueue:
+        """Input queue of the player."""
+        self.recall()
+        return self._inputs
+
+    @inputs.setter
+    def inputs(self, inputs: InputQueue) -> None:
+        self.recall()
+        self._inputs = inputs
+
+    @property
+    def counts(self) -> InputQueue:
+        """The input queue, for its counts alone. On the fast path they lack the latest (`FastPath.count`)."""
+        return self._inputs
+
+    @property
+    def verdicts(self) -> list[tuple[int, int]]:
+        """Numbers and verdicts of commands, to be sent."""
+        self.recall()
+        return self._verdicts
+
+    @property
+    def outbox(self) -> Outbox:
+        """Game events that wait to be sent."""
+        self.recall()
+        return self._outbox
+
+    def coming(self, tick: int) -> Input:
+        """Returns the input that would be taken for a tick now. Changes nothing."""
+        if self.row >= 0 and self.session is not None and self.session.fast_path is not None:
+            return self.session.fast_path.coming(self.row, tick)
+        return self._inputs.coming(tick)
+
+    def recall(self) -> None:
+        """Takes the player's session off the fast path, where its client would get no verdicts and events."""
+        if self.row >= 0 and self.session is not None:
+            self.session.recall()
 
     def drop_older_tokens(self) -> None:
         """Invalidates all resume tokens but the newest one, which the client has now."""

@@ -125,6 +125,8 @@ class ChangeLog:
         self._home: dict[int, Cell] = {
             entity: (x, y, z) for entity, (x, y, z) in zip(states[:, ID].tolist(), homes, strict=True)
         }
+        self.moved: list[int] = []
+        """Entities that have come into a segment in the latest recorded tick."""
         self._parts: dict[int, DeltaCache] = {}
         self._packed: dict[Cell, tuple[int, bytes]] = {}
         self._packs_left = PACKS_PER_TICK
@@ -176,6 +178,7 @@ class ChangeLog:
             now.edited[segment_of(x, y, z)].add(offset_of(x, y, z))
         deltas, self._due = self._encoder.pack(now.acted, now.placed)
         self._latest = {}
+        self.moved.clear()
         for segment, ids, whole, packed in deltas:
             now.changed[segment] = ids
             self._latest[segment] = packed
@@ -185,6 +188,7 @@ class ChangeLog:
                     if home is not None:
                         now.gone[home].append(entity)
                     homes[entity] = segment
+                    self.moved.append(entity)
                     if entity in self._attributes or (home is None and entity in self._named):
                         now.attributes[segment].add(entity)
         for entity in self._attributes_changed & homes.keys():

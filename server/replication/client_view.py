@@ -26,7 +26,8 @@ class ClientView:
         self._knows: set[Cell] = set()  # segments of which a keyframe was sent
         self._fresh: dict[Cell, int] = {}  # segments that wait for their keyframe, with the tick of their entry
         self._behind: dict[Cell, int] = {}  # segments left out of the latest snapshot, with the tick sent last
-        self._tick = -1  # tick of the latest snapshot
+        self.tick = -1
+        """Tick of the latest snapshot."""
 
     def move(self, near: tuple[Cell, ...], keep: int, tick: int = -1) -> tuple[list[Cell], list[Cell]]:
         """Updates the view after the entity has come into another segment.
@@ -57,15 +58,15 @@ class ClientView:
         """Makes all segments be sent as keyframes again."""
         self._fresh = dict.fromkeys(self.sees, -1)
         self._behind.clear()
-        self._tick = -1
+        self.tick = -1
 
     def lost_track(self, tick: int, history: int) -> bool:
         """Returns whether a segment has waited for more than `history` ticks, for which its changes are kept."""
-        return self._tick >= 0 and self.waits(tick) > history
+        return self.tick >= 0 and self.waits(tick) > history
 
     def lose(self, tick: int, history: int) -> list[Cell]:
         """Makes segments that have waited for more than `history` ticks be sent as keyframes. Returns them."""
-        if tick - self._tick > history:
+        if tick - self.tick > history:
             self.forget()
             return list(self.sees)
         lost = {segment: since for segment, since in self._behind.items() if tick - since > history}
@@ -79,6 +80,11 @@ class ClientView:
         return segment not in self._fresh
 
     @property
+    def plain(self) -> tuple[Cell, ...] | None:
+        """Segments of the view in the order in which their deltas are sent; None: the next snapshot needs `take`."""
+        return None if self._behind or self._fresh or self.drops else self.near + self._rest
+
+    @property
     def complete(self) -> bool:
         """Whether the latest snapshot left out nothing."""
         return not (self._behind or self._fresh)
@@ -86,11 +92,11 @@ class ClientView:
     @property
     def complete_tick(self) -> int:
         """Newest tick of which the client has been sent everything that was in its view at the end of that tick."""
-        return min((self._tick, *self._behind.values(), *(since - 1 for since in self._fresh.values())))
+        return min((self.tick, *self._behind.values(), *(since - 1 for since in self._fresh.values())))
 
     def waits(self, tick: int) -> int:
         """Returns the number of ticks since the segment that has waited longest was sent."""
-        return tick - (min(self._behind.values()) if self._behind else self._tick)
+        return tick - (min(self._behind.values()) if self._behind else self.tick)
 
     def take(self, log: ChangeLog, tick: int, room: int) -> tuple[int, bytes]:
         """Chooses the segments of the next snapshot. They, and `drops`, count as sent afterwards.
@@ -103,7 +109,7 @@ class ClientView:
         Returns:
             The number of segment deltas, and their bytes.
         """
-        deltas = log.since(self._tick)
+        deltas = log.since(self.tick)
         if not (self._behind or self._fresh or self.drops):  # the usual case
             n, plain = deltas.together(self.near)
             for segment in self._rest:
@@ -111,10 +117,10 @@ class ClientView:
                     n += 1
                     plain += part
             if len(plain) <= room:
-                self._tick = tick
+                self.tick = tick
                 return n, plain
         special = self._behind | dict.fromkeys(self._fresh, KEYFRAME)
-        due = special | {segment: self._tick for segment in self.sees - special.keys() if deltas[segment]}
+        due = special | {segment: self.tick for segment in self.sees - special.keys() if deltas[segment]}
         parts = {segment: part for segment, since in due.items() if (part := log.since(since)[segment])}
         if sum(map(len, parts.values())) > room:
             parts = self._urgent(parts, due, tick, log.history, room)
@@ -127,7 +133,7 @@ class ClientView:
             if len(parts) < len(due)
             else {}
         )
-        self._tick = tick
+        self.tick = tick
         return len(parts), b"".join(parts.values())
 
     def _urgent(

@@ -68,21 +68,26 @@ class FlowControl:
         self.sent_bytes = 0
         """Total of bytes handed to the transport."""
         self._ask = ask
-        self._taken = 0  # lower bound of the bytes that are no longer on the way
+        self.taken = 0
+        """Lower bound of the bytes that are no longer on the way."""
         # If the link cannot tell: the snapshots that are not acknowledged, with the total of bytes after each. They
         # count from the first acknowledgement on, because a client that waits for terrain sends none.
         self._blind = False
         self._unheard: deque[tuple[int, int]] = deque()
         self._heard = -1
-        self._measure_at = -math.inf
+        self.measure_at = -math.inf
+        """Time in seconds of the next measurement."""
         self._acked: list[tuple[float, int]] = []  # time, bytes acknowledged by then
         # Pairs of time and value. A pair is dropped once a later one is better, so the best is in front.
         self._rates: list[tuple[float, float]] = []
         self._rtts: list[tuple[float, float]] = []
         self._full_at = -math.inf
-        self._pauses = self._narrow = False
-        self._held = 0.0
-        self._carries = LEAST_BYTES
+        self.pauses = self.narrow = False
+        """Whether sending pauses to measure the round trip; whether the connection is narrow."""
+        self.held_share = 0.0
+        """Share of ticks in which nothing could be sent, averaged over `HELD_S`."""
+        self.carries = LEAST_BYTES
+        """Bytes that may be on the way, apart from two snapshots."""
         self._portion = 0
 
     @property
@@ -98,14 +103,14 @@ class FlowControl:
     @property
     def outstanding(self) -> int:
         """Upper bound of the bytes that are on the way."""
-        return self.sent_bytes - self._taken
+        return self.sent_bytes - self.taken
 
     def look(self) -> None:
         """Asks the link for the bytes on the way, which makes `outstanding` exact."""
         told = self._ask()
         self._blind = self._blind or told is None
         unheard = self._unheard[-1][1] - self._heard if self._unheard else 0
-        self._taken = self.sent_bytes - max(told or 0, unheard)
+        self.taken = self.sent_bytes - max(told or 0, unheard)
 
     def sent(self, tick: int) -> None:
         """Notes that the snapshot of a tick was handed to the transport."""
@@ -136,7 +141,7 @@ class FlowControl:
         while self._rtts and self._rtts[-1][1] >= rtt_s:
             self._rtts.pop()
         self._rtts.append((now, rtt_s))
-        self._pauses = False
+        self.pauses = False
 
     def window(self, snapshot_bytes: int, tick_s: float, now: float) -> int:
         """Returns how many bytes may be on the way now. Call it once per tick.
@@ -146,31 +151,42 @@ class FlowControl:
             tick_s: duration of a tick in seconds.
             now: the current time in seconds.
         """
-        measure = now >= self._measure_at
+        measure = now >= self.measure_at
         if measure:
-            self._measure_at = now + SAMPLE_S
-            self.look()
-            self._measure(tick_s, now)
-        window = self._carries
-        if not self._narrow and 2 * snapshot_bytes > window:
+            self.measure(tick_s, now)
+        window = self.carries
+        if not self.narrow and 2 * snapshot_bytes > window:
             window = 2 * snapshot_bytes
-        if not measure and self.sent_bytes - self._taken + snapshot_bytes > window:
+        if not measure and self.sent_bytes - self.taken + snapshot_bytes > window:
             self.look()
-        if self._pauses:
+        if self.pauses:
             return 0
-        held = self.sent_bytes - self._taken > window
+        held = self.sent_bytes - self.taken > window
         if held:
             self._full_at = now
-        if held or self._held:
-            self._held += (held - self._held) * min(tick_s / HELD_S, 1.0)
+        if held or self.held_share:
+            self.held_share += (held - self.held_share) * min(tick_s / HELD_S, 1.0)
         return window
 
     def room(self, window: int) -> int:
         """Returns how many bytes, about, a snapshot may have that is sent now, for the result of `window`."""
-        return self._portion if self._narrow else max(window - self.outstanding, LEAST_BYTES)
+        return self._portion if self.narrow else max(window - self.outstanding, LEAST_BYTES)
 
-    def _measure(self, tick_s: float, now: float) -> None:
-        acked = self._taken
+    @property
+    def steady(self) -> bool:
+        """Whether all that limits the next snapshot is `carries`, and the link tells the bytes on the way."""
+        return not (self.narrow or self.pauses or self._blind or self._heard < 0)
+
+    def measure(self, tick_s: float, now: float) -> None:
+        """Measures the rate of the connection, and from it how many bytes may be on the way.
+
+        Args:
+            tick_s: duration of a tick in seconds.
+            now: the current time in seconds.
+        """
+        self.measure_at = now + SAMPLE_S
+        self.look()
+        acked = self.taken
         self._acked.append((now, acked))
         while len(self._acked) > 1 and self._acked[1][0] <= now - RATE_SPAN_S:
             self._acked.pop(0)
@@ -183,11 +199,11 @@ class FlowControl:
         while self._rates and self._rates[0][0] < now - RATE_WINDOW_S:
             self._rates.pop(0)
         rtt_s = self.least_rtt_s
-        self._narrow = self._held > (WIDE if self._narrow else NARROW)
-        if self._narrow:
-            self._carries = max(NARROW_BYTES, int(self.rate * (rtt_s + 2 * tick_s)))
+        self.narrow = self.held_share > (WIDE if self.narrow else NARROW)
+        if self.narrow:
+            self.carries = max(NARROW_BYTES, int(self.rate * (rtt_s + 2 * tick_s)))
             self._portion = max(NARROW_BYTES, int(self.rate * NARROW_S))
         else:
             hold_s = min(STALL_RTTS * rtt_s, max(HOLD_S_MAX, 1.5 * rtt_s)) + tick_s
-            self._carries = max(LEAST_BYTES, int(self.rate * hold_s))
-        self._pauses = bool(self._rtts) and now - self._rtts[-1][0] > RTT_WINDOW_S > now - self._full_at
+            self.carries = max(LEAST_BYTES, int(self.rate * hold_s))
+        self.pauses = bool(self._rtts) and now - self._rtts[-1][0] > RTT_WINDOW_S > now - self._full_at

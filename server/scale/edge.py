@@ -55,7 +55,7 @@ class EdgeInputs(InputQueue):
 
     def __init__(self, bounds: Bounds, row_bytes: int, held: Input, *, resumed: bool) -> None:
         super().__init__(bounds, row_bytes)
-        self._held, self._idle = held, REPEATED if resumed else IDLE
+        self.held, self._idle = held, REPEATED if resumed else IDLE
         if resumed:
             self.statuses.append(REPEATED)  # for the tick of the seat
         self._taken: dict[int, int] = {}

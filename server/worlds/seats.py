@@ -90,7 +90,7 @@ class Seats:
         if seat is None or seat.settled:
             return EXPIRED
         if seat.session is not None and not seat.session.closed:
-            return EXPIRED if seat.session.stream.acked >= 0 else IN_USE
+            return EXPIRED if seat.session.acknowledged else IN_USE
         return seat
 
     def expire(self, now: float) -> None:

@@ -38,12 +38,13 @@ class Tape:
         self._kernel, self._file = kernel, file
         self._known: dict[tuple[int, int], tuple[int, np.ndarray[Any, Any]]] = {}
         self._held = 0
-        self.calls: dict[str, int] = dict.fromkeys(exports.functions(), 0)
+        self.calls: dict[str, int] = dict.fromkeys(exports.functions(server=False), 0)
 
     def kernel(self) -> Kernel:
         """Returns the kernel with recording."""
         functions = {
-            name: self._recorded(i, name, kinds) for i, (name, kinds) in enumerate(exports.functions().items())
+            name: self._recorded(i, name, kinds)
+            for i, (name, kinds) in enumerate(exports.functions(server=False).items())
         }
         return Kernel(**(vars(self._kernel) | {"bound": lambda arrays: arrays} | functions))
 

@@ -61,7 +61,9 @@ def test_the_prebuilt_one_is_the_first_choice_and_needs_no_numba() -> None:
     assert kernels.describe(AUTO) == f"prebuilt, {kernels.TARGETS[sys.platform, platform.machine().lower()]}"
 
 
-STALE = "the prebuilt kernel was not made from the present shared/kernel.py and shared/bulk.py; run scripts/kernels"
+STALE = (
+    "the prebuilt kernel was not made from the present shared/kernel.py, bulk.py and traffic.py; run scripts/kernels"
+)
 REFUSED = "from shared import kernels; print([kernels.chosen(), kernels.trouble(), kernels.describe()])"
 
 

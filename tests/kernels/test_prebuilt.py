@@ -22,7 +22,7 @@ PYTHON = {
 }  # fmt: skip
 """Functions of Python that the libraries import; all are in the stable ABI of CPython 3.11."""
 INIT = {"PyInit_sovereign_kernel"}
-FUNCTIONS = {f"function:{name}" for name in (*exports.functions(), "built_from")}
+FUNCTIONS = {f"function:{name}" for name in (*exports.functions(server=False), "built_from")}
 AGAIN = ("linux-x86_64.so", "kernel.wasm")
 """Targets that a test builds again; each takes some 6 s."""
 RUN_SCRIPTS_KERNELS = "run scripts/kernels"

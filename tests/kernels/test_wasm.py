@@ -56,7 +56,7 @@ def replayed(path: Path) -> str:
     """Returns the output of a tape's replay with the kernel in WebAssembly."""
     assert NODE is not None
     wasm = kernels.LIBRARIES / "kernel.wasm"
-    signatures = (f"{name}:{kinds}" for name, kinds in exports.functions().items())
+    signatures = (f"{name}:{kinds}" for name, kinds in exports.functions(server=False).items())
     command = (
         NODE,
         str(Path(__file__).with_name("replay.mjs")),

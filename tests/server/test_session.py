@@ -256,15 +256,15 @@ def test_every_input_of_any_client_has_one_status_and_memory_is_bounded(
         if snapshot:
             queue.take_feedback()
             told = tick
-    assert set(queue._waiting) <= set(range(len(ticks) + 1, len(ticks) + AHEAD_MAX + 1))
-    assert sent == queue.used + queue.late + queue.refused + len(queue._waiting)
+    assert set(queue.waiting) <= set(range(len(ticks) + 1, len(ticks) + AHEAD_MAX + 1))
+    assert sent == queue.used + queue.late + queue.refused + len(queue.waiting)
 
 
 def test_a_flood_into_the_future_holds_no_more_than_the_window() -> None:
     queue = InputQueue()
     for first in range(0, 1 << 20, 1 << 10):
         queue.file(inputs(first, *[EAST] * INPUT_ROWS_MAX), 0, 1.0)
-    assert len(queue._waiting) <= AHEAD_MAX
+    assert len(queue.waiting) <= AHEAD_MAX
     assert len(queue.margins) == STATUSES_MAX
     assert queue.refused == 64 * 1024 - (INPUT_ROWS_MAX - 1) - 1
 

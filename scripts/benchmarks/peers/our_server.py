@@ -49,13 +49,13 @@ class Logged(InputQueue):
         self.used_in: set[int] = set()
 
     def file(self, message: Inputs, tick: int, ahead: float) -> None:
-        now, before = time.monotonic(), self._accepted
+        now, before = time.monotonic(), self.accepted
         super().file(message, tick, ahead)
-        for at in range(before + 1 if before >= 0 else message.first, self._accepted + 1):
+        for at in range(before + 1 if before >= 0 else message.first, self.accepted + 1):
             self.arrived[at] = now
 
     def take(self, tick: int) -> Any:
-        if tick in self._waiting:
+        if tick in self.waiting:
             self.used_in.add(tick)
         return super().take(tick)
 

@@ -1,0 +1,253 @@
+"""The rows of the fast path: the state of sessions in arrays that compiled code reads and writes (`shared.traffic`)."""
+
+from array import array
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from server.game.session import Session
+from server.players.input_queue import InputQueue, decoded
+from shared.bounds import bounds
+from shared.inputs import ROW, Input, row
+from shared.kernels import Kernel
+from shared.scene import Scene
+from shared.traffic import (
+    ACCEPTED,
+    ACKED,
+    ALLOWANCE,
+    CARRIES,
+    FLOATS,
+    FREE,
+    HELD,
+    HELD_AIM,
+    HELD_SHARE,
+    KEPT,
+    LATE,
+    MARGINS,
+    MEASURE_AT,
+    MISSING,
+    N_MARGINS,
+    N_SEGMENTS,
+    N_STATUSES,
+    NEWEST,
+    PLAIN,
+    PROBE_AT,
+    PROBE_BYTES,
+    PROBE_TICK,
+    RECEIVED_AT,
+    SEGMENTS,
+    SENT_AT,
+    SENT_BYTES,
+    SLOT,
+    SNAPSHOT_BYTES,
+    STATE,
+    STATUSES,
+    SUBSTITUTED,
+    TAKEN_BYTES,
+    TICK,
+    USED,
+    WIDTH,
+)
+
+ROWS_MIN = 4
+"""Number of rows at first. It doubles when all are in use."""
+INPUTS_KEPT = 4096
+"""Maximum number of decoded inputs that are kept."""
+
+
+class Rows:
+    """The rows of one game.
+
+    Args:
+        scene: the scene.
+        kernel: the kernel that gets the arrays.
+    """
+
+    def __init__(self, scene: Scene, kernel: Kernel) -> None:
+        self._kernel, self._aim = kernel, scene.aim
+        self.slots = bounds(scene.tick_rate).ahead + 1
+        """Number of slots of a row's ring. An input waits at most `Bounds.ahead` ticks, so no two share a slot."""
+        self.sessions: list[Session | None] = []
+        """Session of each row; None: the row is free."""
+        self._inputs: dict[tuple[int, int], Input] = {}
+        self._grow(ROWS_MIN)
+
+    def _grow(self, n: int) -> None:
+        """Makes room for `n` rows. Their contents stay."""
+        old = len(self.sessions)
+        self.sessions += [None] * (n - old)
+        for name, width, kind in (
+            ("numbers", WIDTH, np.int64),
+            ("floats", FLOATS, np.float64),
+            ("ring", self.slots * SLOT, np.int64),
+            ("views", SEGMENTS, np.int64),
+            ("taken", 2, np.int64),
+            ("spans", 2, np.int64),
+        ):
+            grown: npt.NDArray[Any] = np.zeros(n * width, kind)
+            if old:
+                grown[: old * width] = getattr(self, f"{name}_array")
+            setattr(self, f"{name}_array", grown)
+            setattr(self, f"{name}_lent", self._kernel.lent(grown))
+            setattr(self, name, memoryview(grown.data).cast("B").cast("d" if kind is np.float64 else "q"))
+
+    numbers_array: npt.NDArray[np.int64]
+    floats_array: npt.NDArray[np.float64]
+    taken_array: npt.NDArray[np.int64]
+    spans_array: npt.NDArray[np.int64]
+    """Arrays of all rows; each has a view for Python (`numbers`), and one for the kernel (`numbers_lent`)."""
+    numbers: Any
+    floats: Any
+    ring: Any
+    views: Any
+    numbers_lent: Any
+    floats_lent: Any
+    ring_lent: Any
+    views_lent: Any
+    taken_lent: Any
+    spans_lent: Any
+
+    def write(self, session: Session, segments: list[int]) -> None:
+        """Moves the state of a session to a free row.
+
+        Args:
+            session: the session.
+            segments: numbers of the segments of its client view.
+        """
+        if None not in self.sessions:
+            self._grow(2 * len(self.sessions))
+        at = self.sessions.index(None)
+        self.sessions[at] = session
+        queue, stream = session.inputs, session.stream
+        flow, probe = stream.flow, stream.probe
+        values = [0] * WIDTH
+        values[STATE] = PLAIN
+        values[NEWEST], values[ACCEPTED], values[MISSING] = queue.newest, queue.accepted, queue.missing
+        values[HELD], values[HELD_AIM] = self._words(row(queue.held, aim=self._aim))
+        values[N_MARGINS], values[N_STATUSES] = len(queue.margins), len(queue.statuses)
+        values[MARGINS : MARGINS + len(queue.margins)] = queue.margins.tolist()
+        values[STATUSES : STATUSES + len(queue.statuses)] = queue.statuses
+        values[TICK], values[ACKED], values[SNAPSHOT_BYTES] = stream.tick, stream.acked, stream.snapshot_bytes
+        values[SENT_BYTES], values[TAKEN_BYTES], values[CARRIES] = flow.sent_bytes, flow.taken, flow.carries
+        values[PROBE_TICK], probe_at, values[PROBE_BYTES] = probe or (-1, 0.0, 0)
+        values[N_SEGMENTS] = len(segments)
+        self.numbers[at * WIDTH : (at + 1) * WIDTH] = array("q", values)
+        reals = [0.0] * FLOATS
+        reals[RECEIVED_AT], reals[ALLOWANCE], reals[SENT_AT] = session.received_at, session.allowance, stream.sent_at
+        reals[MEASURE_AT], reals[HELD_SHARE], reals[PROBE_AT] = flow.measure_at, flow.held_share, probe_at
+        self.floats[at * FLOATS : (at + 1) * FLOATS] = array("d", reals)
+        self.views[at * SEGMENTS : at * SEGMENTS + len(segments)] = array("q", segments)
+        start, end = at * self.slots * SLOT, (at + 1) * self.slots * SLOT
+        self.ring[start:end] = array("q", [-1]) * (end - start)
+        for tick, input_ in queue.waiting.items():
+            slot = start + tick % self.slots * SLOT
+            self.ring[slot : slot + SLOT] = array("q", (tick, *self._words(row(input_, aim=self._aim))))
+        assert session.player is not None
+        session.row = session.player.row = at
+
+    def restore(self, session: Session, tick: int) -> list[int]:
+        """Moves the state of a session back, and frees its row. Returns the numbers of its segments.
+
+        Args:
+            session: the session.
+            tick: the latest tick whose inputs were taken.
+        """
+        at, session.row = session.row, -1
+        assert session.player is not None
+        session.player.row = -1
+        self.sessions[at] = None
+        values = self.numbers[at * WIDTH : (at + 1) * WIDTH].tolist()
+        self.numbers[at * WIDTH + STATE] = FREE
+        reals = self.floats[at * FLOATS : (at + 1) * FLOATS].tolist()
+        queue, stream = session.inputs, session.stream
+        flow = stream.flow
+        self.add_counts(queue, values)
+        queue.newest, queue.accepted, queue.missing = values[NEWEST], values[ACCEPTED], values[MISSING]
+        queue.held = self.input_of(values[HELD], values[HELD_AIM])
+        queue.margins = array("h", values[MARGINS : MARGINS + values[N_MARGINS]])
+        queue.statuses = bytearray(values[STATUSES : STATUSES + values[N_STATUSES]])
+        queue.waiting = {}
+        for due in range(tick + 1, queue.accepted + 1):
+            slot = (at * self.slots + due % self.slots) * SLOT
+            if self.ring[slot] == due:
+                queue.waiting[due] = self.input_of(self.ring[slot + 1], self.ring[slot + 2])
+        stream.tick = stream.view.tick = values[TICK]
+        stream.acked, stream.snapshot_bytes = values[ACKED], values[SNAPSHOT_BYTES]
+        if values[PROBE_TICK] >= 0:
+            stream.probe = (values[PROBE_TICK], reals[PROBE_AT], values[PROBE_BYTES])
+        else:
+            stream.probe = None
+        flow.sent_bytes, flow.taken, flow.carries = values[SENT_BYTES], values[TAKEN_BYTES], values[CARRIES]
+        session.received_at, session.allowance, stream.sent_at = reals[RECEIVED_AT], reals[ALLOWANCE], reals[SENT_AT]
+        flow.measure_at, flow.held_share = reals[MEASURE_AT], reals[HELD_SHARE]
+        segments: list[int] = self.views[at * SEGMENTS : at * SEGMENTS + values[N_SEGMENTS]].tolist()
+        return segments
+
+    def count(self) -> None:
+        """Adds the counts of inputs since the rows were written, or since the latest call, to the input queues."""
+        for at, session in enumerate(self.sessions):
+            if session is not None and session.player is not None:
+                base = at * WIDTH
+                self.add_counts(session.player.counts, self.numbers[base : base + WIDTH].tolist())
+                for column in (LATE, USED, SUBSTITUTED):
+                    self.numbers[base + column] = 0
+
+    @staticmethod
+    def add_counts(queue: InputQueue, values: list[int]) -> None:
+        """Adds the counts of a row to an input queue."""
+        queue.late += values[LATE]
+        queue.used += values[USED]
+        queue.substituted += values[SUBSTITUTED]
+
+    def inputs(self) -> list[Input]:
+        """Returns the inputs that `traffic.take_inputs` has taken, by row."""
+        known, heads = self._inputs, self.taken_array.tolist()
+        pairs = zip(heads[::2], heads[1::2], strict=True)
+        return [known.get(pair) or self.input_of(*pair) for pair in pairs]
+
+    def coming(self, at: int, tick: int, repeats: int) -> Input:
+        """Returns the input of a row that would be taken for a tick now, like `InputQueue.coming`."""
+        slot, base = (at * self.slots + tick % self.slots) * SLOT, at * WIDTH
+        if self.ring[slot] == tick:
+            return self.input_of(self.ring[slot + 1], self.ring[slot + 2])
+        if self.numbers[base + MISSING] + 1 > repeats:
+            return self.input_of(0, 0)
+        return self.input_of(self.numbers[base + HELD], self.numbers[base + HELD_AIM])
+
+    def input_of(self, head: int, aim: int) -> Input:
+        """Returns the input with these first three bytes and these six bytes of its aim."""
+        input_ = self._inputs.get((head, aim))
+        if input_ is None:
+            if len(self._inputs) >= INPUTS_KEPT:
+                self._inputs.clear()
+            packed = head.to_bytes(ROW.size, "little") + (aim.to_bytes(6, "little") if self._aim else b"")
+            input_ = self._inputs[head, aim] = decoded(packed)
+        return input_
+
+    @staticmethod
+    def _words(packed: bytes) -> tuple[int, int]:
+        return int.from_bytes(packed[: ROW.size], "little"), int.from_bytes(packed[ROW.size :], "little")
+
+
+def fits(session: Session, tick: int) -> bool:
+    """Returns whether a row can hold the state of a session that was just sent the snapshot of a tick."""
+    queue, stream, player = session.inputs, session.stream, session.player
+    view, segments = stream.view, stream.view.plain
+    return (
+        player is not None
+        and type(queue) is InputQueue
+        and queue.override is None
+        and not session.closed
+        and session.greeting is None
+        and 0 <= queue.first <= tick
+        and len(queue.margins) <= KEPT // 2
+        and len(queue.statuses) <= 1
+        and stream.acked >= 0
+        and stream.tick == view.tick == tick
+        and stream.flow.steady
+        and segments is not None
+        and len(segments) <= SEGMENTS
+        and not (stream.terrain_now or stream.terrain_due or stream.shared_due or stream.private_due)
+        and not (player.verdicts or player.outbox.due)
+    )
