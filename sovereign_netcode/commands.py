@@ -23,6 +23,8 @@ def new_game() -> int:
 
 def play() -> int:
     """Runs `sovereign-play`, which is `python -m sovereign_netcode.play`. Returns the exit code."""
+    if "--browser" in sys.argv:
+        return _run("sovereign_netcode.play.in_browser")
     return _run("sovereign_netcode.play.app", "play")
 
 

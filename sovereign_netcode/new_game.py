@@ -27,7 +27,7 @@ from sovereign_netcode.shared.scene import Scene
 class Dash(Behaviour):
     """A dash. The server and every client run this code alike, so a player sees its dash in the next frame.
 
-    A client passes the class: `Client.connect(url, behaviours=[Dash])`.
+    A client passes the class: `Client.connect(url, behaviours=[Dash])`. A browser gets it from the server.
     """
 
     templates = ("player", "runner")
@@ -48,7 +48,7 @@ class {title}(Rules):
 
     scene = "meadow"
     behaviours = (Dash,)
-    keys = {{"dash": "left shift"}}  # noqa: RUF012 - keys in the window of `sovereign-play`
+    keys = {{"dash": "left shift"}}  # noqa: RUF012 - keys in the window of `sovereign-play` and in the browser
 
     def prepare(self, scene: Scene) -> Scene:
         # Friction makes the speed of a dash decay; without it a player would walk on in the next tick.
@@ -180,6 +180,7 @@ def main() -> int:
         print(f"  {sys.executable} -m pip install pytest")
     print(f"  {sys.executable} -m pytest test_{name}.py")
     print(f"  {command('play')} --game {name}:{title}")
+    print(f"  {command('play')} --game {name}:{title} --browser")
     print(f"  {command('play')} --game {name}:{title} --picture {name}.png")
     print(f"  {command('server')} --game {name}:{title}")
     return 0

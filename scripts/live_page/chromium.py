@@ -86,12 +86,12 @@ class Tab:
 
 
 @contextmanager
-def chromium(path: str) -> Iterator[Tab]:
-    """Runs a browser with an empty profile. Yields its only page, which is empty."""
+def chromium(path: str, *flags: str) -> Iterator[Tab]:
+    """Runs a browser with an empty profile and further flags. Yields its only page, which is empty."""
     root = ("--no-sandbox",) if hasattr(os, "geteuid") and os.geteuid() == 0 else ()
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as profile:
         browser = subprocess.Popen(
-            [path, *FLAGS, *root, f"--user-data-dir={profile}", "about:blank"],
+            [path, *FLAGS, *flags, *root, f"--user-data-dir={profile}", "about:blank"],
             stdin=subprocess.DEVNULL,
             stdout=subprocess.DEVNULL,
             stderr=subprocess.PIPE,

@@ -1,6 +1,5 @@
 """Opens a window to play a game in. By default the game is tag, on a server of its own, with bots."""
 
-import argparse
 import contextlib
 import importlib
 import os
@@ -19,10 +18,10 @@ from server.rules import Rules, RulesError, load_rules
 from server.runtime.reload import folder_of
 from shared.messages import WRONG_SCENE
 from sovereign_netcode.play import own_server
+from sovereign_netcode.play.options import GAME, arguments
 from sovereign_netcode.play.script import Script
 from sovereign_netcode.play.window import CLOSED, Window, keyboard
 
-GAME = "sovereign_netcode.examples.tag:Tag"
 FRAMES_PER_S = 60
 OTHER_CODE = 3
 """Exit code if the server plays a game with another scene or other behaviours."""
@@ -34,39 +33,6 @@ SCRIPT_S = 120.0
 """Longest time of a scripted session, in seconds. A session that takes longer has failed."""
 UNSEEN = ("dummy", "offscreen")
 """Drivers of SDL whose windows are invisible. SDL uses one of them where there is no display."""
-
-
-def arguments(argv: list[str] | None = None) -> argparse.Namespace:
-    parser = argparse.ArgumentParser(prog="sovereign-play", description=__doc__, allow_abbrev=False)
-    parser.add_argument("--url", metavar="ws://...", help="URL of the server to play on (default: starts one)")
-    parser.add_argument(
-        "--game",
-        default=GAME,
-        metavar="MODULE:CLASS",
-        help="game of the server that is started (default: tag); with --url, the game that is played there: its "
-        "behaviours, keys and bots are used",
-    )
-    parser.add_argument("--scene", help="scene of the server that is started (default: the game's)")
-    parser.add_argument(
-        "--bots", type=int, metavar="N", help="number of bots (default: 4 on a server that is started, else 0)"
-    )
-    parser.add_argument("--name", default="You", help="player's name (default: %(default)s)")
-    parser.add_argument(
-        "--lag", type=float, default=0, metavar="MS", help="latency to add at the start; the keys [ and ] change it"
-    )
-    parser.add_argument(
-        "--reload", action="store_true", help="restart the server and the game when a file beside the game changes"
-    )
-    parser.add_argument(
-        "--option", action="append", default=[], metavar="NAME=VALUE", help="option of the game on the server started"
-    )
-    parser.add_argument(
-        "--picture", metavar="OUT.png", help="play for some seconds, save a picture, and exit; needs no display"
-    )
-    parser.add_argument(
-        "--script-demo", metavar="OUT.png", help="run a scripted session, save a picture, and exit; needs no display"
-    )
-    return parser.parse_args(argv)
 
 
 def main(argv: list[str] | None = None) -> int:

@@ -4,12 +4,14 @@ It takes Python for browsers from the package registries, as `scripts/browser` d
 """
 
 import asyncio
+import contextlib
 import json
 import math
+import shutil
 import subprocess
 import sys
 import urllib.request
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +20,7 @@ import pytest
 from scripts.browser_build import runtime
 from scripts.browser_build.packages import FetchError, npm_package, wheels
 from scripts.live_page.chromium import Tab, chromium, installed
-from tests.client_sdk.servers import real_server
+from tests.client_sdk.servers import ROOT, real_server
 
 BROWSER = installed()
 JOIN_S = 240.0
@@ -175,3 +177,58 @@ async def test_a_new_game_plays_in_the_browser_as_it_is(new_game: Path) -> None:
             found = await asyncio.to_thread(played, url, play, 1000, 700)
     assert found["said"] == []
     assert found["stats"]["divergences"] == 0
+
+
+@pytest.fixture
+def examples(tmp_path: Path) -> Path:
+    """A folder with the examples for pages of one's own, and three.js."""
+    if shutil.which("node") is None:
+        pytest.skip("there is no Node.js on this machine")
+    folder = tmp_path / "web"
+    shutil.copytree(ROOT / "scripts" / "examples" / "web", folder, ignore=shutil.ignore_patterns("node_modules"))
+    try:
+        (folder / "node_modules").mkdir()
+        (folder / "node_modules" / "three").symlink_to(npm_package("three"))
+    except FetchError as error:
+        pytest.skip(str(error))
+    return folder
+
+
+@contextlib.contextmanager
+def proxied(folder: Path, url: str) -> Iterator[str]:
+    """Serves the examples beside a game server. Yields their address."""
+    command = ["node", "serve.mjs", url.replace("ws:", "http:"), "0"]
+    with subprocess.Popen(command, cwd=folder, stdout=subprocess.PIPE, text=True) as pages:
+        try:
+            assert pages.stdout is not None
+            yield pages.stdout.readline().split("/canvas.html")[0]
+        finally:
+            pages.terminate()
+
+
+def examined(address: str, *scripts: str) -> list[Any]:
+    """Returns the values of expressions in an example, once it has joined and drawn."""
+    assert BROWSER is not None
+    with chromium(BROWSER, "--enable-unsafe-swiftshader", "--use-angle=swiftshader") as tab:
+        tab.open(address, 800, 700)
+        tab.until("globalThis.client?.view().me", JOIN_S)
+        key(tab, "ArrowRight", down=True)
+        tab.until("client.view().me.velocity[0] > 0", 60)
+        values = [tab.until(script, 60) for script in scripts]
+        errors = [line for line in tab.said if "exceptionThrown" in line or '"level": "error"' in line]
+        return [*values, errors]
+
+
+@pytest.mark.parametrize(
+    ("page", "scripts"),
+    [
+        ("canvas.html", ["court.getContext('2d').getImageData(320, 320, 1, 1).data[0] === 255"]),
+        ("three.html", ["segments.size", "boxes.size > 1", "[...segments.values()].some(({count}) => count > 900)"]),
+    ],
+)
+async def test_the_examples_for_pages_of_ones_own(examples: Path, page: str, scripts: list[str]) -> None:
+    async with asyncio.timeout(600):
+        with real_server("--game", "sovereign_netcode.examples.tag:Tag") as url, proxied(examples, url) as address:
+            *values, errors = await asyncio.to_thread(examined, f"{address}/{page}", *scripts)
+    assert all(values)
+    assert errors == []

@@ -10,6 +10,7 @@ import pytest
 
 from server.play.behaviours import Modules, modules_of
 from shared.behaviours import Behaviour, entry_of
+from tests.readme import tutorial
 
 BEHAVIOURS = """
 from sovereign_netcode.shared.behaviours import Behaviour, field
@@ -165,6 +166,12 @@ def test_a_module_that_they_import_may_not_use_the_server_either(game: Path) -> 
 
 def test_installed_packages_are_not_sent(game: Path) -> None:
     assert sent(game, "moves_d", "import numpy, pytest", "numpy, pytest").files.keys() == {"moves_d.py"}
+
+
+def test_the_game_of_the_tutorial(game: Path) -> None:
+    tutorial.write(9, game)
+    found = modules_of(importlib.import_module("dodge").Dodge.behaviours)
+    assert (found.files.keys(), found.trouble) == ({"abilities.py"}, "")
 
 
 def test_a_class_without_a_file_is_refused() -> None:
