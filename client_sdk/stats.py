@@ -2,7 +2,6 @@
 
 from collections import deque
 from dataclasses import dataclass, field
-from statistics import median_low
 from typing import NamedTuple
 
 from client_sdk.events import Corrected
@@ -134,7 +133,7 @@ class Stats:
     def pinged(self, round_trip_s: float) -> None:
         """Adds a measured round trip, in seconds."""
         self._round_trips.append(round_trip_s)
-        self.rtt_s = median_low(self._round_trips)
+        self.rtt_s = sorted(self._round_trips)[(len(self._round_trips) - 1) // 2]
 
     def measure(self, now: float) -> None:
         """Measures the rates and keeps the counters, at most once per second. May be called more often."""

@@ -218,28 +218,29 @@ class Matrix(ndarray):
         return (Vector(row) for row in self._rows())
 
     def __getitem__(self, at: Index) -> Any:
+        if type(at) is tuple:
+            rows, columns = at
+            if type(rows) is int:
+                part = self._row(rows)[columns]
+                return part if type(columns) is int else Vector(part)
+            if type(rows) is not slice:
+                return self._gathered(rows, columns)
+            if type(columns) is int:
+                return Vector(self._column(rows, columns))
+            some: Matrix = self[rows]
+            if type(columns) is tuple:
+                picked = [row[k] for row in some._rows() for k in columns]
+                return shaped(self.dtype, picked, (len(some), len(columns)))
+            first, stop, _ = columns.indices(self.shape[1])
+            return Matrix(self._flat, some._start + first, self._stride, (len(some), max(stop - first, 0)))
         if type(at) is int:
             return Vector(self._row(at))
-        if type(at) is slice:
-            first, stop, step = at.indices(self.shape[0])
-            assert step == 1
-            start = self._start + first * self._stride
-            return Matrix(self._flat, start, self._stride, (max(stop - first, 0), self.shape[1]))
-        if type(at) is not tuple:
+        if type(at) is not slice:
             return self.take(at, 0)
-        rows, columns = at
-        if type(rows) is int:
-            return self._row(rows)[columns] if type(columns) is int else Vector(self._row(rows)[columns])
-        if type(rows) is not slice:
-            return self._gathered(rows, columns)
-        if type(columns) is int:
-            return Vector(self._column(rows, columns))
-        some: Matrix = self[rows]
-        if type(columns) is tuple:
-            picked = [row[k] for row in some._rows() for k in columns]
-            return shaped(self.dtype, picked, (len(some), len(columns)))
-        first, stop, _ = columns.indices(self.shape[1])
-        return Matrix(self._flat, some._start + first, self._stride, (len(some), max(stop - first, 0)))
+        first, stop, step = at.indices(self.shape[0])
+        assert step == 1
+        start = self._start + first * self._stride
+        return Matrix(self._flat, start, self._stride, (max(stop - first, 0), self.shape[1]))
 
     def __setitem__(self, at: Index, value: Any) -> None:
         if type(at) is tuple:

@@ -5,7 +5,6 @@ Every value is checked when a scene is made. A fingerprint shows whether client 
 
 import functools
 import hashlib
-import tomllib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
@@ -346,6 +345,8 @@ def load_scene(name_or_path: str | Path) -> Scene:
     """
     if not isinstance(name_or_path, str | Path):
         raise SceneError(f"scene = {shown(name_or_path)}: must be a name, or the path of a file")
+    import tomllib  # here, because a client gets its scene from a server
+
     built_in, path = SCENES / f"{name_or_path}.toml", Path(name_or_path)
     try:
         path = built_in if built_in.is_file() else path
