@@ -7,6 +7,7 @@ import asyncio
 import contextlib
 import json
 import random
+import time
 from collections.abc import AsyncIterator
 from typing import Any
 
@@ -93,12 +94,16 @@ async def bots(url: str) -> AsyncIterator[list[AsyncClient]]:
             await client.close()
 
 
-async def test_a_minute_beside_bots() -> None:
+@pytest.fixture(scope="module", autouse=True)
+def _python_for_browsers() -> None:
     try:
         if not runtime.ready():
             runtime.make(npm_package("pyodide"), wheels())
     except FetchError as error:
         pytest.skip(str(error))
+
+
+async def test_a_minute_beside_bots() -> None:
     with real_server("--scene", "arena") as url:
         async with asyncio.timeout(JOIN_S + 3 * MINUTE_S), bots(url) as beside:
             found = await asyncio.to_thread(minute, url)
@@ -111,3 +116,59 @@ async def test_a_minute_beside_bots() -> None:
     assert found["causes"].keys() <= {"late input", "other entity", "unknown edit", "server act", "missing terrain"}
     assert found["verdict"]["verdict"] != "diverging"
     assert found["views_per_s"] > 5
+
+
+JOINS = """(async () => {
+  const {connect} = await import("/play/sovereign.js");
+  globalThis.types = [];
+  globalThis.mine = await connect({name: "Page"});
+  mine.addEventListener("event", ({detail}) => types.push(detail.type));
+  globalThis.drawing = true;
+  function draw() {
+    mine.setInput(Math.cos(performance.now() / 900), Math.sin(performance.now() / 900));
+    if (drawing) mine.view();
+    requestAnimationFrame(draw);
+  }
+  draw();
+})().catch(error => { globalThis.failed = String(error); })"""
+AWAY_S = 17.0
+"""Time for which the page is away, in seconds: longer than a server waits for a silent client."""
+
+
+def away(url: str) -> dict[str, Any]:
+    """Returns what happens to a page that does not draw, and to one that is frozen."""
+    assert BROWSER is not None
+    with chromium(BROWSER) as tab:
+        tab.open(f"{url.replace('ws:', 'http:')}/play", 1000, 700)
+        tab.until("document.readyState === 'complete' && location.pathname === '/play'")
+        tab.call("Runtime.evaluate", expression=JOINS)
+        tab.until("globalThis.failed || globalThis.mine?.view().me", JOIN_S)
+        assert tab.run("globalThis.failed ?? ''") == ""
+        tab.run("drawing = false; types.length = 0")
+        time.sleep(AWAY_S)
+        hidden = tab.run("types")
+        tab.run("drawing = true; types.length = 0")
+        time.sleep(1.0)
+        tab.call("Page.setWebLifecycleState", state="frozen")
+        time.sleep(AWAY_S)
+        tab.call("Page.setWebLifecycleState", state="active")
+        tab.until("mine.view().state === 'playing' && mine.stats.snapshot_age_s < 2 && mine.stats.rtt_s > 0", 60)
+        before = tab.run("mine.view().me.position")
+        tab.until(f"(([x, y]) => Math.hypot(x - {before[0]}, y - {before[1]}) > 0.5)(mine.view().me.position)", 60)
+        return {
+            "hidden": hidden,
+            "frozen": tab.run("types"),
+            "divergences": tab.run("mine.stats.divergences"),
+            "said": tab.said,
+        }
+
+
+async def test_a_page_that_was_hidden_and_one_that_slept_play_on() -> None:
+    with real_server("--scene", "flat") as url:
+        async with asyncio.timeout(JOIN_S + 3 * MINUTE_S):
+            found = await asyncio.to_thread(away, url)
+    assert set(found["hidden"]) <= {"Corrected", "Resynchronised", "SegmentLoaded"}
+    assert set(found["frozen"]) <= {"Corrected", "Resynchronised", "Disconnected", "Resumed", "Joined", "SegmentLoaded"}
+    assert found["divergences"] == 0
+    lost = "WebSocket connection to"  # the browser's own line about a connection that broke off
+    assert [line for line in found["said"] if lost not in line] == []

@@ -138,7 +138,8 @@ def test_writing(name: str) -> None:
 @pytest.mark.parametrize("n", [0, 1, 7])
 def test_vectors(n: int) -> None:
     (theirs, ours), (more, own) = (vectors(random.Random(seed), n) for seed in (1, 2))
-    for by in (lambda a: a, lambda a: a[1:], lambda a: a == 2, lambda a: ~(a == 2), lambda a: a[a > 0]):
+    reads: tuple[Callable[[Any], Any], ...] = (lambda a: a[1:], lambda a: ~(a == 2), lambda a: a[a > 0])
+    for by in reads:
         same(by(theirs), by(ours))
     same(theirs != more, ours != own)
     same((theirs > 0).any(), (ours > 0).any())
