@@ -89,7 +89,7 @@ class PartProcess:
             CannotStartError: it is not in time, or has ended.
         """
         until = time.monotonic() + START_S
-        while time.monotonic() < until and self.alive:
+        while time.monotonic() < until:
             for line in self.log.read_text("utf-8").splitlines():
                 if line.startswith("listening on "):
                     self.port = int(line.rpartition(":")[2])
@@ -133,15 +133,15 @@ class Cluster:
         folder: an existing folder for all files.
         edges, standbys: numbers of these parts.
         arguments: further arguments of all parts.
-        config: further lines of the configuration of the NATS server.
+        store: further settings of the store of the NATS server.
     """
 
     def __init__(
-        self, folder: Path, *, edges: int = 2, standbys: int = 1, arguments: Sequence[str] = (), config: str = ""
+        self, folder: Path, *, edges: int = 2, standbys: int = 1, arguments: Sequence[str] = (), store: str = ""
     ) -> None:
         self.folder = folder
         (folder / "nats").mkdir(parents=True, exist_ok=True)
-        self.nats = NatsServer(folder / "nats", config)
+        self.nats = NatsServer(folder / "nats", store)
         self._arguments = arguments
         self.sequencer = self._part("sequencer")
         self.edges = [self._part(f"edge{number + 1}") for number in range(edges)]
@@ -163,13 +163,6 @@ class Cluster:
             part.start(self.nats.url)
         for part in self.parts:
             await part.ready()
-
-    async def leader(self) -> PartProcess | None:
-        """Returns the part that runs the world; None: none says so."""
-        for part in (self.sequencer, *self.standbys):
-            if part.alive and (await part.stats()).get("leads"):
-                return part
-        return None
 
     def close(self) -> None:
         """Ends all processes."""

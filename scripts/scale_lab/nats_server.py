@@ -22,12 +22,11 @@ class NatsServer:
 
     Args:
         folder: an existing folder for its files.
-        config: further lines of its configuration.
+        store: further settings of its store.
     """
 
-    def __init__(self, folder: Path, config: str = "") -> None:
-        self.folder, self._port = folder, -1
-        self._config = config
+    def __init__(self, folder: Path, store: str = "") -> None:
+        self.folder, self._port, self._store = folder, -1, store
         self._process: subprocess.Popen[bytes] | None = None
 
     @property
@@ -48,8 +47,8 @@ class NatsServer:
         for old in self.folder.glob("*.ports"):
             old.unlink()
         (self.folder / "nats.conf").write_text(
-            f'listen: "127.0.0.1:{self._port}"\njetstream {{ store_dir: "{self.folder}/jetstream" }}\n'
-            f'ports_file_dir: "{self.folder}"\n{self._config}\n',
+            f'listen: "127.0.0.1:{self._port}"\njetstream {{\n  store_dir: "{self.folder}/jetstream"\n'
+            f'  {self._store}\n}}\nports_file_dir: "{self.folder}"\n',
             "utf-8",
         )
         with (self.folder / "nats.log").open("ab") as log:

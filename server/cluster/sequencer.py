@@ -17,6 +17,7 @@ from server.cluster.part import Part, PartError
 from server.config.limits import Limits
 from server.journal.recorded_world import RecordedWorld
 from server.journal.records import DivergedError
+from server.players.persisted_state import PersistedState
 from server.rules import Rules
 from server.runtime.ticker import Ticker, best_alarm
 from server.scale import checkpoint
@@ -80,6 +81,10 @@ class SequencerPart(Part):
         self._tasks: set[asyncio.Task[None]] = set()
         self._over: asyncio.Future[None] | None = None
         self._heard = time.monotonic()
+
+    @property
+    def kept(self) -> PersistedState:
+        return super().kept if self.core is None else self.core.api.kept
 
     async def run(self) -> None:
         following = self.following

@@ -365,7 +365,7 @@ class EdgeServer(Front):
         """Ends the connection of a client because the sequencer has ended it."""
         for session in [session for session, number in self._roster.clients.items() if number == client]:
             del self._roster.clients[session]
-            self.connections.end(session, code, reason)
+            self.connections.end(session, code, reason, 0.0 if code == messages.TOO_SLOW else -1.0)
 
 
 class _Durable(Commands):

@@ -83,6 +83,8 @@ class WorldSequencer:
         self._waiting: dict[str, dict[int, Batch]] = {}
         """Batches by edge and by the number of the batch before. Each waits for that one: none may be left out."""
         self._newest: dict[str, int] = {} if replica is None else dict(replica.batches)
+        self._taken = dict.fromkeys(self._newest, world.tick)
+        """Tick that took the newest batch of each edge."""
         self._sessions: dict[tuple[str, int], Session] = {}
         self._silent = in_ticks(SILENT_S, world.scene.tick_rate, 2)
         self._gone = in_ticks(GONE_S, world.scene.tick_rate, 2)
@@ -139,7 +141,7 @@ class WorldSequencer:
 
     def _take(self, batch: Batch, now: float) -> None:
         """Carries out the requests of a batch, and takes its inputs."""
-        self._newest[batch.edge] = batch.number
+        self._newest[batch.edge], self._taken[batch.edge] = batch.number, self.world.tick + 1
         for kind, client, *parts in batch.requests:
             key = (batch.edge, client)
             session = self._sessions.get(key)
@@ -185,10 +187,10 @@ class WorldSequencer:
                 inputs.missing += 1
             elif isinstance(session.link, RemoteLink):
                 inputs.missing = max(missing.get(session.link.edge, 0), 0)
-        for edge in [edge for edge, ticks in missing.items() if ticks > self._gone]:
-            del self._newest[edge]
+        for edge in [edge for edge, taken in self._taken.items() if tick - taken > self._gone]:
+            del self._newest[edge], self._taken[edge]
             self._waiting.pop(edge, None)
-        silent = {edge for edge, ticks in missing.items() if ticks > self._silent}
+        silent = {edge for edge, taken in self._taken.items() if tick - taken > self._silent}
         if silent:
             for key in [key for key in self._sessions if key[0] in silent]:
                 session = self._sessions.pop(key)

@@ -188,6 +188,29 @@ def test_a_player_who_is_alone_is_corrected_for_late_inputs_only_when_parts_are_
     hashes_agree(match)
 
 
+def test_an_edge_far_behind_the_sequencer_keeps_its_clients() -> None:
+    match = ScaledMatch(load_scene("flat"), 1, edges=1, standbys=0, bus={"delay_s": 0.7})
+    player = match.join(wander, PATH)
+    match.run(12)
+    assert player.core.state == "playing"
+    assert set(causes(player)) <= {"late input"}
+    assert not any(isinstance(event, Disconnected) for event in player.events)
+    hashes_agree(match)
+
+
+def test_the_clients_of_an_edge_that_is_cut_off_go_on_at_another_one() -> None:
+    match = ScaledMatch(load_scene("flat"), 1, edges=2)
+    player = match.join(wander, PATH)
+    match.run(3)
+    entity, edge = player.core.entity, player.edge
+    assert edge is not None
+    match.bus.hold(edge.name, "sequencer", 60.0)
+    match.run(4)
+    assert (player.core.state, player.core.entity) == ("playing", entity)
+    assert player.edge not in (None, edge)
+    hashes_agree(match)
+
+
 @pytest.mark.parametrize("seed", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_a_lost_batch_is_sent_again(seed: int) -> None:
     match = ScaledMatch(load_scene("meadow"), seed, edges=2, rules=Tally, bus={"lost": 0.01, "twice": 0.02})
