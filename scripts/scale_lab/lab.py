@@ -15,7 +15,7 @@ from server.cluster.nats_bus import NatsBus
 from server.journal.records import JournalError, Recording
 from server.scale.wire import record_of
 
-ARGUMENTS = ("--scene", "meadow", "--game", "scripts.scale_lab.tally:Tally", "--log-level", "info")
+ARGUMENTS = ("--scene", "meadow", "--game", "scripts.scale_lab.tally:Tally", "--checkpoint-s", "5")
 """Arguments of all parts."""
 CALM_S = 1.0
 """Seconds without a disturbance before and after each one."""

@@ -22,7 +22,7 @@ from nats.aio.client import Client
 from nats.aio.msg import Msg
 from nats.errors import Error as NatsError
 from nats.js import JetStreamContext
-from nats.js.api import Header, ObjectStoreConfig, RePublish, StreamConfig
+from nats.js.api import AckPolicy, ConsumerConfig, DeliverPolicy, Header, ObjectStoreConfig, RePublish, StreamConfig
 from nats.js.errors import APIError, KeyNotFoundError, KeyWrongLastSequenceError, NotFoundError
 from nats.js.kv import KeyValue
 
@@ -37,8 +37,8 @@ CONNECT_S = 5.0
 """Seconds to wait for a connection at the start."""
 RECONNECT_S = 0.1
 """Seconds between two attempts to reconnect."""
-FETCHED_MAX = 256
-"""Maximum number of missing records that are fetched at once."""
+FETCHED_MAX, ONE_BY_ONE = 512, 16
+"""Maximum number of missing records that are fetched at once. Number from which they are fetched by a consumer."""
 ATTEMPTS = 20
 """Attempts to fetch a record that the stream has, and that did not come."""
 WRONG_LAST_ID, NAME_IN_USE = 10070, 10058
@@ -182,6 +182,8 @@ class NatsBus:
             BusError: there was no answer.
         """
         try:
+            if last - first >= ONE_BY_ONE:
+                return await self._fetch_many(first, last)
             found = await asyncio.gather(*(self._stored(seq) for seq in range(first, last + 1)))
         except NotFoundError as error:
             info = await self._js.stream_info(self._stream)
@@ -190,6 +192,28 @@ class NatsBus:
             raise BusError("a record is missing") from error
         except (NatsError, OSError, TimeoutError) as error:
             raise BusError(_said(error)) from error
+        return found
+
+    async def _fetch_many(self, first: int, last: int) -> list[Stored]:
+        """Returns records by a consumer of the stream, or only the first ones of them."""
+        config = ConsumerConfig(
+            deliver_policy=DeliverPolicy.BY_START_SEQUENCE,
+            opt_start_seq=first,
+            ack_policy=AckPolicy.NONE,
+            inactive_threshold=2 * ANSWER_S,
+        )
+        subject = f"{self._subject}.log"
+        subscription = await self._js.pull_subscribe(subject, stream=self._stream, config=config)
+        try:
+            messages = await subscription.fetch(last - first + 1, timeout=ANSWER_S)
+        finally:
+            await subscription.unsubscribe()
+        found = [
+            Stored(message.metadata.sequence.stream, _id_of(message.headers), message.data) for message in messages
+        ]
+        self.bytes_in += sum(len(stored.data) for stored in found)
+        if found and found[0].seq > first:
+            raise PurgedError(f"record {first} is not in the log any more")
         return found
 
     async def _stored(self, seq: int) -> Stored:
