@@ -37,6 +37,7 @@ EXPORTS = {
     "traffic": {
         "take_messages": "QDQbqdBqd",
         "take_inputs": "QQQnnn",
+        "due_rows": "QdQd",
         "write_snapshots": "QDqqqbBQqd",
     },
 }

@@ -274,7 +274,7 @@ _KIND_OF = {kind: number for number, (kind, _) in KINDS.items()}
 
 
 def head_of(kind: type[Message]) -> bytes:
-    """Returns the first two bytes of every message of a kind with at most 14 fields: the list's length, the kind."""
+    """Returns the first two bytes of each message of a kind with at most 14 fields."""
     return bytes((0x91 + len(kind._fields), _KIND_OF[kind]))
 
 

@@ -41,8 +41,8 @@ FREE, PLAIN, ODD = range(3)
 
 DONE, ANSWERED, LEFT = range(3)
 """Fates of a message: handled; handled, and it answers the probe of the round trip; left to the code in Python."""
-UNWRITTEN = -1
-"""Start of the message of a row without one."""
+UNUSED, UNWRITTEN = -1, -2
+"""Starts of the messages of rows without one: the row is free; its session is odd."""
 USED_INPUT, REPEATED_INPUT, NEUTRAL_INPUT = 0, 1, 2
 """Input statuses (`messages.USED`, `REPEATED`, `NEUTRALISED`)."""
 REFUSED_MARGIN = -(1 << 15)
@@ -262,6 +262,38 @@ def take_inputs(numbers: Any, ring: Any, taken: Any, tick: int, repeats: int, sl
 
 
 @jit
+def due_rows(numbers: Any, floats: Any, due: Any, clock: Any) -> int:
+    """Lists the rows whose connection is to be asked for the bytes on the way, and makes silent ones `ODD`.
+
+    Args:
+        numbers, floats: the rows.
+        due: gets the rows. Those with an earlier measurement than now come as they are; others, which may have no
+            room, as `-1 - row`.
+        clock: the time, and the longest time without a message, in seconds.
+
+    Returns:
+        The number of rows in `due`.
+    """
+    n = 0
+    for row in range(len(numbers) // WIDTH):
+        base, reals = row * WIDTH, row * FLOATS
+        if numbers[base + STATE] != PLAIN:
+            continue
+        if clock[0] - floats[reals + RECEIVED_AT] > clock[1]:
+            numbers[base + STATE] = ODD
+        elif clock[0] >= floats[reals + MEASURE_AT]:
+            due[n] = row
+            n += 1
+        else:
+            latest = numbers[base + SNAPSHOT_BYTES]
+            outstanding = numbers[base + SENT_BYTES] - numbers[base + TAKEN_BYTES]
+            if outstanding + latest > max(numbers[base + CARRIES], 2 * latest):
+                due[n] = -1 - row
+                n += 1
+    return n
+
+
+@jit
 def write_snapshots(
     numbers: Any,
     floats: Any,
@@ -282,7 +314,7 @@ def write_snapshots(
         starts, lengths: the delta of each segment in `parts`, by number; length 0: there is none.
         parts: the encoded deltas.
         out: gets the messages. It has room for the longest one at least.
-        spans: gets start and end of each row's message in `out`; start `UNWRITTEN`: none was written.
+        spans: gets start and end of each row's message in `out`; start `UNUSED` or `UNWRITTEN`: there is none.
         rules: the first row, the tick, most bytes of a snapshot.
         clock: the time, messages of a burst, messages per tick, part by which the held share nears its new value.
 
@@ -294,7 +326,7 @@ def write_snapshots(
     at = 0
     for row in range(rules[0], len(numbers) // WIDTH):
         base, reals = row * WIDTH, row * FLOATS
-        spans[2 * row] = UNWRITTEN
+        spans[2 * row] = UNUSED
         if numbers[base + STATE] == FREE:
             continue
         size, n = 0, 0
@@ -304,6 +336,7 @@ def write_snapshots(
         if at + HEADER_BYTES + size > len(out):
             return row
         floats[reals + ALLOWANCE] = refilled(floats[reals + ALLOWANCE], burst, refill)
+        spans[2 * row] = UNWRITTEN
         if numbers[base + STATE] == ODD:
             continue
         latest, outstanding = numbers[base + SNAPSHOT_BYTES], numbers[base + SENT_BYTES] - numbers[base + TAKEN_BYTES]

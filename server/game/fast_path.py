@@ -23,18 +23,16 @@ Clients cannot tell the difference: tests compare every byte that is sent (`test
 from array import array
 from collections.abc import Callable, Mapping
 
-import numpy as np
-
 from server.config.limits import Limits, catch_up_ticks
 from server.game.clocks import Clocks
 from server.game.connections import Connections
-from server.game.fast_rows import Rows, fits
+from server.game.fast_rows import Arguments, Rows, fits, lent
 from server.game.session import Session
 from server.observability.counters import Counters
 from server.players.player import Player
 from server.replication.change_log import ChangeLog
 from server.replication.flow_control import HELD_S
-from server.replication.sender import SNAPSHOT_BYTES as SNAPSHOT_BYTES_MAX
+from server.replication.sender import SNAPSHOT_BYTES
 from shared.bounds import bounds
 from shared.checks import Cell
 from shared.inputs import Input
@@ -51,14 +49,13 @@ from shared.traffic import (
     LEFT,
     MEASURE_AT,
     ODD,
-    PLAIN,
     PROBE_AT,
     PROBE_BYTES,
     RECEIVED_AT,
     SENT_BYTES,
-    SNAPSHOT_BYTES,
     STATE,
     TAKEN_BYTES,
+    UNUSED,
     UNWRITTEN,
     WIDTH,
 )
@@ -70,7 +67,7 @@ SOON = 12
 """Ticks. A session that is recalled sooner after it came waits twice as long before it comes again."""
 WAITING_MAX = 4096
 """Maximum number of messages that wait for the next tick."""
-OUT_BYTES, SEGMENTS_MIN = 1 << 16, 64
+OUT_BYTES, SEGMENTS_MIN = 2048, 32
 """Initial sizes: bytes of the buffer for snapshots, number of segments."""
 INPUTS, PING = head_of(Inputs), head_of(Ping)
 """First two bytes of the messages that do not take a session off the fast path."""
@@ -117,8 +114,11 @@ class FastPath:
         """Number of each segment that a session on the fast path has seen."""
         self._used: list[int] = []
         """Number of sessions that see a segment, by its number."""
-        self._starts, self._lengths = np.zeros(0, np.int64), np.zeros(0, np.int64)
-        self._out = np.zeros(OUT_BYTES, np.uint8)
+        self._starts, self._lengths = Arguments(kernel, "q", SEGMENTS_MIN), Arguments(kernel, "q", SEGMENTS_MIN)
+        self._changed: list[int] = []
+        """Numbers of the segments that have a length."""
+        self._out = Arguments(kernel, "B", OUT_BYTES)
+        self._rules, self._clock = Arguments(kernel, "q", 5), Arguments(kernel, "d", 5)
         self._shared = 0
         """Version of the shared values that all sessions here have been sent."""
         self._n = 0
@@ -155,20 +155,21 @@ class FastPath:
             return
         data, spans, times, rows = self._data, self._spans, self._times, self._rows
         self._renew()
-        lent, fates = self._kernel.lent, bytearray(len(data))
-        rules = (self._world.tick, self._bounds.ahead, self._row_bytes, self._limits.input_rows_max, rows.slots)
-        deadline = self._clocks.deadline
-        clock = (deadline, self._rate, self._catch_up, self._bounds.margin_one, self._clocks.burst)
+        fates, rules, clock = bytearray(len(data)), self._rules, self._clock
+        rules.values[0], rules.values[1], rules.values[2] = self._world.tick, self._bounds.ahead, self._row_bytes
+        rules.values[3], rules.values[4] = self._limits.input_rows_max, rows.slots
+        clock.values[0], clock.values[1], clock.values[2] = self._clocks.deadline, self._rate, self._catch_up
+        clock.values[3], clock.values[4] = self._bounds.margin_one, self._clocks.burst
         self._kernel.take_messages(
             rows.numbers_lent,
             rows.floats_lent,
             rows.ring_lent,
             b"".join(data),
-            lent(np.frombuffer(spans, np.int64)),
-            lent(np.frombuffer(times, np.float64)),
-            lent(np.frombuffer(fates, np.uint8)),
-            lent(np.array(rules, np.int64)),
-            lent(np.array(clock, np.float64)),
+            lent(self._kernel, spans, "q"),
+            lent(self._kernel, times, "d"),
+            lent(self._kernel, fates, "B"),
+            rules.lent,
+            clock.lent,
         )
         if not any(fates):
             return
@@ -217,70 +218,71 @@ class FastPath:
         for entity in self._log.moved:
             if entity in self._players:
                 self._players[entity].recall()
-        silent = now - self._rows.floats_array[RECEIVED_AT::FLOATS] > self._limits.silence_s
-        self._rows.numbers_array[STATE::WIDTH][silent & (self._rows.numbers_array[STATE::WIDTH] == PLAIN)] = ODD
         self._measure(now)
-        self._write(now)
-        for row in np.flatnonzero(self._rows.numbers_array[STATE::WIDTH] == ODD).tolist():
-            odd = self._rows.sessions[row]
-            if odd is not None:
-                self.recall(odd)
+        for session in self._write(now):
+            self.recall(session)
 
     def _measure(self, now: float) -> None:
         """Measures the connections whose time has come, or looks at them, as `FlowControl.window` does."""
         rows = self._rows
-        numbers, base = rows.numbers_array, rows.numbers
-        latest, on_way = numbers[SNAPSHOT_BYTES::WIDTH], numbers[SENT_BYTES::WIDTH] - numbers[TAKEN_BYTES::WIDTH]
-        due = rows.floats_array[MEASURE_AT::FLOATS] <= now
-        full = on_way + latest > np.maximum(numbers[CARRIES::WIDTH], 2 * latest)
-        for row in np.flatnonzero((due | full) & (numbers[STATE::WIDTH] == PLAIN)).tolist():
-            session = rows.sessions[row]
+        numbers, floats = rows.numbers, rows.floats
+        self._clock.values[0], self._clock.values[1] = now, self._limits.silence_s
+        n = self._kernel.due_rows(rows.numbers_lent, rows.floats_lent, rows.due_lent, self._clock.lent)
+        for row in rows.due[:n].tolist():
+            at, measures = (row, True) if row >= 0 else (-1 - row, False)
+            session, base = rows.sessions[at], at * WIDTH
             assert session is not None
-            flow, at = session.flow, row * WIDTH
-            flow.sent_bytes = base[at + SENT_BYTES]
-            if due[row]:
-                flow.held_share = rows.floats[row * FLOATS + HELD_SHARE]
+            flow = session.flow
+            flow.sent_bytes = numbers[base + SENT_BYTES]
+            if measures:
+                flow.held_share = floats[at * FLOATS + HELD_SHARE]
                 flow.measure(self._tick_s, now)
-                base[at + CARRIES] = flow.carries
-                rows.floats[row * FLOATS + MEASURE_AT] = flow.measure_at
+                numbers[base + CARRIES], floats[at * FLOATS + MEASURE_AT] = flow.carries, flow.measure_at
                 if not flow.steady:
-                    base[at + STATE] = ODD
+                    numbers[base + STATE] = ODD
             else:
                 flow.look()
-            base[at + TAKEN_BYTES] = flow.taken
+            numbers[base + TAKEN_BYTES] = flow.taken
 
-    def _write(self, now: float) -> None:
-        """Writes the snapshots, and sends them."""
-        rows, tick, lent = self._rows, self._world.tick, self._kernel.lent
-        parts, longest = self._parts()
-        if len(self._out) < HEADER_BYTES + longest:
-            self._out = np.zeros(2 * (HEADER_BYTES + longest), np.uint8)
-        view, n = self._out.data, len(rows.sessions)
-        clock = (now, self._clocks.burst, self._limits.messages_per_tick, self._decay)
-        at = 0
+    def _write(self, now: float) -> list[Session]:
+        """Writes the snapshots, and sends them. Returns the sessions for which it was not done."""
+        rows, n, rules, clock = self._rows, len(self._rows.sessions), self._rules, self._clock
+        parts = self._parts()
+        if len(self._out.values) < HEADER_BYTES + len(parts):
+            self._out = Arguments(self._kernel, "B", 2 * (HEADER_BYTES + len(parts)))
+        clock.values[0], clock.values[1] = now, self._clocks.burst
+        clock.values[2], clock.values[3] = self._limits.messages_per_tick, self._decay
+        rules.values[1], rules.values[2] = self._world.tick, SNAPSHOT_BYTES
+        at, left = 0, list[Session]()
         while at < n:
+            rules.values[0] = at
             end = self._kernel.write_snapshots(
                 rows.numbers_lent,
                 rows.floats_lent,
                 rows.views_lent,
-                lent(self._starts),
-                lent(self._lengths),
+                self._starts.lent,
+                self._lengths.lent,
                 parts,
-                lent(self._out),
+                self._out.lent,
                 rows.spans_lent,
-                lent(np.array((at, tick, SNAPSHOT_BYTES_MAX), np.int64)),
-                lent(np.array(clock, np.float64)),
+                rules.lent,
+                clock.lent,
             )
-            spans = rows.spans_array[2 * at : 2 * end].tolist()
-            data = bytes(view[: max(spans, default=0)])
-            self._pass_on(at, spans, data)
+            left += self._pass_on(at, rows.spans[2 * at : 2 * end].tolist())
+            if end < n:
+                self._out = Arguments(self._kernel, "B", 2 * len(self._out.values))
             at = end
+        return left
 
-    def _pass_on(self, row: int, spans: list[int], data: bytes) -> None:
-        """Passes the messages of consecutive rows to their connections."""
-        sessions, sent, size = self._rows.sessions, 0, 0
-        for start, end, session in zip(spans[::2], spans[1::2], sessions[row : row + len(spans) // 2], strict=True):
-            if start == UNWRITTEN or session is None:
+    def _pass_on(self, row: int, spans: list[int]) -> list[Session]:
+        """Passes the messages of consecutive rows to their connections. Returns the sessions without one."""
+        data = bytes(self._out.values[: max(spans, default=0)])
+        sent, size, left = 0, 0, []
+        for start, end, session in zip(spans[::2], spans[1::2], self._rows.sessions[row:], strict=False):
+            if session is None or start == UNUSED:
+                continue
+            if start == UNWRITTEN:
+                left.append(session)
                 continue
             sent += 1
             size += end - start
@@ -290,18 +292,23 @@ class FastPath:
                 self._connections.fail(session, "serving a client")
         self._counters.snapshots_sent += sent
         self._counters.snapshot_bytes += size
+        return left
 
-    def _parts(self) -> tuple[bytes, int]:
-        """Returns the deltas of all segments that are seen here and have changed, and their size."""
-        self._lengths[:] = 0
+    def _parts(self) -> bytes:
+        """Returns the deltas of all segments that are seen here and have changed."""
+        starts, lengths = self._starts.values, self._lengths.values
+        for latest in self._changed:
+            lengths[latest] = 0
+        self._changed.clear()
         deltas, parts, at = self._log.since(self._world.tick - 1), [], 0
         for segment in deltas.changed:
             number = self._numbers.get(segment)
             if number is not None and self._used[number] and (part := deltas[segment]):
                 parts.append(part)
-                self._starts[number], self._lengths[number] = at, len(part)
+                self._changed.append(number)
+                starts[number], lengths[number] = at, len(part)
                 at += len(part)
-        return b"".join(parts), at
+        return b"".join(parts)
 
     # -- coming and going ----------------------------------------------------------------------------------
 
@@ -338,9 +345,10 @@ class FastPath:
         if number is None:
             number = self._numbers[segment] = len(self._used)
             self._used.append(0)
-            if number >= len(self._starts):
-                more = np.zeros(max(len(self._starts), SEGMENTS_MIN), np.int64)
-                self._starts, self._lengths = (np.concatenate((old, more)) for old in (self._starts, self._lengths))
+            if number >= len(self._starts.values):
+                self._starts, self._lengths = (
+                    Arguments(self._kernel, "q", 2 * number, old.values) for old in (self._starts, self._lengths)
+                )
         return number
 
     def recall(self, session: Session) -> None:

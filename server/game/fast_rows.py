@@ -4,13 +4,12 @@ from array import array
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from server.game.session import Session
 from server.players.input_queue import InputQueue, decoded
 from shared.bounds import bounds
 from shared.inputs import ROW, Input, row
-from shared.kernels import Kernel
+from shared.kernels import NUMBA, Kernel
 from shared.scene import Scene
 from shared.traffic import (
     ACCEPTED,
@@ -56,6 +55,35 @@ INPUTS_KEPT = 4096
 """Maximum number of decoded inputs that are kept."""
 
 
+def lent(kernel: Kernel, values: Any, kind: str) -> Any:
+    """Returns a flat array with a buffer as a kernel takes it.
+
+    Args:
+        kernel: the kernel.
+        values: the array.
+        kind: kind of its elements, as in `array`.
+    """
+    return kernel.lent(np.frombuffer(values, kind)) if kernel.form == NUMBA else values
+
+
+class Arguments:
+    """A flat array for a kernel, filled with zeros.
+
+    Args:
+        kernel: the kernel.
+        kind: kind of its elements, as in `array`: "q", "d" or "B".
+        length: number of its elements.
+        old: values for its beginning; None: none.
+    """
+
+    def __init__(self, kernel: Kernel, kind: str, length: int, old: memoryview | None = None) -> None:
+        made = array(kind, bytes(length * array(kind).itemsize))
+        self.values: Any = memoryview(made)  # of whole numbers or floats
+        self.lent = lent(kernel, made, kind)
+        if old is not None:
+            self.values[: len(old)] = old
+
+
 class Rows:
     """The rows of one game.
 
@@ -78,35 +106,33 @@ class Rows:
         old = len(self.sessions)
         self.sessions += [None] * (n - old)
         for name, width, kind in (
-            ("numbers", WIDTH, np.int64),
-            ("floats", FLOATS, np.float64),
-            ("ring", self.slots * SLOT, np.int64),
-            ("views", SEGMENTS, np.int64),
-            ("taken", 2, np.int64),
-            ("spans", 2, np.int64),
+            ("numbers", WIDTH, "q"),
+            ("floats", FLOATS, "d"),
+            ("ring", self.slots * SLOT, "q"),
+            ("views", SEGMENTS, "q"),
+            ("taken", 2, "q"),
+            ("spans", 2, "q"),
+            ("due", 1, "q"),
         ):
-            grown: npt.NDArray[Any] = np.zeros(n * width, kind)
-            if old:
-                grown[: old * width] = getattr(self, f"{name}_array")
-            setattr(self, f"{name}_array", grown)
-            setattr(self, f"{name}_lent", self._kernel.lent(grown))
-            setattr(self, name, memoryview(grown.data).cast("B").cast("d" if kind is np.float64 else "q"))
+            grown = Arguments(self._kernel, kind, n * width, getattr(self, name) if old else None)
+            setattr(self, name, grown.values)
+            setattr(self, f"{name}_lent", grown.lent)
 
-    numbers_array: npt.NDArray[np.int64]
-    floats_array: npt.NDArray[np.float64]
-    taken_array: npt.NDArray[np.int64]
-    spans_array: npt.NDArray[np.int64]
-    """Arrays of all rows; each has a view for Python (`numbers`), and one for the kernel (`numbers_lent`)."""
     numbers: Any
     floats: Any
     ring: Any
     views: Any
+    taken: Any
+    spans: Any
+    due: Any
+    """Arrays of all rows; each has a form for the kernel (`numbers_lent`)."""
     numbers_lent: Any
     floats_lent: Any
     ring_lent: Any
     views_lent: Any
     taken_lent: Any
     spans_lent: Any
+    due_lent: Any
 
     def write(self, session: Session, segments: list[int]) -> None:
         """Moves the state of a session to a free row.
@@ -202,7 +228,7 @@ class Rows:
 
     def inputs(self) -> list[Input]:
         """Returns the inputs that `traffic.take_inputs` has taken, by row."""
-        known, heads = self._inputs, self.taken_array.tolist()
+        known, heads = self._inputs, self.taken.tolist()
         pairs = zip(heads[::2], heads[1::2], strict=True)
         return [known.get(pair) or self.input_of(*pair) for pair in pairs]
 

@@ -16,20 +16,22 @@ import math
 import sys
 import time
 import tomllib
-from typing import Any, cast
+from typing import Any
 
 from scripts.benchmarks.busy_server import in_view
 from scripts.environment import ROOT
 from server import serving
 from server.config.settings import Settings
-from server.game import Game, roster
-from server.players.input_queue import InputQueue
+from server.game import Game
+from server.game.session import Session
 from server.runtime import event_loop, log
 from server.runtime.warmup import warm_up
-from shared.messages import Inputs
+from shared.fields import INPUT_ROW_BYTES
+from shared.messages import Inputs, decode_from_client, head_of
 from shared.scene import Scene
 
 RATE = 32
+INPUTS = head_of(Inputs)
 
 
 def scene() -> Scene:
@@ -40,36 +42,28 @@ def scene() -> Scene:
     return Scene.from_table(table)
 
 
-class Logged(InputQueue):
-    """An input queue that notes when each input arrived, and in which tick it was used."""
-
-    def __init__(self, *args: Any) -> None:
-        super().__init__(*args)
-        self.arrived: dict[int, float] = {}
-        self.used_in: set[int] = set()
-
-    def file(self, message: Inputs, tick: int, ahead: float) -> None:
-        now, before = time.monotonic(), self.accepted
-        super().file(message, tick, ahead)
-        for at in range(before + 1 if before >= 0 else message.first, self.accepted + 1):
-            self.arrived[at] = now
-
-    def take(self, tick: int) -> Any:
-        if tick in self.waiting:
-            self.used_in.add(tick)
-        return super().take(tick)
-
-
 class Measured(Game):
-    """The game with a log: the time at which each tick began, and if `follow`, the way that each player walked."""
+    """The game with a log: when each tick began, when each input arrived, and if `follow`, how far each player walked.
+
+    An input that arrived before its tick began was used in it.
+    """
 
     def __init__(self, rules: Scene, *, follow: bool) -> None:
         super().__init__(rules)
         self.follow = follow
         self.began: list[float] = []
+        self.arrived: dict[str, dict[int, float]] = {}
         self.first = self.world.tick + 1
         self._at: dict[int, tuple[float, float]] = {}
         self.walked: dict[str, float] = {}
+
+    def receive(self, session: Session, data: bytes, now: float) -> None:
+        if data[:2] == INPUTS and session.player is not None:
+            message, arrived = decode_from_client(data), self.arrived.setdefault(session.player.name, {})
+            assert isinstance(message, Inputs)
+            for at in range(message.first, message.first + len(message.rows) // INPUT_ROW_BYTES):
+                arrived.setdefault(at, now)
+        super().receive(session, data, now)
 
     def tick(self, deadline: float, now: float) -> None:
         self.began.append(time.monotonic())
@@ -91,14 +85,15 @@ class Measured(Game):
         }
 
     def input_log(self) -> dict[str, Any]:
-        inputs = {}
-        for player in self.players.values():
-            queue = player.inputs
-            assert isinstance(queue, Logged)
-            inputs[player.name] = [
-                [at, arrived, at - self.first if at in queue.used_in else -1] for at, arrived in queue.arrived.items()
-            ]
+        inputs = {
+            name: [[at, arrived, at - self.first if self._used(at, arrived) else -1] for at, arrived in log.items()]
+            for name, log in self.arrived.items()
+        }
         return {"first": self.first, "ticks": self.began, "inputs": inputs}
+
+    def _used(self, at: int, arrived: float) -> bool:
+        """Returns whether the input for a tick was used in it."""
+        return 0 <= at - self.first < len(self.began) and arrived < self.began[at - self.first]
 
 
 class Reporting(serving.Server):
@@ -127,7 +122,6 @@ class Reporting(serving.Server):
 
 
 def main(argv: list[str]) -> int:
-    cast("Any", roster).InputQueue = Logged
     rules = scene()
     warm_up(rules)
     settings = Settings(port=int(argv[0]), page=False, log_level="warning")
