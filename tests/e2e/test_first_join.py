@@ -1,22 +1,27 @@
-"""The first join of a client without a prebuilt kernel: it plays at once, while its kernel is compiled.
+"""The first start of a server and the first join of a client without a prebuilt kernel.
 
-A kernel takes long to compile, so the same one is compared with the prebuilt one, too.
+Numba takes long to compile a kernel, so one compilation serves both: the start of the server fills the cache, the
+client compiles what has been removed from it, and the result is compared with the prebuilt kernel.
 """
 
+import json
 import os
+import signal
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 
+from server.runtime.event_loop import COMPILING
 from shared import kernels
-from tests.e2e.processes import ROOT, running
+from tests.e2e.processes import BUSY, ROOT, running
 from tests.kernels import chains
 
 pytestmark = [
     pytest.mark.e2e,
     pytest.mark.slow,
+    pytest.mark.longest,
     pytest.mark.skipif(not kernels.numba_installed(), reason="Numba is not installed"),
 ]
 
@@ -41,15 +46,71 @@ with Client.connect(sys.argv[1], name="Ann") as client:
 """
 
 
-def test_a_client_plays_while_its_kernel_is_compiled_which_agrees_with_the_prebuilt_one_at_every_tick(
-    tmp_path: Path,
-) -> None:
+def test_a_start_that_compiles_says_so_and_a_client_plays_meanwhile_with_equal_results(tmp_path: Path) -> None:
+    first_start_and_later_ones(tmp_path)
+    remove(tmp_path, "step", "turn")  # the client has to compile these
+    first_join(tmp_path)
+    other = chains.elsewhere("hills", chains.TICKS, kernels.NUMBA, NUMBA_CACHE_DIR=str(tmp_path))
+    assert other == f"{kernels.NUMBA} {chains.chain('hills', chains.TICKS, compiled=True)}"
+
+
+def first_start_and_later_ones(cache: Path) -> None:
+    """Checks that the first start compiles the whole kernel, and a later one what is not in the cache, and says so."""
+    if os.name == "nt":  # it has no such terminals
+        assert in_a_log(cache) == [COMPILING]
+    else:
+        assert on_a_terminal(cache) == ["compiling", "listening"]
+        assert on_a_terminal(cache) == ["listening"]
+    remove(cache, "read_turns")
+    assert in_a_log(cache) == [COMPILING]
+    assert in_a_log(cache) == []
+
+
+def first_join(cache: Path) -> None:
+    """Checks that a client plays at once with the plain kernel, and then with the compiled one, all without a
+    divergence."""
     with running("--port", "0", "--scene", "flat") as server:
         host, port = server.address()
-        environment = os.environ | {kernels.VARIABLE: kernels.NUMBA, "NUMBA_CACHE_DIR": str(tmp_path)}
+        environment = os.environ | {kernels.VARIABLE: kernels.NUMBA, "NUMBA_CACHE_DIR": str(cache)}
         command = (sys.executable, "-c", PROGRAM, f"ws://{host}:{port}")
         done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, check=False)
     assert done.stderr == ""
     assert done.stdout == "['plain for now', 'numba'] 0 0 True\n"
-    other = chains.elsewhere("hills", chains.TICKS, kernels.NUMBA, NUMBA_CACHE_DIR=str(tmp_path))
-    assert other == f"{kernels.NUMBA} {chains.chain('hills', chains.TICKS, compiled=True)}"
+
+
+def remove(cache: Path, *functions: str) -> None:
+    """Removes compiled functions from Numba's cache."""
+    for function in functions:
+        (index,) = cache.rglob(f"*.{function}-*.nbi")
+        index.unlink()
+
+
+def on_a_terminal(cache: Path) -> list[str]:
+    """Returns the first word of each line on the terminal of a starting server, up to the line of its address.
+
+    Lines behind it do not count, because the same read may have brought them, too.
+    """
+    seen, its = os.openpty()
+    command = [sys.executable, "-m", "server", "--port", "0", "--scene", "flat", "--log-level", "warning"]
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(cache), kernels.VARIABLE: kernels.NUMBA}
+    with subprocess.Popen(command, cwd=ROOT, env=environment, stdin=its, stdout=its, stderr=its) as process:
+        os.close(its)
+        try:
+            shown = b""
+            while b"listening on" not in shown:
+                shown += os.read(seen, 1000)
+        finally:
+            process.terminate()
+            os.close(seen)
+    lines = [line for line in shown.decode(errors="replace").splitlines() if not BUSY.search(line)]
+    words = [line.partition(" ")[0] for line in lines]
+    return words[: words.index("listening") + 1]
+
+
+def in_a_log(cache: Path) -> list[str]:
+    """Returns the log's entries about compiling of a server that starts and ends."""
+    flags = ("--port", "0", "--scene", "flat")
+    with running(*flags, NUMBA_CACHE_DIR=str(cache), SOVEREIGN_KERNEL=kernels.NUMBA) as server:
+        server.address()
+        assert server.end(signal.SIGTERM) == 0
+        return [json.loads(line)["event"] for line in server.errors if "compiling" in line]

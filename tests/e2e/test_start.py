@@ -18,54 +18,10 @@ import pytest
 
 from client_sdk.client import Client
 from server.runtime.event_loop import COMPILING, announce_compiling
-from shared import kernels
-from tests.e2e.processes import BUSY, ROOT, START_S, other, page, running, stats, until
+from tests.e2e.processes import ROOT, START_S, other, page, running, stats, until
 from tests.lengths import long
 
 pytestmark = pytest.mark.e2e
-
-
-def on_a_terminal(cache: Path) -> list[str]:
-    """Returns the first word of each line on the terminal of a starting server, up to the line of its address.
-
-    Lines behind it do not count, because the same read may have brought them, too.
-    """
-    seen, its = os.openpty()
-    command = [sys.executable, "-m", "server", "--port", "0", "--scene", "flat", "--log-level", "warning"]
-    environment = {**os.environ, "NUMBA_CACHE_DIR": str(cache), kernels.VARIABLE: kernels.NUMBA}
-    with subprocess.Popen(command, cwd=ROOT, env=environment, stdin=its, stdout=its, stderr=its) as process:
-        os.close(its)
-        try:
-            shown = b""
-            while b"listening on" not in shown:
-                shown += os.read(seen, 1000)
-        finally:
-            process.terminate()
-            os.close(seen)
-    lines = [line for line in shown.decode(errors="replace").splitlines() if not BUSY.search(line)]
-    words = [line.partition(" ")[0] for line in lines]
-    return words[: words.index("listening") + 1]
-
-
-def in_a_log(cache: Path) -> list[str]:
-    """Returns the log's entries about compiling of a server that starts and ends."""
-    flags = ("--port", "0", "--scene", "flat")
-    with running(*flags, NUMBA_CACHE_DIR=str(cache), SOVEREIGN_KERNEL=kernels.NUMBA) as server:
-        server.address()
-        assert server.end(signal.SIGTERM) == 0
-        return [json.loads(line)["event"] for line in server.errors if "compiling" in line]
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(os.name == "nt" or not kernels.numba_installed(), reason="needs a terminal, and Numba")
-def test_a_start_that_compiles_says_so_on_a_terminal_and_in_a_log(tmp_path: Path) -> None:
-    """The first start compiles the whole kernel, and a later one a function that has been removed from the cache."""
-    assert on_a_terminal(tmp_path) == ["compiling", "listening"]
-    assert on_a_terminal(tmp_path) == ["listening"]
-    (index,) = tmp_path.rglob("*read_turns*.nbi")
-    index.unlink()
-    assert in_a_log(tmp_path) == [COMPILING]
-    assert in_a_log(tmp_path) == []
 
 
 def test_a_terminal_gets_plain_text_and_anything_else_a_line_of_the_log(caplog: pytest.LogCaptureFixture) -> None:
