@@ -57,11 +57,14 @@ function changes(outside) {
   const count = u32();
   need(count * (4 + array.unit));
   const values = at + 4 * count;
-  for (let i = 0; i < count; i++) {
-    const to = piece.readUInt32LE(at + 4 * i) * array.unit;
+  const index = (i) => piece.readUInt32LE(at + 4 * i);
+  for (let i = 0, next; i < count; i = next) {
+    for (next = i + 1; next < count && index(next) - index(i) === next - i; ) next++;
+    const to = index(i) * array.unit;
     const from = values + i * array.unit;
-    piece.copy(array.expected, to, from, from + array.unit);
-    if (outside) piece.copy(bytes, array.address + to, from, from + array.unit);
+    const end = values + next * array.unit;
+    piece.copy(array.expected, to, from, end);
+    if (outside) piece.copy(bytes, array.address + to, from, end);
   }
   at = values + count * array.unit;
 }

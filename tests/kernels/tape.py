@@ -15,6 +15,7 @@ All numbers are little-endian; an index counts units. The order of the functions
 """
 
 import struct
+from dataclasses import dataclass
 from typing import Any, BinaryIO
 
 import numpy as np
@@ -24,6 +25,14 @@ from shared.kernels import Kernel
 
 BYTES_MAX = 256 << 20
 """Bytes of all recorded arrays. When they exceed it, all arrays are forgotten."""
+
+
+@dataclass
+class Shadow:
+    """An array on the tape: its number there, and its bytes after the latest call."""
+
+    number: int
+    data: bytes
 
 
 class Tape:
@@ -36,7 +45,7 @@ class Tape:
 
     def __init__(self, kernel: Kernel, file: BinaryIO) -> None:
         self._kernel, self._file = kernel, file
-        self._known: dict[tuple[int, int], tuple[int, np.ndarray[Any, Any]]] = {}
+        self._known: dict[tuple[int, int], Shadow] = {}
         self._held = 0
         self.calls: dict[str, int] = dict.fromkeys(exports.functions(server=False), 0)
 
@@ -56,49 +65,49 @@ class Tape:
                 self._file.write(b"R")
                 self._known.clear()
                 self._held = 0
-            touched: list[tuple[int, np.ndarray[Any, Any], np.ndarray[Any, Any]]] = []
+            touched: list[tuple[Shadow, np.ndarray[Any, Any]]] = []
             words = bytearray(struct.pack("<cB", b"C", number))
             for kind, argument in zip(kinds, arguments, strict=True):
                 if kind in (exports.NUMBER, exports.TRUTH):
                     words += struct.pack("<q", argument)
                     continue
                 for each in argument if kind == exports.WORLD else (argument,):
-                    array, now, shadow = self._array(each)
-                    touched.append((array, now, shadow))
-                    words += struct.pack("<II", array, len(each))
-            for array, now, shadow in touched:
-                if changes := _changes(array, now, shadow):
+                    shadow, now = self._array(each)
+                    touched.append((shadow, now))
+                    words += struct.pack("<II", shadow.number, len(each))
+            for shadow, now in touched:
+                if changes := _changes(shadow, now):
                     self._file.write(b"W" + changes)
             given = [
                 self._kernel.bound(argument) if kind == exports.WORLD else argument
                 for kind, argument in zip(kinds, arguments, strict=True)
             ]
             result = function(*given)
-            made = [changes for array, now, shadow in touched if (changes := _changes(array, now, shadow))]
+            made = [changes for shadow, now in touched if (changes := _changes(shadow, now))]
             self._file.write(bytes(words) + struct.pack("<iH", int(result or 0), len(made)) + b"".join(made))
             self.calls[name] += 1
             return result
 
         return call
 
-    def _array(self, given: Any) -> tuple[int, np.ndarray[Any, Any], np.ndarray[Any, Any]]:
-        """Returns the number of an array, its units as they are now, and as they were after the latest call."""
+    def _array(self, given: Any) -> tuple[Shadow, np.ndarray[Any, Any]]:
+        """Returns the shadow of an array, and its units as they are now."""
         raw = np.frombuffer(given, np.uint8) if len(given) else np.zeros(0, np.uint8)
         unit = next(size for size in (8, 4, 1) if len(raw) % size == 0)
         now = raw.view(f"<u{unit}")
         key = (raw.ctypes.data if len(raw) else 0, len(raw))
         if key not in self._known:
-            self._known[key] = len(self._known), np.zeros_like(now)
+            self._known[key] = Shadow(len(self._known), bytes(len(raw)))
             self._held += len(raw)
-            self._file.write(struct.pack("<cIIB", b"A", self._known[key][0], len(raw), unit))
-        number, shadow = self._known[key]
-        return number, now, shadow
+            self._file.write(struct.pack("<cIIB", b"A", self._known[key].number, len(raw), unit))
+        return self._known[key], now
 
 
-def _changes(array: int, now: np.ndarray[Any, Any], shadow: np.ndarray[Any, Any]) -> bytes:
+def _changes(shadow: Shadow, now: np.ndarray[Any, Any]) -> bytes:
     """Returns the packed changes of an array since the last time."""
-    at = np.flatnonzero(now != shadow)
-    if not len(at):
+    data = now.tobytes()
+    if data == shadow.data:
         return b""
-    shadow[at] = now[at]
-    return struct.pack("<II", array, len(at)) + at.astype("<u4").tobytes() + now[at].tobytes()
+    at = np.flatnonzero(now != np.frombuffer(shadow.data, now.dtype))
+    shadow.data = data
+    return struct.pack("<II", shadow.number, len(at)) + at.astype("<u4").tobytes() + now[at].tobytes()
