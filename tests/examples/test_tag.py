@@ -20,9 +20,15 @@ TYPICAL = Link(0.05, 0.01, 0.01)
 CAUSES = {"late input", "other entity", "server act", "unknown edit", "missing terrain"}
 
 
+class Brief(Tag):
+    """Tag with short rounds, so that one ends within a short match."""
+
+    round_s = 40.0
+
+
 def played(count: int, seconds: float, seed: int, path: Link) -> tuple[Match, list[Player], io.BytesIO]:
     """Plays a recorded game with `count` bots. Returns the match, its players and the recording."""
-    match = Match(load_scene(Tag.scene), seed, rules=Tag())
+    match = Match(load_scene(Tag.scene), seed, rules=Brief())
     recording = io.BytesIO()
     match.game.world.record(recording)
     players = [match.join(bot(TagPlayer()), path) for _ in range(count)]
@@ -36,7 +42,7 @@ def said(match: Match) -> dict[int, Any]:
     return {entity: match.game.api.kept.attributes.get(entity) for entity in match.game.api.entities()}
 
 
-@pytest.mark.parametrize(("count", "seconds"), [(6, 15), *long((20, 130))], ids=["short", "long"])
+@pytest.mark.parametrize(("count", "seconds"), [(6, 15), *long((20, 50))], ids=["short", "long"])
 def test_bots_play_tag_and_a_recording_gives_the_same_scores(count: int, seconds: float) -> None:
     match, players, file = played(count, seconds, 21, TYPICAL)
     game = match.game
