@@ -275,8 +275,8 @@ def test_a_run_that_fails_leaves_the_others(
 
 @needs_linux
 @pytest.mark.slow
+@pytest.mark.longest
 @pytest.mark.e2e
-@pytest.mark.alone
 def test_both_play_over_the_same_line(tmp_path: Path) -> None:
     try:
         install.ensure()

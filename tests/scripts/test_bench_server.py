@@ -58,7 +58,6 @@ def test_every_player_has_a_spawn_and_a_segment_as_many_as_it_should(players: in
 @needs_linux
 @pytest.mark.slow
 @pytest.mark.e2e
-@pytest.mark.alone
 @pytest.mark.parametrize("kind", ["echo", bench.ECHO_PICOWS, "game", "profile"])
 def test_each_kind_of_server_holds_a_few_players(kind: str) -> None:
     more = ("1000",) if kind.startswith("echo") else ()
@@ -79,7 +78,6 @@ def test_each_kind_of_server_holds_a_few_players(kind: str) -> None:
 @needs_linux
 @pytest.mark.slow
 @pytest.mark.e2e
-@pytest.mark.alone
 @pytest.mark.parametrize("kind", jitter.VARIANTS)
 def test_each_variant_of_the_product_has_its_settings(kind: str) -> None:
     uvloop = pytest.importorskip("uvloop")
