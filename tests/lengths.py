@@ -1,11 +1,12 @@
 """The long forms of tests, which `scripts/test --long` runs."""
 
-from collections.abc import Collection, Iterable
-from typing import Any
+from collections.abc import Collection, Iterable, Sequence
+from typing import Any, TypeVar
 
 import pytest
 from hypothesis import settings
 
+T = TypeVar("T")
 VARIANTS = 4
 """Number of variants of one test in a short run, besides those that are long ones by themselves. A long run has all."""
 EXAMPLES = 100
@@ -35,3 +36,17 @@ def sampled(count: int) -> set[int]:
     if count <= VARIANTS:
         return set(range(count))
     return {round(k * (count - 1) / (VARIANTS - 1)) for k in range(VARIANTS)}
+
+
+def spread(longest: Sequence[T], rest: Sequence[T], workers: int) -> list[T]:
+    """Returns all tests in an order in which every worker has its share of the longest ones early.
+
+    pytest-xdist deals one run of successive tests to each worker. A long test that comes last would leave the other
+    workers idle. The longest ones come a little behind the first test of a worker, because the runs need not begin
+    where these do.
+    """
+    order: list[T] = []
+    for worker in range(workers):
+        share = rest[worker * len(rest) // workers : (worker + 1) * len(rest) // workers]
+        order += [*share[: len(longest)], *longest[worker::workers], *share[len(longest) :]]
+    return order

@@ -163,6 +163,7 @@ def entries(url: str) -> list[dict[str, Any]]:
         return list(json.load(answer)["worlds"])
 
 
+@pytest.mark.longest
 @pytest.mark.parametrize(("clients", "at_once", "kills", "data"), long((1000, 200, 0, False), (200, 60, 3, True)))
 async def test_nobody_is_lost_in_matchmaking(
     clients: int, at_once: int, kills: int, data: bool, tmp_path: Path

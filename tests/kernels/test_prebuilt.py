@@ -78,6 +78,7 @@ def test_a_library_needs_python_or_a_memory_and_nothing_else(
 
 
 @pytest.mark.slow
+@pytest.mark.longest
 @pytest.mark.skipif(not kernels.numba_installed(), reason="Numba is not installed")
 def test_a_second_build_gives_the_same_bytes(tmp_path: Path) -> None:
     """The bytes are compared before the linker runs. `scripts/kernels --check` includes the linker, which the tests'

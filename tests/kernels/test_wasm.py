@@ -116,6 +116,7 @@ def test_thousands_of_ticks(scene: str, tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.longest
 def test_golden_runs_hard_cases_and_properties(tmp_path: Path) -> None:
     path = tmp_path / "tape"
     command = (sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "-p", "tests.kernels.taping")

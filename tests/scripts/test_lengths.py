@@ -4,7 +4,7 @@ from itertools import pairwise
 
 import pytest
 
-from tests.lengths import VARIANTS, sampled
+from tests.lengths import VARIANTS, sampled, spread
 
 
 @pytest.mark.parametrize("count", [1, 2, VARIANTS])
@@ -18,3 +18,16 @@ def test_a_test_with_many_keeps_the_first_the_last_and_some_between(count: int) 
     assert (len(kept), kept[0], kept[-1]) == (VARIANTS, 0, count - 1)
     gaps = [b - a for a, b in pairwise(kept)]
     assert max(gaps) - min(gaps) <= 1
+
+
+@pytest.mark.parametrize("workers", [1, 2, 3, 4])
+@pytest.mark.parametrize("count", [0, 1, 5, 7])
+def test_every_worker_begins_with_its_share_of_the_longest(count: int, workers: int) -> None:
+    longest, rest = [f"long {k}" for k in range(count)], [f"short {k}" for k in range(1000)]
+    order = spread(longest, rest, workers)
+    assert sorted(order) == sorted([*longest, *rest])
+    assert [test for test in order if test in rest] == rest
+    dealt = [order[k * len(order) // workers : (k + 1) * len(order) // workers] for k in range(workers)]
+    for number, tests in enumerate(dealt):
+        assert [test for test in tests if test in longest] == longest[number::workers]
+        assert all(tests.index(test) < 3 * count for test in tests if test in longest)

@@ -18,6 +18,7 @@ COMPILES = (shutil.which("cc") or shutil.which("gcc")) and Path(sysconfig.get_pa
 
 pytestmark = [
     pytest.mark.slow,
+    pytest.mark.longest,
     pytest.mark.skipif(not COMPILES, reason="there is no C compiler, or none of Python's headers"),
 ]
 

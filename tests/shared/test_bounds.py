@@ -27,6 +27,7 @@ WORK = (
 )
 pytestmark = [
     pytest.mark.slow,
+    pytest.mark.longest,
     pytest.mark.skipif(not kernels.numba_installed(), reason="Numba is not installed"),
 ]
 
