@@ -17,7 +17,7 @@ def settled(match: Match, *players: Player) -> None:
     match.run_until(lambda: all(player.core.state == "playing" for player in players), 60)
 
 
-@pytest.mark.parametrize("seconds", [20, *long(120)])
+@pytest.mark.parametrize("seconds", [20, *long(60)])
 @pytest.mark.parametrize("preset", long_but(["lan", "typical", "dip"], PRESETS))
 def test_a_lone_player_is_only_ever_corrected_after_a_late_input(preset: str, seconds: float) -> None:
     match = Match(load_scene("hills"), 11)
@@ -32,7 +32,7 @@ def test_a_lone_player_is_only_ever_corrected_after_a_late_input(preset: str, se
     assert player.closed is None
 
 
-@pytest.mark.parametrize("seconds", [25, *long(120)])
+@pytest.mark.parametrize("seconds", [25, *long(60)])
 @pytest.mark.parametrize("preset", long_but(["lan", "outage"], PRESETS))
 def test_held_keys_survive_every_stall(preset: str, seconds: float) -> None:
     match = Match(load_scene("arena"), 12)
@@ -69,7 +69,7 @@ def ages(preset: str, seconds: float) -> list[float]:
     [
         ("regional", 8),
         *long(("outage", 8)),
-        *long(*((preset, 60) for preset in ("lan", "regional", "typical", "far", "wifi", "outage"))),
+        *long(*((preset, 30) for preset in ("lan", "regional", "typical", "far", "wifi", "outage"))),
     ],
 )
 def test_snapshots_are_as_fresh_as_the_link_delivers(
@@ -104,7 +104,7 @@ def test_in_a_dip_snapshots_stay_fresh_and_are_normal_again_at_once(seconds: flo
     assert max(found) <= 500
 
 
-@pytest.mark.parametrize("seconds", [20, *long(30, 120)])
+@pytest.mark.parametrize("seconds", [20, *long(30, 60)])
 def test_a_thin_link_stays_connected_and_sees_fresh_snapshots(seconds: float) -> None:
     found = sorted(ages("thin", seconds))
     assert found[len(found) // 2] <= 250
@@ -131,7 +131,7 @@ def test_on_a_thin_link_no_segment_is_starved(seconds: float) -> None:
     assert 4 < max(waits) <= 32
 
 
-@pytest.mark.parametrize("seconds", [50, *long(300)])
+@pytest.mark.parametrize("seconds", [50, *long(150)])
 def test_corrections_have_their_fields_distance_and_cause(seconds: float) -> None:
     match = Match(load_scene("hills"), 14)
     player = match.join(wander, PRESETS["far"])
