@@ -135,8 +135,8 @@ def storm(server: ServerProcess, attack: dict[str, Any], tick_ms: float) -> None
 def test_honest_players_are_served_during_an_attack_and_nothing_is_left_of_it(
     attack: dict[str, Any], gateway: str
 ) -> None:
-    flags = ("--gateway", gateway) if gateway else ()
-    flags += ("--resume-s", "2", "--handshake-s", "2", "--hello-s", "2")  # they end within the window, too
+    flags = ["--gateway", gateway] if gateway else []
+    flags += ["--resume-s", "2", "--handshake-s", "2", "--hello-s", "2"]  # they end within a window, too
     with running("--port", "0", "--scene", "flat", "--tick-rate", "32", *flags) as server:
         storm(server, attack, 1000 / 32)
         assert server.end(15) == 0
