@@ -12,14 +12,14 @@ import socket
 import time
 from collections.abc import Callable, Iterable
 from types import TracebackType
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any
 
 from client_sdk import addresses
 from client_sdk.base import BaseClient, set_link
 from client_sdk.events import Event
 from client_sdk.pending_events import PendingEvents
 from client_sdk.port import READ_BYTES
-from client_sdk.transports.common import CLOSE_S, UNSENT_MAX, ConnectError
+from client_sdk.transports.common import CLOSE_S, TIMEOUT_S, UNSENT_MAX, ConnectError
 from client_sdk.transports.listing import WorldEntry, list_worlds
 from client_sdk.view import View
 from shared.checks import duration
@@ -29,13 +29,11 @@ if TYPE_CHECKING:
 
     from client_sdk.core import Core
     from client_sdk.netsim.links import Link
-    from client_sdk.transports.connection import Connection
+    from client_sdk.transports.async_streams import SecondStream
     from shared.behaviours import Behaviour
     from shared.scene import Scene
 
 
-TIMEOUT_S = 5.0
-"""Time that a handshake may take, in seconds."""
 NUMERIC = socket.NI_NUMERICHOST | socket.NI_NUMERICSERV
 """Flags for the text of an IP address, with the scope of a link-local one."""
 WAIT_S_MIN = 0.001
@@ -72,7 +70,9 @@ class AsyncClient(BaseClient):
         self._connection = Connection(url, core)
         self._before_update = before_update
         self._loop = asyncio.get_running_loop()
-        self._host = ""
+        self._hosts: dict[str, str] = {}
+        """IP addresses of the servers, by name: each is looked up once."""
+        self._second: SecondStream | None = None
         self._transport: asyncio.Transport | None = None
         self._timer: asyncio.TimerHandle | None = None
         self._due = 0.0
@@ -209,7 +209,9 @@ class AsyncClient(BaseClient):
 
     def _made(self, transport: asyncio.Transport) -> None:
         self._transport = transport
-        self._host = self._host or socket.getnameinfo(transport.get_extra_info("peername"), NUMERIC)[0]
+        uri = self._connection.uri
+        if uri.host not in self._hosts:
+            self._hosts[uri.host] = socket.getnameinfo(transport.get_extra_info("peername"), NUMERIC)[0]
         transport.set_write_buffer_limits(UNSENT_MAX)
         if self.core.port.appetite < READ_BYTES:  # with a slow simulated link, unread bytes wait at the server
             transport.get_extra_info("socket").setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 0)
@@ -236,13 +238,15 @@ class AsyncClient(BaseClient):
     async def _dial(self, timeout: float) -> None:
         """Connects, and waits at most `timeout` seconds until the server has answered.
 
-        All connections but the first go to the IP address of the first one.
+        All connections to one server go to the IP address of the first one.
         """
+        from client_sdk.transports.async_streams import Stream
+
         connection, uri = self._connection, self._connection.uri
         async with asyncio.timeout(timeout):
             await self._loop.create_connection(
-                lambda: _Stream(self, connection),
-                self._host or uri.host,
+                lambda: Stream(self, connection),
+                self._hosts.get(uri.host, uri.host),
                 uri.port,
                 ssl=(self._tls or True) if uri.secure else None,
                 server_hostname=uri.host if uri.secure else None,
@@ -302,6 +306,7 @@ class AsyncClient(BaseClient):
         if self._transport is not None:
             self._connection.look(now)
         core.port.update(now)
+        self._change(now)
         self._read_on()
         if core.dials(now):
             self._drop()
@@ -309,6 +314,32 @@ class AsyncClient(BaseClient):
             self._redialing = self._loop.create_task(self._redial())
         self._pump(now)
         self._schedule(now)
+
+    def _change(self, now: float) -> None:
+        """Opens a second connection, and makes it the first or closes it, as the core says."""
+        core, second = self.core, self._second
+        if second is None and core.second is not None:
+            from client_sdk.transports.async_streams import SecondStream
+            from client_sdk.transports.connection import Connection
+
+            connection = Connection(self._connection.address, core, core.second)
+            host = self._hosts.get(connection.uri.host, connection.uri.host)
+            second = self._second = SecondStream(self, connection, host, self._tls, self._loop)
+        if second is None:
+            return
+        second.pump(now)
+        if core.second is second.connection.port:
+            return
+        self._second = None
+        if not second.connection.complete:
+            second.drop()
+            return
+        if self._transport is not None:
+            self._transport.abort()
+        second.connection.take_place()
+        self._connection, self._transport = second.connection, second.transport
+        self._gone = self._loop.create_future()
+        self._pump(now)
 
     def _schedule(self, now: float) -> None:
         """Sets the timer for the next update."""
@@ -337,6 +368,8 @@ class AsyncClient(BaseClient):
                 self._set_timer(CLOSE_S, self._drop)
         if connection.done(now):
             self._drop()
+        if self._second is not None:
+            self._second.pump(now)
 
     def _set_timer(self, seconds: float, call: Callable[[], None]) -> None:
         if self._timer is not None:
@@ -349,29 +382,6 @@ class AsyncClient(BaseClient):
         if self._transport is not None:
             self._transport.abort()
             self._transport = None
-
-
-class _Stream(asyncio.Protocol):
-    """The asyncio protocol of one connection of a client. It ignores calls after the client has reconnected."""
-
-    def __init__(self, client: AsyncClient, connection: "Connection") -> None:
-        self._client, self._connection = client, connection
-
-    @property
-    def _current(self) -> bool:
-        return self._client._connection is self._connection
-
-    def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        self._client._made(cast("asyncio.Transport", transport))  # a transport of uvloop is not a subclass of it
-
-    def data_received(self, data: bytes) -> None:
-        if self._current:
-            self._client._received(data)
-
-    def connection_lost(self, error: Exception | None) -> None:
-        if self._current:
-            self._client._ended(error)
-
-    def pause_writing(self) -> None:
-        if self._current:
-            self._client._stalled()
+        if self._second is not None and self.core.second is None:
+            self._second.drop()
+            self._second = None

@@ -15,19 +15,16 @@ A `Go` of the server leads to another world: the client joins it from the start,
 """
 
 import math
-from collections import Counter
 from collections.abc import Iterable
 from typing import Any
 
 from client_sdk.advice import advised
+from client_sdk.changing import TAKEN_OVER_S, Changing
 from client_sdk.events import Disconnected, Joined, Left, Resumed, SegmentLoaded
-from client_sdk.handover import Handover
-from client_sdk.pending_events import GameEvents
-from client_sdk.port import READ_BYTES, Port
-from client_sdk.program_side import ProgramSide
+from client_sdk.port import READ_BYTES
 from client_sdk.reconnect import Reconnect
 from client_sdk.replica import Replica
-from client_sdk.travel import Travel, progress
+from client_sdk.travel import progress
 from shared import fields, messages
 from shared.behaviours import Behaviour, BehaviourError
 from shared.checks import duration, text
@@ -36,14 +33,11 @@ from shared.scene import Scene
 
 COME_AGAIN = (messages.TOO_SLOW, messages.GOING_AWAY, messages.NO_HELLO)
 """Close codes after which a client reconnects although the server did not ask for it: the connection was at fault."""
-TAKEN_OVER_S = 5.0
-"""Seconds after the loss of a second connection in which "taken over" means that it had taken over, and not another
-program."""
 NAME_MAX = 1 << 16
 """Longest name that a program may pass, in characters; only the first `fields.NAME_MAX` characters are sent."""
 
 
-class Core(ProgramSide):
+class Core(Changing):
     """The client as a state machine.
 
     Args:
@@ -73,26 +67,16 @@ class Core(ProgramSide):
     ) -> None:
         super().__init__(scene, behaviours, compiled=compiled, neighbours=neighbours)
         self.name = text(name, "name", NAME_MAX, shortest=0)
-        self.port: Port = self
-        """The object that a transport talks to; `client_sdk.netsim.linked` puts a simulated link in front."""
         self.close_request: tuple[int, str] | None = None
         """Close code and reason with which the transport has to close the connection now; None: it must not."""
         self.reconnect = Reconnect(duration(patience_s, "patience_s", endless=True))
-        self.travel = Travel()
-        self.handover: Handover | None = None
-        """The second connection, while the client changes to another process of the world; None: it does not."""
         self.shared: dict[str, Any] = {}
         """The values that the rules of the game share with all clients, by name."""
         self.private: dict[str, Any] = {}
         """The values that the rules of the game share with this player only, by name."""
-        self._twice: Counter[messages.Message] = Counter()
-        """Game events that have come over the connection before a hand-over, and may come over this one, too."""
-        self._beside_lost = -math.inf
-        """Local time at which the latest second connection was lost, in seconds."""
         self._token = text(token, "token", fields.TOKEN_MAX, shortest=0)
         self._resume = b""
         self._scene_asked = scene
-        self._game_events = GameEvents(self._events)
 
     @property
     def appetite(self) -> int:
@@ -146,42 +130,6 @@ class Core(ProgramSide):
         else:
             self._end(Left(code, reason))
 
-    def begin_handover(self) -> Handover | None:
-        """Begins a change to another process of the world. Returns the second connection; None: it is not possible now.
-
-        The transport passes on its messages by `receive_beside` and sends `Handover.outgoing`. When `handover` is None
-        again, it is over. If it is `complete`, the second connection has taken the place of the first, which the
-        transport closes without a word.
-        """
-        if self.state != "playing" or self.handover is not None or self.scene is None:
-            return None
-        name = self.name[: fields.NAME_MAX]
-        hello = messages.Hello(messages.VERSION, self.scene.digests, name, self._token, self._resume)
-        self.handover = Handover(self._worlds, hello)
-        return self.handover
-
-    def receive_beside(self, data: bytes, now: float) -> None:
-        """Takes one message of the second connection. A malformed message ends the hand-over."""
-        handover = self.handover
-        if handover is None:
-            return
-        self.stats.bytes_down += len(data)
-        try:
-            handover.receive(decode_from_server(data), now)
-        except (ProtocolError, BehaviourError):
-            handover.failed = True
-        if handover.failed:
-            self.lost_beside(now)
-        elif handover.complete:
-            self._change_over(handover, now)
-
-    def lost_beside(self, now: float) -> None:
-        """Takes the end of the second connection. The client goes on over the first, if there is one."""
-        handover, self.handover = self.handover, None
-        self._beside_lost = now
-        if handover is not None and handover.alone:
-            self._cut_off(Left(messages.TAKEN_OVER, "the second connection was lost", 0.0), now)
-
     def close(self) -> None:
         """Leaves the game: sends Bye and asks the transport to close the connection."""
         if self.state != "closed":
@@ -195,13 +143,14 @@ class Core(ProgramSide):
     def update(self, now: float) -> None:
         """Starts the play once the world is complete, predicts every tick that is due, and sends pings that are due."""
         worlds = self._worlds
+        if self.handover is not None:
+            self._update_second(now)
         if worlds.plain_for_now:
             worlds.speed_up()
         if worlds.play and self.state != "closed":
             for message in worlds.play.follow(now, online=self.state == "playing"):
                 self._send(message)
-                if self.handover is not None:
-                    self.handover.copy(message)
+                self._copy(message)
         if self._open and worlds.ping_due(now):
             self._send(messages.Ping(now, self.stats.corrections))
         if self.state in ("joining", "reconnecting") and worlds.filled and worlds.filled.complete:
@@ -209,8 +158,7 @@ class Core(ProgramSide):
         if worlds.play and self.state != "closed":
             for message in worlds.play.update(now, self.controls, online=self.state == "playing"):
                 self._send(message)
-                if self.handover is not None:
-                    self.handover.copy(message)
+                self._copy(message)
         else:
             self.controls.forget()
 
@@ -220,6 +168,8 @@ class Core(ProgramSide):
         due = worlds.connection_clock.next_ping if self._open else self.reconnect.retry_at
         if worlds.play:
             due = min(due, worlds.play.next_tick(now))
+        if self.second is not None:
+            due = min(due, self.second.next_update(now))
         return max(due, now)  # inf: nothing to do until a message arrives
 
     # -- what goes out -------------------------------------------------------------------------------------
@@ -262,24 +212,15 @@ class Core(ProgramSide):
                 self._bye(message, now)
             case messages.Go():
                 self._go(message, now)
+            case messages.Edges():
+                self.travel.edges = message.addresses
+                self._game_events.apart = True
+            case messages.HandOver():
+                self._begin_handover(message, now)
             case messages.Waiting() if self.state == "joining" and not self._worlds.filled:
                 self._events.append(progress(message))
             case _:
                 raise ProtocolError(f"unexpected {type(message).__name__} message from a server")
-
-    def _happened(self, message: messages.Happened | messages.Announce, *, announced: bool) -> None:
-        """Takes a game event. One that came over the connection before a hand-over, too, is only counted."""
-        if self.handover is not None:
-            self.handover.got[message] += 1
-        if self._twice[message]:
-            self._twice[message] -= 1
-            announced = True
-        self._game_events.happened(message, hold=self._joins, announced=announced)
-
-    @property
-    def _joins(self) -> bool:
-        """Whether the client waits for `Joined` or `Resumed` after a welcome."""
-        return self._worlds.filled is not None and self.state != "playing"
 
     @property
     def _comes_back(self) -> bool:
@@ -322,16 +263,6 @@ class Core(ProgramSide):
         for inputs in play.unreceived() if same else ():
             self._send(inputs)
 
-    def _change_over(self, handover: Handover, now: float) -> None:
-        """Goes on over the second connection."""
-        assert handover.replica is not None
-        self.handover = None
-        self._worlds.change_over(handover.replica)
-        self._out[:] = self._commands.again()
-        self._twice = handover.got
-        for message in handover.waiting:
-            self._take(message, now)
-
     def _bye(self, bye: messages.Bye, now: float) -> None:
         if self.handover is not None and bye.code == messages.TAKEN_OVER:
             self.handover.alone = True
@@ -342,7 +273,7 @@ class Core(ProgramSide):
         left = Left(bye.code, advised(bye.code, bye.reason), bye.wait)
         if self._comes_back and (bye.wait >= 0 or bye.code in COME_AGAIN):
             self._cut_off(left, now)
-        elif self.state == "joining" and not self._worlds.filled and self.travel.again(bye):
+        elif self.state == "joining" and not self._worlds.filled and self.travel.again(bye, self.reconnect.spread):
             self._depart()
         else:
             self._end(left)
@@ -371,8 +302,9 @@ class Core(ProgramSide):
 
     def _cut_off(self, left: Left, now: float) -> None:
         """Starts to reconnect after a lost connection, or ends if the client may not reconnect."""
-        self._open, self._worlds.filled, self.handover = False, None, None
+        self._open, self._worlds.filled, self.handover, self.second = False, None, None, None
         self._out.clear()
+        self.travel.elsewhere(self.reconnect.spread)
         wait = max(left.wait_s, 0.0)
         if not self._resume or not self.reconnect.lost(now, wait):
             self._end(left)
@@ -390,7 +322,7 @@ class Core(ProgramSide):
     def _end(self, left: Left) -> None:
         if self.state != "closed":
             self.state = "closed"
-            self._open = False
+            self._open, self.handover, self.second = False, None, None
             if self._worlds.play:
                 self._game_events.release()
             self._events.append(left)

@@ -63,6 +63,17 @@ class Moved:
 
 
 @dataclass(frozen=True)
+class HandedOver:
+    """The client goes on at another server of the same world, `server`, because the server before asked for it.
+
+    Nothing else changes: entity, prediction and view go on without a pause. `reason` is the text of the server.
+    """
+
+    server: str
+    reason: str
+
+
+@dataclass(frozen=True)
 class Disconnected:
     """The connection is lost; the client tries to reconnect in `wait_s` seconds. One event per attempt.
 
@@ -180,7 +191,10 @@ class EventsDropped:
 
     The server drops game events (`Happened`) if more than 1,024 wait for a slow or lost connection. The client drops
     events if the program leaves more than 10,000 of them; then other events may be among them. `Joined`, `Matched`,
-    `Moved`, `Disconnected`, `Resumed` and `Left` are never dropped.
+    `Moved`, `HandedOver`, `Disconnected`, `Resumed` and `Left` are never dropped.
+
+    `count` is 0 if the client cannot know the number: announcements may be missing after a lost connection to a world
+    that several servers share.
     """
 
     count: int
@@ -229,6 +243,7 @@ Event = (
     | Waiting
     | Matched
     | Moved
+    | HandedOver
     | Disconnected
     | Resumed
     | Left

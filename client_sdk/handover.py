@@ -1,20 +1,25 @@
-"""A hand-over: the client changes to another process of the same world without a pause.
+"""A hand-over: the client changes to another server of the same world without a pause.
 
-Theory of operation. The client opens a second connection beside the first. Its messages fill a second replica, while
-the client plays on over the first connection. Once the replica is complete, the client sends its inputs over both, and
-learns from both how early they have to be. The server takes them from the second as soon as they arrive there in time,
-and reports input statuses over it from that tick on. The first such snapshot ends the hand-over: the client goes on in
-the second replica, and closes the first connection. Messages of the second connection that are for the program wait
-until then.
+Theory of operation. A server asks for it by `HandOver`. The client opens a second connection beside the first. Its
+messages fill a second replica, while the client plays on over the first connection. Once the replica is complete, the
+client sends its inputs over both, and learns from both how early they have to be. The server takes them from the second
+as soon as they arrive there in time, and reports input statuses over it from that tick on. The first such snapshot ends
+the hand-over: the client goes on in the second replica, and closes the first connection. Messages of the second
+connection that are for the program wait until then.
 """
 
+import math
 from collections import Counter
-from typing import Any
+from collections.abc import Callable
+from typing import Any, Protocol
 
 from client_sdk.replica import Replica
 from client_sdk.worlds import Worlds
 from shared import messages
-from shared.messages import Inputs, Message, ProtocolError, Snapshot, Terrain, Welcome, encode
+from shared.messages import Beside, HandOver, Inputs, Message, ProtocolError, Snapshot, Terrain, Welcome, encode
+
+HANDOVER_S = 15.0
+"""Time after which a client gives up a hand-over, in seconds."""
 
 
 class Handover:
@@ -22,14 +27,21 @@ class Handover:
 
     Args:
         worlds: the worlds of the client, which plays.
-        hello: the first message over the second connection.
+        asked: the server's message.
+        first: the first message over the second connection.
+        now: local time in seconds.
     """
 
-    def __init__(self, worlds: Worlds, hello: messages.Hello) -> None:
+    def __init__(self, worlds: Worlds, asked: HandOver, first: Beside, now: float) -> None:
         self._worlds = worlds
-        self._out: list[bytes] = [encode(hello)]
+        self._out: list[bytes] = [encode(first)]
+        self.address, self.reason = asked
+        self.until = now + HANDOVER_S
+        """Local time at which the client gives up, in seconds."""
         self.replica: Replica | None = None
         """The replica that the second connection fills."""
+        self._copies = False
+        """Whether inputs and commands are sent over the second connection, too."""
         self.failed = False
         """Whether the second connection is of no use."""
         self.waiting: list[Message] = []
@@ -73,15 +85,103 @@ class Handover:
             case _:
                 self.waiting.append(message)
 
-    def copy(self, message: Any) -> None:
-        """Sends a message of the input loop over the second connection, too, if its replica is complete."""
+    def copy(self, message: Any, commands: Callable[[], list[bytes]]) -> None:
+        """Sends a message of the input loop over the second connection, too, if its replica is complete.
+
+        Args:
+            message: the message.
+            commands: returns the commands without a result, which are sent ahead of the first message.
+        """
         if self.replica is None or not self.replica.complete:
             return
+        if not self._copies:
+            self._copies = True
+            self._out += commands()
         if isinstance(message, Inputs):
             message = message._replace(acked=self.replica.confirmed.world.tick)
         self._out.append(encode(message))
+
+    def copy_command(self, message: bytes) -> None:
+        """Sends a command over the second connection, too: a command that comes late there is carried out late."""
+        if self._copies:
+            self._out.append(message)
 
     def outgoing(self) -> list[bytes]:
         """Returns the messages to send over the second connection, and forgets them."""
         out, self._out = self._out, []
         return out
+
+
+class Changes(Protocol):
+    """The side of a core that a second connection talks to."""
+
+    handover: Handover | None
+
+    @property
+    def appetite(self) -> int:
+        """The number of bytes that the transport should read at once."""
+        ...
+
+    def receive(self, data: bytes, now: float) -> None:
+        """Takes one message of the connection."""
+
+    def lost(self, code: int, reason: str, now: float) -> None:
+        """Takes the loss of the connection."""
+
+    def outgoing(self) -> list[bytes]:
+        """Returns the messages to send, and forgets them."""
+        ...
+
+    def receive_beside(self, data: bytes, now: float) -> None:
+        """Takes one message of the second connection."""
+
+    def lost_beside(self, now: float) -> None:
+        """Takes the end of the second connection."""
+
+
+class SecondPort:
+    """The port of a second connection. Once it has taken the place of the first, it passes all on to the core.
+
+    Args:
+        core: the core.
+        handover: the hand-over.
+    """
+
+    connected = False
+    """Whether there was a connection before the port began."""
+    state = "playing"
+    """State for a simulated link."""
+
+    def __init__(self, core: Changes, handover: Handover) -> None:
+        self._core, self._handover = core, handover
+
+    @property
+    def appetite(self) -> int:
+        return self._core.appetite
+
+    def open(self, now: float) -> None:
+        pass
+
+    def receive(self, data: bytes, now: float) -> None:
+        if self._handover.complete:
+            self._core.receive(data, now)
+        elif self._core.handover is self._handover:
+            self._core.receive_beside(data, now)
+
+    def lost(self, code: int, reason: str, now: float) -> None:
+        if self._handover.complete:
+            self._core.lost(code, reason, now)
+        elif self._core.handover is self._handover:
+            self._core.lost_beside(now)
+
+    def update(self, now: float) -> None:
+        pass
+
+    def next_update(self, now: float) -> float:
+        return math.inf
+
+    def outgoing(self) -> list[bytes]:
+        return self._core.outgoing() if self._handover.complete else self._handover.outgoing()
+
+    def outstanding(self) -> int:
+        return 0

@@ -5,6 +5,7 @@ from client_sdk.events import (
     Disconnected,
     Event,
     EventsDropped,
+    HandedOver,
     Happened,
     Joined,
     Left,
@@ -20,7 +21,8 @@ NEVER, GAME, OTHER = range(3)
 """Kinds of events: never dropped, game events, and other events of the SDK."""
 KINDS = {
     Happened: GAME, Announced: GAME, EventsDropped: GAME,
-    Joined: NEVER, Matched: NEVER, Moved: NEVER, Disconnected: NEVER, Resumed: NEVER, Left: NEVER,
+    Joined: NEVER, Matched: NEVER, Moved: NEVER, HandedOver: NEVER,
+    Disconnected: NEVER, Resumed: NEVER, Left: NEVER,
 }  # fmt: skip
 """Kind of an event by its class; all others are OTHER."""
 
@@ -88,6 +90,10 @@ class GameEvents:
         self._events = events
         self._held = PendingEvents()
         """Events that arrived before `Joined` or `Resumed`, and follow it."""
+        self.apart = False
+        """Whether announcements have no numbers (`shared.messages.Edges`)."""
+        self._announces = False
+        """Whether there was an announcement without a number."""
         self._count = 0
         """Number of events that have arrived, or are known to be lost."""
 
@@ -102,7 +108,10 @@ class GameEvents:
         Raises:
             ProtocolError: its payload is malformed.
         """
-        self._count += 1
+        if self.apart and isinstance(message, messages.Announce):
+            self._announces = True
+        else:
+            self._count += 1
         if announced:
             return
         data = payloads.unpack_value(message.payload)
@@ -111,10 +120,16 @@ class GameEvents:
         else:
             self._file(Happened(message.tick, message.name, data), hold=hold)
 
-    def next(self, number: int, *, hold: bool) -> None:
-        """Takes the number of the server's next event. If events before it are missing, files an `EventsDropped`."""
-        if number > self._count:
-            self._file(EventsDropped(number - self._count), hold=hold)
+    def next(self, number: int, *, hold: bool, sure: bool = False) -> None:
+        """Takes the number of the server's next event. If events before it are missing, files an `EventsDropped`.
+
+        Args:
+            number: the number.
+            hold: whether to hold it back until `release`.
+            sure: whether no announcement can be missing.
+        """
+        if number > self._count or (self._announces and not sure):
+            self._file(EventsDropped(max(number - self._count, 0)), hold=hold)
         self._count = number
 
     def release(self) -> None:
@@ -125,7 +140,7 @@ class GameEvents:
     def restart(self) -> None:
         """Releases the events, and counts from 0 again, because the player is a new one to the server."""
         self.release()
-        self._count = 0
+        self._count, self.apart, self._announces = 0, False, False
 
     def _file(self, event: Event, *, hold: bool) -> None:
         (self._held if hold else self._events).append(event)

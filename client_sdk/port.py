@@ -1,4 +1,4 @@
-"""The side of a core that a transport talks to."""
+"""The side of a core that a transport talks to, for each of its connections."""
 
 from typing import Protocol
 

@@ -1,11 +1,12 @@
 """The way of a client from world to world on one server: where it connects next, and how often.
 
 Theory of operation. A server names another path by `Go`. The client then ends its connection (`leaving`), and connects
-to that path as a new player as soon as the end of the old connection is known. Only the path changes: the transport
-keeps host and port. A `Go` ahead of a welcome came from a lobby. If the world that a lobby named does not take the
-client, the client asks the lobby again. If a world has sent the client away and the connection breaks on the way, it
-tries the new path again, the last time without the seat. Both are bounded, and so is the number of worlds without play
-in between.
+to that path as a new player as soon as the end of the old connection is known. The transport keeps host and port,
+unless the `Go` names another server. The servers that `Edges` names have the same world: after a lost connection, the
+client tries them in turn. A `Go` ahead of a welcome came from a lobby. If the world that a lobby named does not take
+the client, the client asks the lobby again. If a world has sent the client away and the connection breaks on the way,
+it tries the new path again, the last time without the seat. Both are bounded, and so is the number of worlds without
+play in between.
 """
 
 import math
@@ -36,6 +37,11 @@ class Travel:
     def __init__(self) -> None:
         self.path = ""
         """The path and query of the next connection; empty: those of the transport's address."""
+        self.server = ""
+        """Address of the server of the next connection; empty: that of the transport's address."""
+        self.edges: list[str] = []
+        """Addresses of other servers of the same world."""
+        self._tried = 0
         self.code = ""
         """The code of the world if it is a private one."""
         self.seats: tuple[str, ...] = ()
@@ -79,10 +85,12 @@ class Travel:
                 f"Go.path = {go.path!r}: world {self._worlds} in a row with less than {PLAYED_S:g} s of play"
             )
         if lobby:
-            self._lobby = self._lobby or self.path
+            self._lobby = self._lobby or self.server + self.path
         else:
             self._lobby, self._failed = "", 0
-        self.path, self.code, self.seats = go.path, go.code, tuple(go.seats)
+        server, self.path = fields.split_place(go.path)
+        self.server, self.edges = server or self.server, []
+        self.code, self.seats = go.code, tuple(go.seats)
         self.sent = self.leaving = self._arriving = True
         self._wait_s = 0.0
         return Matched(self.world, self.code, self.seats) if lobby else Moved(self.world, go.reason)
@@ -92,19 +100,24 @@ class Travel:
         self.leaving = False
         return self._wait_s
 
-    def again(self, bye: Bye | None = None) -> bool:
+    def again(self, bye: Bye | None = None, spread: int = 0) -> bool:
         """Takes the failure of the way to a world, before its welcome. Returns whether there is a further attempt.
 
         Args:
             bye: the refusal; None: there was no connection, or it was lost.
+            spread: as for `elsewhere`.
         """
+        if bye is not None and 0 <= bye.wait <= WAIT_S_MAX and self._tried < ATTEMPTS_MAX and self.elsewhere(spread):
+            self.leaving, self._wait_s = True, bye.wait
+            return True
         wait_s = max(bye.wait if bye else 0.0, AGAIN_S * 2**self._failed)
         final = bye is not None and (bye.code in FINAL or not self._lobby)
         if not self._arriving or final or self._failed >= ATTEMPTS_MAX or wait_s > WAIT_S_MAX:
             return False
         self._failed += 1
         if self._lobby:
-            self.path, self.code, self.seats, self._arriving = self._lobby, "", (), False
+            self.server, self.path = fields.split_place(self._lobby)
+            self.code, self.seats, self._arriving = "", (), False
         elif self._failed == ATTEMPTS_MAX:  # the seat counts once, and a connection that broke off may have used it
             self.path = without_seat(self.path)
         self.leaving, self._wait_s = True, wait_s
@@ -117,7 +130,23 @@ class Travel:
 
     def plays(self, now: float) -> None:
         """Notes that play has begun."""
-        self._playing_since = now
+        self._playing_since, self._tried = now, 0
+
+    def elsewhere(self, spread: int) -> bool:
+        """Chooses the server of the next connection after a lost one. Returns whether there is another one.
+
+        These are the other servers of the world in turn, and then the one that the program has named.
+
+        Args:
+            spread: any whole number. Clients with different numbers begin with different servers.
+        """
+        edges = self.edges
+        if not edges:
+            return False
+        at = self._tried % (len(edges) + 1)
+        self.server = edges[(at + spread) % len(edges)] if at < len(edges) else ""
+        self._tried += 1
+        return True
 
 
 def without_seat(path: str) -> str:

@@ -185,7 +185,7 @@ class Worlds:
         assert self.play is not None
         old = self.play.world
         world.take_over(old)
-        world.prediction.begin(old.prediction.predicted.tick)
+        world.prediction.take_place(old.prediction)
         self.filled = self.play.world = world
         self.play.change_over()
         self._pings.clear()

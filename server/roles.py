@@ -29,8 +29,8 @@ from server.runtime.tasks import Tasks
 from server.serving import Serving
 from shared.scene import Scene
 
-LEAVE_S = 1.0
-"""Seconds that the shutdown waits for the bus."""
+LEAVE_S = 12.0
+"""Seconds that the shutdown waits until the clients have gone on at other edges."""
 
 logger = structlog.stdlib.get_logger("server")
 
@@ -71,6 +71,7 @@ class PartServer(Serving):
             self._end(str(error) or type(error).__name__, 1)
 
     async def _drain(self) -> None:
+        self.draining = True
         with contextlib.suppress(BusError, TimeoutError):
             await asyncio.wait_for(self.part.leave(), LEAVE_S)
         await super()._drain()
@@ -109,15 +110,13 @@ def run_part(
     Args:
         settings: the settings.
         scene: the scene.
-        rules: the rules; an edge does not run them.
+        rules: the rules; an edge runs nothing of them but `load_player`.
         world: a new world of the scene with its terrain.
         authenticate: returns the subject of a client's token, as for `Game`.
 
     Raises:
         SettingsError: the bus cannot be used, or the part belongs to another world than the one on the bus.
     """
-    if type(rules).load_player is not Rules.load_player:
-        raise SettingsError(f"game = {settings.game!r}: load_player works in one process only (role = 'server')")
     with asyncio.Runner(loop_factory=loop_factory()) as runner:
         return runner.run(_run(settings, scene, rules, world, authenticate))
 
@@ -144,7 +143,7 @@ async def _run(
             part: Part
             play: PlayPages | None = None
             if settings.role == "edge":
-                part = EdgePart(bus, world, authenticate=authenticate, **common)
+                part = EdgePart(bus, world, authenticate=authenticate, rules=rules, **common)
                 play = play_pages(settings, [(settings.game or scene.name, scene, rules)])
             else:
                 part = SequencerPart(

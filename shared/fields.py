@@ -8,6 +8,7 @@ import math
 import re
 from collections.abc import Callable
 from typing import Any
+from urllib.parse import urlsplit
 
 from shared.bounds import STATUSES_S, TICK_RATE_MAX, in_ticks
 
@@ -49,6 +50,10 @@ CODE_MAX = 16
 """Longest code of a private world, in characters."""
 SEATS_MAX = 64
 """Limit of the seats that one client reserves."""
+ADDRESS_MAX = 256
+"""Longest address of a server, in characters."""
+EDGES_MAX = 64
+"""Limit of the addresses in one message."""
 RESUME_BYTES = 16
 """Length of a resume token, in bytes."""
 LIST_MAX = 8 * 1024
@@ -66,6 +71,7 @@ ENTITY_MAX = (1 << 31) - 1
 """Greatest number of an entity."""
 
 _PATH = re.compile(r"[!-~]+")
+_ADDRESS = re.compile(r"wss?://(?:[A-Za-z0-9.-]+|\[[0-9A-Fa-f:.]+\])(?::[0-9]{1,5})?")
 
 Check = Callable[[Any], bool]
 """Function that returns whether a value is allowed in a field."""
@@ -126,6 +132,42 @@ def names(value: Any) -> bool:
 def path(value: Any) -> bool:
     """Returns whether a value is a path with a query, as it stands in an HTTP request."""
     return type(value) is str and len(value) <= PATH_MAX and value[:1] == "/" and _PATH.fullmatch(value) is not None
+
+
+def address(value: Any) -> bool:
+    """Returns whether a value is the address of a server, without a path: ws://HOST:PORT."""
+    return type(value) is str and len(value) <= ADDRESS_MAX and _ADDRESS.fullmatch(value) is not None and _splits(value)
+
+
+def addresses(value: Any) -> bool:
+    """Returns whether a value is a list of addresses of servers."""
+    return type(value) is list and len(value) <= EDGES_MAX and all(map(address, value))
+
+
+def place(value: Any) -> bool:
+    """Returns whether a value is a path on this server, or the address of a server with a path."""
+    if type(value) is not str or value[:1] == "/":
+        return path(value)
+    server, rest = split_place(value[: ADDRESS_MAX + PATH_MAX])
+    return address(server) and path(rest)
+
+
+def split_place(place: str) -> tuple[str, str]:
+    """Returns the address of a server, empty if it is this one, and the path of a place."""
+    if place[:1] == "/":
+        return "", place
+    scheme, _, rest = place.partition("://")
+    host, slash, path = rest.partition("/")
+    return f"{scheme}://{host}", slash + path
+
+
+def _splits(address: str) -> bool:
+    """Returns whether host and port of an address can be used."""
+    try:
+        parts = urlsplit(address)
+        return bool(parts.hostname) and parts.port != 0
+    except ValueError:
+        return False
 
 
 def paths(value: Any) -> bool:

@@ -48,9 +48,9 @@ class Private(NamedTuple):
 class Go(NamedTuple):
     """A request to connect to another path of this server, and to join the world there as a new player.
 
-    `path` is the path of a WebSocket request, with a reserved seat if there is one. `code` is the code of a private
-    world, or empty. `seats` has the paths of the seats that were reserved for the client's friends. `reason` says why
-    the client goes.
+    `path` is the path of a WebSocket request, with a reserved seat if there is one; if the world is at another server,
+    the server's address stands in front of it. `code` is the code of a private world, or empty. `seats` has the paths
+    of the seats that were reserved for the client's friends. `reason` says why the client goes.
     """
 
     path: str
@@ -63,3 +63,19 @@ class Waiting(NamedTuple):
     """Progress while a client waits for a world; the payload is a MessagePack table."""
 
     payload: bytes
+
+
+class Edges(NamedTuple):
+    """The addresses of other servers of the same world. After a lost connection, the client may go on at any of them.
+
+    On a connection where this message has come, `Announce` does not count for `NextHappened`.
+    """
+
+    addresses: list[str]
+
+
+class HandOver(NamedTuple):
+    """A request to go on at another server of the same world, over a second connection that begins with `Beside`."""
+
+    address: str
+    reason: str

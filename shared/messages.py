@@ -11,12 +11,14 @@ packed little-endian records in a MessagePack `bin`. docs/protocol.md explains e
       5 Command  number tick seen name payload             20 Pong      sent tick
       6 Resync                                             21 Happened  tick name payload
       7 Restart  tick                                      22 Shared    values
-                                                           23 NextHappened  number
+      8 Beside   version token resume                      23 NextHappened  number
                                                            24 Announce  tick entity name payload
                                                            25 Refusal   number reason
                                                            26 Private   values
                                                            27 Go        path code seats reason
                                                            28 Waiting   payload
+                                                           29 Edges     addresses
+                                                           30 HandOver  address reason
                                                             4 Bye       code reason wait
 
     Inputs.rows    n * [i8 move_x, i8 move_y, u8 buttons], for the ticks first, first + 1, ...; in a scene with aim
@@ -42,6 +44,10 @@ packed little-endian records in a MessagePack `bin`. docs/protocol.md explains e
     Refusal        a reason for the verdict FORBIDDEN; it comes ahead of the snapshot with that verdict.
     Go             asks the client to join another world: a match that was found, or where the rules send the player.
     Waiting        progress while a client waits for a world.
+    Edges          the addresses of other servers of the same world.
+    HandOver       asks the client to go on at another server of the same world, without a pause.
+    Beside         the first message of a second connection: the player goes on over it as soon as its inputs arrive
+                   there in time. `resume` is the one of the first connection.
     Ping           `corrections`: number of corrections of the client's prediction so far, for the operator.
     Pong.tick      the server time in ticks when it answered: 17.25 is a quarter of a tick after tick 17.
 
@@ -67,7 +73,9 @@ from shared.fields import (
     whole_rows,
 )
 from shared.game_messages import Announce as Announce
+from shared.game_messages import Edges as Edges
 from shared.game_messages import Go as Go
+from shared.game_messages import HandOver as HandOver
 from shared.game_messages import Happened as Happened
 from shared.game_messages import NextHappened as NextHappened
 from shared.game_messages import Private as Private
@@ -161,6 +169,14 @@ class Restart(NamedTuple):
     tick: int
 
 
+class Beside(NamedTuple):
+    """The first message of a second connection, over which the player goes on."""
+
+    version: int
+    token: str
+    resume: bytes
+
+
 class Bye(NamedTuple):
     """The last message before the connection closes, from either side.
 
@@ -239,6 +255,9 @@ Message = (
     | Private
     | Go
     | Waiting
+    | Edges
+    | HandOver
+    | Beside
 )
 KINDS: dict[int, tuple[type[Any], tuple[fields.Check, ...]]] = {
     1: (Hello, (fields.version, fields.digests, fields.name, fields.token, fields.resume)),
@@ -248,6 +267,7 @@ KINDS: dict[int, tuple[type[Any], tuple[fields.Check, ...]]] = {
     5: (Command, (fields.count, fields.tick, fields.number, fields.name, fields.payload)),
     6: (Resync, ()),
     7: (Restart, (fields.first,)),
+    8: (Beside, (fields.version, fields.token, fields.resume)),
     17: (Welcome, (fields.version, fields.tick, fields.entity, fields.table, fields.resume)),
     18: (
         Snapshot,
@@ -261,14 +281,16 @@ KINDS: dict[int, tuple[type[Any], tuple[fields.Check, ...]]] = {
     24: (Announce, (fields.tick, fields.entity, fields.name, fields.payload)),
     25: (Refusal, (fields.count, fields.reason)),
     26: (Private, (fields.names,)),
-    27: (Go, (fields.path, fields.world_code, fields.paths, fields.reason)),
+    27: (Go, (fields.place, fields.world_code, fields.paths, fields.reason)),
     28: (Waiting, (fields.payload,)),
+    29: (Edges, (fields.addresses,)),
+    30: (HandOver, (fields.address, fields.reason)),
 }
 """Message class and checks of the fields, by the number of the kind. A snapshot's last field has no check here:
 `shared.snapshot` checks the segments."""
-CLIENT_KINDS = frozenset({1, 2, 3, 4, 5, 6, 7})
+CLIENT_KINDS = frozenset({1, 2, 3, 4, 5, 6, 7, 8})
 """Kinds of messages that a client may send."""
-SERVER_KINDS = frozenset({4, 17, 18, 19, 20, 21, 22, 23, 24, 25, 26, 27, 28})
+SERVER_KINDS = frozenset({4, 17, 18, 19, 20, 21, 22, 23, 24, 25, 26, 27, 28, 29, 30})
 """Kinds of messages that a server may send."""
 _KIND_OF = {kind: number for number, (kind, _) in KINDS.items()}
 

@@ -12,8 +12,10 @@ the lab.
 """
 
 import math
+from typing import cast
 
 from client_sdk.core import Core
+from client_sdk.handover import SecondPort
 from client_sdk.netsim.links import EventQueue, Link, LinkEvents, TcpStream, named
 
 LOST = b""
@@ -34,8 +36,8 @@ class LinkedPort:
         seed: all chance on the link comes from it.
     """
 
-    def __init__(self, core: Core, seed: int = 1) -> None:
-        self.core = core
+    def __init__(self, core: Core | SecondPort, seed: int = 1) -> None:
+        self.core = cast("Core", core)
         self._seed = seed
         self._link: Link | None = None
         self._line: _Line | None = None
@@ -121,6 +123,17 @@ class LinkedPort:
     def outstanding(self) -> int:
         """Returns the bytes on the way to this client that are not acknowledged yet, as the server sees them."""
         return 0 if self._line is None else self._line.down.outstanding()
+
+    def beside(self, port: SecondPort) -> "LinkedPort":
+        """Returns the same simulated link in front of the port of a second connection."""
+        linked = LinkedPort(port, self._seed + 1000)
+        linked.link = self._link
+        return linked
+
+    def taken_by(self, core: Core) -> "LinkedPort":
+        """Makes this the port of the core's only connection, and returns it."""
+        self.core = core
+        return self
 
     def _on(self, now: float) -> "_Line | None":
         """Advances the line to `now`, and creates it if a link needs one. Returns it; None if there is no link."""

@@ -117,6 +117,17 @@ class Prediction:
         self._inputs, self._edits, self.announcements = old._inputs, old._edits, old.announcements
         self._failed = old._failed
 
+    def take_place(self, old: "Prediction") -> None:
+        """Goes on from another prediction of the same entity in the same world, without a replay.
+
+        The next comparison is with the states that `old` has predicted. An edit that `old` knows to be done may not be
+        in this confirmed world yet, so a replay now would lack it.
+        """
+        self.adopt(old)
+        self._states, self.predicted, self.begun = old._states, old.predicted, True
+        self._compared, self._refused = old._compared, old._refused
+        self.confirmed_copy.take_acted()
+
     def rows_since(self, tick: int, to: int) -> bytes:
         """Returns the own inputs after `tick`, up to `to`, packed as `Inputs.rows`.
 

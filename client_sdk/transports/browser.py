@@ -15,6 +15,8 @@ from typing import Any, Protocol
 from urllib.parse import urlsplit, urlunsplit
 
 from client_sdk.core import Core
+from client_sdk.handover import Handover
+from client_sdk.port import Port
 from client_sdk.transports.common import (
     ADDRESS_HINT,
     BROKE_OFF,
@@ -93,6 +95,7 @@ class BrowserTransport:
         first = urlunsplit(("", "", parts.path or "/", parts.query, ""))
         core.travel.path = core.travel.path or first
         self._line: _Line | None = None
+        self._second: _Line | None = None
         self._dial(clock())
 
     def poll(self, now: float) -> None:
@@ -101,19 +104,13 @@ class BrowserTransport:
         if core.dials(now):
             core.reconnect.trying()
             self._dial(now)
-        elif line is not None and not line.open and now > line.until:
-            self._ended(line, BROKE_OFF, f"{self._url}: no answer in time", now)
         elif line is not None:
-            line.read(now)
-            silent = line.silence.look(now)
-            if core.port.appetite == 0 or not line.open:
-                line.silence.heard()
-            elif silent:
-                self._ended(line, BROKE_OFF, f"nothing received for {SILENCE_S:g} s", now)
+            self._look(line, now)
         self.send(now)
 
     def send(self, now: float) -> None:
         """Sends the messages that wait in the core."""
+        self._change(now)
         core, line = self._core, self._line
         if line is None or not line.open:
             if line is not None and core.state == "closed":
@@ -133,31 +130,80 @@ class BrowserTransport:
         """Sends what waits and closes the connection. The browser finishes it."""
         self.send(self._clock())
 
-    @property
-    def _url(self) -> str:
-        return f"{self._address}{self._core.travel.path}"
-
     def _dial(self, now: float) -> None:
         if self._line is not None:
             self._dropped(self._line, CLOSED_BY_US, "")
         line = _Line(self, self._core, self._clock, now + self._timeout)
-        try:
-            line.socket = self._open_socket(self._url, line)
-        except OSError as error:
-            self._core.port.lost(BROKE_OFF, f"{self._url}: {error}", now)
-        else:
+        if self._open(line, self._core.travel.server, now):
             self._line = line
+
+    def _open(self, line: "_Line", server: str, now: float) -> bool:
+        """Opens the socket of a line. Returns whether there is one.
+
+        Args:
+            line: the line.
+            server: address of the server; empty: the one that the program has named.
+            now: local time in seconds.
+        """
+        if server and self._address.startswith("wss:"):
+            server = "wss:" + server.partition(":")[2]  # an address cannot switch TLS off
+        line.url = f"{server or self._address}{self._core.travel.path}"
+        try:
+            line.socket = self._open_socket(line.url, line)
+        except OSError as error:
+            line.port.lost(BROKE_OFF, f"{line.url}: {error}", now)
+            return False
+        return True
+
+    def _look(self, line: "_Line", now: float) -> None:
+        """Reads what waits, and gives a server up that does not answer."""
+        if not line.open and now > line.until:
+            self._ended(line, BROKE_OFF, f"{line.url}: no answer in time", now)
+            return
+        line.read(now)
+        silent = line.silence.look(now)
+        if line.port.appetite == 0 or not line.open:
+            line.silence.heard()
+        elif silent:
+            self._ended(line, BROKE_OFF, f"nothing received for {SILENCE_S:g} s", now)
+
+    def _change(self, now: float) -> None:
+        """Opens a second connection, and makes it the first or closes it, as the core says."""
+        core, second = self._core, self._second
+        handover = core.handover
+        if second is None and core.second is not None and handover is not None:
+            second = _Line(self, core, self._clock, now + self._timeout, core.second, handover)
+            if self._open(second, handover.address, now):
+                self._second = second
+        if second is None or self._second is None:
+            return
+        if core.second is second.port:
+            self._look(second, now)
+        if core.second is second.port and second.open:
+            for message in second.port.outgoing():
+                second.socket.send(message)
+        elif core.second is not second.port:
+            self._second = None
+            if second.handover is not None and second.handover.complete:
+                if self._line is not None:
+                    self._dropped(self._line, CLOSED_BY_US, "")
+                second.second, self._line = None, second
+            else:
+                self._dropped(second, CLOSED_BY_US, "")
 
     def _ended(self, line: "_Line", code: int, reason: str, now: float) -> None:
         """Takes the end of a connection, which the core is notified of."""
-        if line is self._line:
+        if line in (self._line, self._second):
+            port = line.port
             self._dropped(line, code, reason)
-            self._core.port.lost(code, reason, now)
+            port.lost(code, reason, now)
 
     def _dropped(self, line: "_Line", code: int, reason: str) -> None:
         """Closes a socket and ignores it from then on."""
         if line is self._line:
             self._line = None
+        if line is self._second:
+            self._second = None
         line.over = True
         allowed = code == CLOSED_BY_US or code in OWN_CODES
         line.socket.close(code if allowed else CLOSED_BY_US, sendable(reason))
@@ -167,21 +213,36 @@ class _Line:
     """One socket and its messages."""
 
     socket: Socket
+    url: str
 
-    def __init__(self, transport: BrowserTransport, core: Core, clock: Callable[[], float], until: float) -> None:
+    def __init__(
+        self,
+        transport: BrowserTransport,
+        core: Core,
+        clock: Callable[[], float],
+        until: float,
+        second: Port | None = None,
+        handover: Handover | None = None,
+    ) -> None:
         self._transport, self._core, self._clock = transport, core, clock
+        self.second, self.handover = second, handover
         self.until = until
         """Local time at which the handshake has failed, in seconds."""
         self.open = self.over = False
         self.silence = Silence()
         self._inbox: deque[bytes] = deque()
 
+    @property
+    def port(self) -> Port:
+        """The side of the core that this connection talks to."""
+        return self._core.port if self.second is None else self.second
+
     def opened(self) -> None:
         if self.over:
             return
         now = self._clock()
         self.open = True
-        self._core.port.open(now)
+        self.port.open(now)
         self._transport.send(now)
 
     def received(self, data: bytes | str) -> None:
@@ -189,7 +250,7 @@ class _Line:
             return
         now = self._clock()
         if isinstance(data, str):
-            url = self._transport._url
+            url = self.url
             self._transport._ended(self, TEXT, f"{url} is not a Sovereign Netcode server: it sends text", now)
             return
         self.silence.heard()
@@ -202,16 +263,16 @@ class _Line:
             return
         now = self._clock()
         while self._inbox and not self.over:
-            self._core.port.receive(self._inbox.popleft(), now)
+            self.port.receive(self._inbox.popleft(), now)
         if not self.open:
-            url = self._transport._url
+            url = self.url
             reason = f"{url}: no connection; is the address right, is a server there, and does it allow this page?"
         self._transport._ended(self, code, reason or "the connection broke off", now)
 
     def read(self, now: float) -> None:
         """Passes on the messages that the core wants now."""
-        while self._inbox and not self.over and self._core.port.appetite:
-            self._core.port.receive(self._inbox.popleft(), now)
+        while self._inbox and not self.over and self.port.appetite:
+            self.port.receive(self._inbox.popleft(), now)
 
 
 def checked_address(url: object) -> str:

@@ -11,6 +11,8 @@ minutes to report a server that is gone."""
 LOOK_S = 1.0
 """Longest time between two looks that counts as silence, in seconds: a program that was busy or asleep could not
 receive anything."""
+TIMEOUT_S = 5.0
+"""Time that a handshake may take, in seconds."""
 CLOSE_S = 2.0
 """Time that a server gets to finish the closing handshake, in seconds; then the client closes the stream anyway."""
 REASON_BYTES_MAX = 123

@@ -22,6 +22,7 @@ from websockets.uri import WebSocketURI, parse_uri
 
 from client_sdk.advice import TLS_ALERT, untrusted
 from client_sdk.core import Core
+from client_sdk.port import Port
 from client_sdk.transports.common import ADDRESS_HINT, CLOSE_S, SILENCE_S, UNSENT_MAX, ConnectError, Silence, sendable
 from shared.checks import shown
 from shared.fields import MESSAGE_MAX, REASON_MAX
@@ -32,27 +33,35 @@ REFUSALS = (400, 403, 404, 409, 429, 503)
 
 
 class Connection:
-    """One WebSocket connection of a core, to the path that the core names.
+    """One WebSocket connection of a core, to the server and the path that the core names.
 
     Args:
         url: address of the server, like ws://host:8765. Its path is the first one of the core.
         core: the state machine whose messages are sent and received.
+        second: the port of the core's second connection, if this is that one.
 
     Raises:
         ConnectError: `url` is not the address of a server.
     """
 
-    def __init__(self, url: str, core: Core) -> None:
+    def __init__(self, url: str, core: Core, second: Port | None = None) -> None:
         self.address = url
         """The address that the program gave; the next connection begins with it."""
         self.uri = parsed(url)
         core.travel.path = core.travel.path or self.uri.resource_name
+        server = core.handover.address if second is not None and core.handover is not None else core.travel.server
+        if server:
+            parts = urlsplit(server)
+            scheme = "wss" if self.uri.secure else parts.scheme  # an address cannot switch TLS off
+            url = urlunsplit(urlsplit(url)._replace(scheme=scheme, netloc=parts.netloc))
+            self.uri = parsed(url)
         if self.uri.resource_name != core.travel.path:
             path, _, query = core.travel.path.partition("?")
             self.uri = replace(self.uri, path=path, query=query)
             url = urlunsplit(urlsplit(url)._replace(path=path, query=query))
         self.url = url
         self.core = core
+        self._second, self._handover = second, core.handover if second is not None else None
         self.refused: ConnectError | None = None
         """The error with which the handshake failed; None while it may still succeed, and after it has succeeded."""
         self._protocol = ClientProtocol(self.uri, max_size=MESSAGE_MAX)
@@ -61,6 +70,25 @@ class Connection:
         self._fragments = bytearray()
         self._ending_since: float | None = None
         self._silence = Silence()
+
+    @property
+    def port(self) -> Port:
+        """The side of the core that this connection talks to."""
+        return self.core.port if self._second is None else self._second
+
+    @property
+    def second(self) -> bool:
+        """Whether this is a second connection that has not taken the place of the first."""
+        return self._second is not None
+
+    @property
+    def complete(self) -> bool:
+        """Whether this is a second connection that has to take the place of the first."""
+        return self._handover is not None and self._handover.complete
+
+    def take_place(self) -> None:
+        """Makes this the first connection of the core, because the hand-over to it is complete."""
+        self._second = None
 
     @property
     def opened(self) -> bool:
@@ -85,7 +113,7 @@ class Connection:
             if isinstance(event, Frame):
                 self._take(event, now)
             elif protocol.handshake_exc is None:
-                self.core.port.open(now)
+                self.port.open(now)
         self._check(now)
 
     def look(self, now: float) -> None:
@@ -94,7 +122,7 @@ class Connection:
         Call it at least once per second, after all bytes that have arrived were passed to `receive`.
         """
         silent = self._silence.look(now)
-        if self.core.port.appetite == 0 or not self.opened or self._ending_since is not None:
+        if self.port.appetite == 0 or not self.opened or self._ending_since is not None:
             self._silence.heard()
         elif silent:
             self.broke(f"nothing received for {SILENCE_S:g} s", now)
@@ -114,16 +142,16 @@ class Connection:
         """
         self._protocol.receive_eof()
         self.refused = self.refused or (None if self.opened else self._refusal(reason))
-        self.core.port.lost(code, reason, now)
+        self.port.lost(code, reason, now)
         self._check(now)
 
     def data_to_send(self, now: float) -> bytes:
         """Returns the bytes to write to the stream."""
         protocol = self._protocol
         if protocol.state is OPEN:
-            for message in self.core.port.outgoing():
+            for message in self.port.outgoing():
                 protocol.send_binary(message)
-            if self.core.close_request is not None:
+            if self._second is None and self.core.close_request is not None:
                 code, reason = self.core.close_request
                 protocol.send_close(code, sendable(reason))
                 self._check(now)
@@ -133,16 +161,16 @@ class Connection:
     def _take(self, frame: Frame, now: float) -> None:
         opcode = frame.opcode
         if opcode is Opcode.BINARY and frame.fin:
-            self.core.port.receive(bytes(frame.data), now)
+            self.port.receive(bytes(frame.data), now)
         elif opcode is Opcode.BINARY or (opcode is Opcode.CONT and self._fragments):
             self._fragments += frame.data
             if frame.fin:
                 message = bytes(self._fragments)
                 self._fragments.clear()
-                self.core.port.receive(message, now)
+                self.port.receive(message, now)
         elif opcode is Opcode.TEXT or opcode is Opcode.CONT:
             self._protocol.fail(TEXT, "text message; only binary messages are allowed")
-            self.core.port.lost(TEXT, f"{self.url} is not a Sovereign Netcode server: it sends text", now)
+            self.port.lost(TEXT, f"{self.url} is not a Sovereign Netcode server: it sends text", now)
 
     def _refusal(self, reason: str = "") -> ConnectError | None:
         """Returns the error for a handshake without an HTTP answer; None if there was such an answer."""
@@ -159,15 +187,15 @@ class Connection:
             return
         self._ending_since = now
         if self.refused is not None:
-            self.core.port.lost(CloseCode.ABNORMAL_CLOSURE, str(self.refused), now)
+            self.port.lost(CloseCode.ABNORMAL_CLOSURE, str(self.refused), now)
         elif protocol.close_rcvd is not None:
             close = protocol.close_rcvd
-            self.core.port.lost(close.code, close.reason or "the server closed the connection", now)
+            self.port.lost(close.code, close.reason or "the server closed the connection", now)
         elif protocol.close_sent is not None:
             close = protocol.close_sent
-            self.core.port.lost(close.code, f"the server broke the WebSocket protocol: {close.reason}", now)
+            self.port.lost(close.code, f"the server broke the WebSocket protocol: {close.reason}", now)
         else:
-            self.core.port.lost(CloseCode.ABNORMAL_CLOSURE, "the connection broke off", now)
+            self.port.lost(CloseCode.ABNORMAL_CLOSURE, "the connection broke off", now)
 
 
 def stalled(connection: Connection, now: float) -> None:

@@ -11,7 +11,6 @@ clients with a reason, so that they go on at another edge. It takes no new ones 
 """
 
 import asyncio
-import json
 import logging
 import math
 import time
@@ -25,13 +24,13 @@ from server.config.limits import Limits
 from server.game.session import Session
 from server.journal.recorded_world import RecordedWorld
 from server.journal.records import DivergedError
+from server.rules import Rules
+from server.runtime.tasks import Tasks
 from server.runtime.ticker import Alarm, best_alarm
 from server.scale.clock import EdgeClock
 from server.scale.edge import EdgeServer
-from server.scale.sequencer import SILENT_S
 from server.scale.wire import packed
 from shared import messages
-from shared.bounds import in_ticks
 
 SHED_S = 2.0
 """Seconds of records that may wait before an edge sends its clients to other edges."""
@@ -49,6 +48,7 @@ class EdgePart(Part):
         url: address for clients, which other edges may tell theirs; empty: none.
         limits: the limits.
         authenticate: returns the subject of a client's token, as for `Game`.
+        rules: the rules, whose `load_player` the edge runs; None: there is none.
 
     Attributes:
         core: the edge, from the moment at which it is ready; None: not yet.
@@ -65,6 +65,7 @@ class EdgePart(Part):
         url: str = "",
         limits: Limits | None = None,
         authenticate: Callable[[str], str] | None = None,
+        rules: Rules | None = None,
     ) -> None:
         super().__init__(bus, fresh, name=name, world=world)
         self.url = url
@@ -74,38 +75,38 @@ class EdgePart(Part):
         """Whether the edge is behind, and takes no clients."""
         self.sheds = 0
         self.clock = EdgeClock(self.scene.tick_rate)
-        self._limits, self._authenticate = limits or Limits(), authenticate
+        self._limits, self._authenticate, self._rules = limits or Limits(), authenticate, rules
+        self._tasks: Tasks | None = None
+        self._empty = asyncio.Event()
         self._alarm: Alarm | None = None
         self._shed_at = round(SHED_S * self.scene.tick_rate)
-        self._silent = in_ticks(SILENT_S, self.scene.tick_rate, 2)
-        self._urls: dict[str, str] = {}
-        self._watching: asyncio.Task[None] | None = None
-
-    @property
-    def key(self) -> str:
-        """Key of the edge's address on the bus."""
-        return f"{self.world_name}.edge.{self.name}"
 
     def others(self) -> list[str]:
-        """Returns the addresses of the other edges whose batches are in the log."""
-        replica = self.following.replica
-        alive = [name for name, newest in replica.batches.items() if replica.world.tick - newest <= self._silent]
-        return [self._urls[name] for name in sorted(alive) if name != self.name and name in self._urls]
+        """Returns the addresses of the other edges that take clients, first the one with the fewest players."""
+        return [] if self.core is None else self.core.moves.others
 
     async def run(self) -> None:
         following = self.following
         await following.catch_up()
         self.began()
-        self.core = EdgeServer(self.name, following.replica, self._limits, self._authenticate)
+        self.core = EdgeServer(
+            self.name,
+            following.replica,
+            self._limits,
+            address=self.url,
+            authenticate=self._authenticate,
+            rules=self._rules,
+        )
         self.faults = self.core.faults
+        self._tasks = Tasks(asyncio.get_running_loop(), self._limits.load_s)
+        self.core.joining.run = self._tasks.run
         self._alarm = best_alarm(asyncio.get_running_loop(), self._ring)
-        self._watching = asyncio.create_task(self._watch())
-        if self.url:
-            await self.bus.put(self.key, json.dumps({"url": self.url}).encode())
         try:
             while True:
                 assert following.reader is not None
                 stored = await following.reader.take(WAIT_S)
+                if following.reader is None:
+                    return  # the part was stopped while it waited
                 if stored is not None:
                     self._take(self.core, stored)
                     self._look_whether_behind(self.core, following.reader.waiting)
@@ -115,17 +116,29 @@ class EdgePart(Part):
         finally:
             self.stop()
 
+    def drain(self) -> None:
+        """Begins to send all clients to other edges, because this one is about to stop."""
+        if self.core is not None:
+            self.core.drain()
+
+    @property
+    def drained(self) -> bool:
+        """Whether no client plays over this edge."""
+        return self.core is None or self.core.drained
+
     async def leave(self) -> None:
-        """Removes the edge's address from the bus, so that no client is sent here any more."""
-        await self.bus.delete(self.key)
+        """Sends all clients to other edges, and waits until they are gone. Without another edge, it does nothing."""
+        if self.others():
+            self.drain()
+            await self._empty.wait()
 
     def stop(self) -> None:
         super().stop()
         if self._alarm is not None:
             self._alarm.close()
             self._alarm = None
-        if self._watching is not None:
-            self._watching.cancel()
+        if self._tasks is not None:
+            self._tasks.stop()
 
     def unready(self) -> str:
         if self.shedding:
@@ -172,6 +185,8 @@ class EdgePart(Part):
             if newest is not None:
                 self.ready.set()
             self._schedule(core)
+        if core.moves.draining and core.drained:
+            self._empty.set()
         if again:
             for batch in core.unrecorded():
                 self.bus.publish(packed(batch))
@@ -210,13 +225,3 @@ class EdgePart(Part):
                 return
             self.bus.publish(packed(batch))
         self._schedule(core)
-
-    async def _watch(self) -> None:
-        """Keeps the addresses of the other edges."""
-        prefix = f"{self.world_name}.edge."
-        async for key, value in self.bus.watch(prefix):
-            name = key.removeprefix(prefix)
-            if value is None:
-                self._urls.pop(name, None)
-            else:
-                self._urls[name] = json.loads(value)["url"]

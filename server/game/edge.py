@@ -26,11 +26,20 @@ class Edge:
         limits: the limits.
         counters: where dropped events, snapshots and bytes are counted.
         durable: returns the newest tick that no crash can undo. Verdicts up to it are sent.
+        apart: whether announcements have no numbers, because the players change between edges.
     """
 
     def __init__(
-        self, world: World, kept: PersistedState, limits: Limits, counters: Counters, durable: Callable[[], int]
+        self,
+        world: World,
+        kept: PersistedState,
+        limits: Limits,
+        counters: Counters,
+        durable: Callable[[], int],
+        *,
+        apart: bool = False,
     ) -> None:
+        self._numbered = not apart
         self._world, self._kept, self._limits, self._counters = world, kept, limits, counters
         self._durable = durable
         self.log = ChangeLog(world, kept.attributes)
@@ -80,4 +89,5 @@ class Edge:
                 continue
             own = player.entity <= entity <= player.entity + reserved
             if own or segment is None or segment in session.stream.view.sees:
-                self._counters.events_dropped += player.outbox.add(tick, message, self._limits.outbox_max)
+                most = self._limits.outbox_max
+                self._counters.events_dropped += player.outbox.add(tick, message, most, self._numbered)

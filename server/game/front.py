@@ -17,6 +17,7 @@ from server.replication.client_stream import Transport
 from server.replication.sender import Sender
 from shared import messages
 from shared.messages import (
+    Beside,
     Bye,
     Command,
     Hello,
@@ -67,6 +68,8 @@ class Front:
     scene: Scene
     fast_path: FastPath | None = None
     """Serves the sessions that have nothing special to do; None: there is no compiled kernel."""
+    takes_second = False
+    """Whether a client may open a second connection, to go on over it."""
     _row_bytes: int
 
     @property
@@ -151,7 +154,7 @@ class Front:
                 self.counters.corrections += max(message.corrections - session.corrections, 0)
             session.corrections = max(message.corrections, session.corrections)
         elif isinstance(message, Hello) and not session.entity and session.hello is None and not session.loading:
-            self.joining.hello(session, message, now)
+            self.hello(session, message, now)
         elif isinstance(message, Command) and session.entity:
             assert session.player is not None
             self.commands.file(session.player, message)
@@ -164,9 +167,16 @@ class Front:
             session.inputs.restart(message.tick)
         elif isinstance(message, Bye):
             self.connections.leave(session)
+        elif isinstance(message, Beside) and self.takes_second and not (session.hello or session.player):
+            session.beside = True
+            self.hello(session, Hello(message.version, {}, "", message.token, message.resume), now)
         else:
             state = "after the join" if session.entity else "before the join"
             self.connections.kick(session, messages.MALFORMED, f"unexpected {type(message).__name__} {state}")
+
+    def hello(self, session: Session, hello: Hello, now: float) -> None:
+        """Takes the first message of a client."""
+        self.joining.hello(session, hello, now)
 
     # -- what goes out, once per tick ------------------------------------------------------------------------
 

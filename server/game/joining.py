@@ -128,6 +128,8 @@ class Joining:
             return False
         session.send(welcome)
         session.greeting = None
+        if session.beginning:
+            session.send(session.beginning)
         return True
 
     def _authenticated(self, session: Session, token: str) -> bool:

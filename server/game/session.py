@@ -49,6 +49,8 @@ class Session:
         """Hello of a client that waits to join."""
         self.greeting: tuple[int, bytes] | None = None
         """Tick that must be durable before the welcome is sent, because of its resume token; and the welcome."""
+        self.beginning = b""
+        """Message that follows the welcome; empty: none."""
         self.subject = ""
         self.opened = self.received_at = now
         """Times in seconds: when the connection opened, and when the latest message arrived."""

@@ -17,7 +17,7 @@ class Outbox:
     """The events that wait to be sent to one player."""
 
     def __init__(self) -> None:
-        self._waiting: deque[tuple[int, bytes]] = deque()
+        self._waiting: deque[tuple[int, bytes, bool]] = deque()
         self._next = 0
         """Number of the first event that waits."""
         self._unsure = False
@@ -31,22 +31,23 @@ class Outbox:
         """Whether there is anything to send, or will be."""
         return self._unsure or bool(self._waiting)
 
-    def add(self, tick: int, message: bytes, most: int) -> bool:
+    def add(self, tick: int, message: bytes, most: int, counts: bool = True) -> bool:
         """Queues an event.
 
         Args:
             tick: the tick in which the rules sent it.
             message: the encoded event.
             most: number of events that may wait; if there are more, the oldest is dropped.
+            counts: whether the event has a number. An edge cannot number announcements, because other edges have sent
+                others (`server.scale`).
 
         Returns:
             Whether an event was dropped.
         """
-        self._waiting.append((tick, message))
+        self._waiting.append((tick, message, counts))
         full = len(self._waiting) > most
         if full:
-            self._waiting.popleft()
-            self._next += 1
+            self._next += self._waiting.popleft()[2]
             self._unsure = True
         return full
 
@@ -71,8 +72,9 @@ class Outbox:
             self._unsure = False
             messages.append(encode(NextHappened(self._next)))
         while self._waiting and self._waiting[0][0] <= complete_tick:
-            messages.append(self._waiting.popleft()[1])
-            self._next += 1
+            _, message, counts = self._waiting.popleft()
+            messages.append(message)
+            self._next += counts
             room -= len(messages[-1])
             if room <= 0:
                 break

@@ -10,7 +10,7 @@ from server.persistence.checkpoint import Checkpoint
 from server.players import persisted_state
 from server.scale.replica import Replica
 
-FORMAT = 1
+FORMAT = 2
 """Version of the format."""
 
 
@@ -33,6 +33,7 @@ def encoded(replica: Replica, last: str) -> bytes:
             [replica.epoch, replica.batches, replica.events],
             [[entity, *home] for entity, home in replica.homes.items()],
             [[*key, entity] for key, entity in replica.beside.items()],
+            replica.edges,
         ]
     )
     return data
@@ -51,7 +52,7 @@ def decoded(data: bytes, fresh: RecordedWorld) -> tuple[Replica, str]:
     parts: list[Any] = msgpack.unpackb(data, strict_map_key=False)
     if parts[0] != FORMAT:
         raise ValueError(f"the checkpoint has format {parts[0]}, and this program reads format {FORMAT}")
-    last, world, notes, known, homes, beside = parts[1:]
+    last, world, notes, known, homes, beside, edges = parts[1:]
     tick, next_id, states, hashed, segments = world
     saved = Checkpoint(tick, next_id, states, hashed, b"", [(x, y, z, kinds) for x, y, z, kinds in segments], [])
     replica = Replica(
@@ -60,4 +61,5 @@ def decoded(data: bytes, fresh: RecordedWorld) -> tuple[Replica, str]:
     replica.epoch, replica.batches, replica.events = known
     replica.homes = {entity: (edge, client) for entity, edge, client in homes}
     replica.beside = {(edge, client): entity for edge, client, entity in beside}
+    replica.edges = edges
     return replica, last

@@ -12,6 +12,8 @@ from collections import deque
 from collections.abc import Callable
 from typing import Any, cast
 
+import msgpack
+
 from server.config.limits import Limits
 from server.game.clocks import Clocks
 from server.game.commands import Commands
@@ -26,121 +28,24 @@ from server.game_api.shared_values import SharedValues
 from server.journal.records import input_record
 from server.observability.counters import Counters
 from server.observability.errors import FaultReporter
-from server.players.input_queue import InputQueue
 from server.players.persisted_state import PersistedState
-from server.players.player import Player
 from server.rules import Rules
+from server.scale.clients import EdgeCommands, EdgeInputs, EdgeRoster
+from server.scale.moves import Moves
 from server.scale.replica import Replica
-from server.scale.wire import COMMAND, GONE, JOIN, KNOWS, LEAVE, LOST, SWITCH, Batch, Record, rows
+from server.scale.wire import COMMAND, GONE, HERE, JOIN, KNOWS, SWITCH, Batch, Record, rows
 from shared import fields, messages
-from shared.bounds import Bounds, bounds
-from shared.inputs import Input
-from shared.messages import IDLE, NEUTRALISED, REPEATED, USED, Command, Welcome, encode
+from shared.bounds import bounds, in_ticks
+from shared.messages import Hello, Welcome, encode
 
 RESEND_TICKS, RESENT_MAX = 8, 64
 """Ticks without a batch in the records after which the unrecorded batches are sent again: one of them was lost on the
 way. Maximum number of batches that are sent again at once."""
 AHEAD_MAX = 8
 """Maximum number of batches that are in no record yet. An edge that hears nothing of the sequencer stops there."""
-
-
-class EdgeInputs(InputQueue):
-    """The inputs of one player at an edge. Their statuses wait for the records of their ticks.
-
-    Args:
-        bounds, row_bytes: as for `InputQueue`.
-        held: the input that the player's entity had before, which stands in for missing ones.
-        resumed: whether the player was in the world before, so that an input is expected for every tick.
-    """
-
-    def __init__(self, bounds: Bounds, row_bytes: int, held: Input, *, resumed: bool) -> None:
-        super().__init__(bounds, row_bytes)
-        self.held, self._idle = held, REPEATED if resumed else IDLE
-        if resumed:
-            self.statuses.append(REPEATED)  # for the tick of the seat
-        self._taken: dict[int, int] = {}
-        self.takes = IDLE
-        """Status of the newest tick that was taken."""
-        self.switching = False
-        """Whether the change of the player to this edge was asked for."""
-        self.sent: Input | None = None
-        """The input in the latest batch that had one."""
-
-    def take(self, tick: int) -> Input:
-        input_ = super().take(tick)
-        self.takes = self._taken[tick] = self.statuses.pop()
-        return input_
-
-    def skip(self, tick: int) -> None:
-        """Drops the status of a tick for which another edge had the input."""
-        self._taken.pop(tick, None)
-
-    def confirm(self, tick: int, missing: int) -> None:
-        """Files the status of a tick whose record has come.
-
-        Args:
-            tick: the tick.
-            missing: ticks from the newest batch in the record to the tick; 0: the input was used.
-        """
-        status = self._taken.pop(tick, IDLE)
-        if status == IDLE:
-            status = self._idle
-        if missing and status != IDLE:
-            self.used -= status == USED
-            self.substituted += status == USED
-            status = REPEATED if self._bounds.stands_in(missing) else NEUTRALISED
-        self.statuses.append(status)
-        if len(self.statuses) > self._bounds.statuses:
-            del self.statuses[0]
-
-
-class EdgeRoster:
-    """The requests of the clients of an edge about their players, in the place of a roster."""
-
-    def __init__(self) -> None:
-        self.requests: list[list[Any]] = []
-        self.clients: dict[Session, int] = {}
-        """Clients that have asked to join, with their numbers."""
-        self.mine: set[int] = set()
-        """Players whose latest connection was one to this edge."""
-
-    def lost(self, session: Session, now: float) -> None:
-        """Reports a lost connection."""
-        self._report(LOST, session)
-
-    def dismiss(self, session: Session) -> None:
-        """Reports a client that has left, or that may not come back."""
-        self._report(LEAVE, session)
-
-    def excuse(self, seconds: float, now: float) -> None:
-        """Does nothing: the sequencer has the times."""
-
-    def _report(self, kind: int, session: Session) -> None:
-        client = self.clients.pop(session, None)
-        if session.beside and session.player is not None:
-            self.mine.discard(session.player.entity)
-        if client is not None:
-            self.requests.append([kind, client])
-        if session.player is not None and session.player.session is session:
-            session.player.session = None
-
-
-class EdgeCommands:
-    """The commands of the clients of an edge, until their ticks."""
-
-    def __init__(self, limits: Limits, ahead: int) -> None:
-        self._limits, self._ahead = limits, ahead
-        self.newest = -1
-        """Newest tick whose inputs were taken."""
-
-    def file(self, player: Player, command: Command) -> None:
-        """Queues a command that has arrived. The verdict of an answered one is sent again."""
-        if command.number in player.settled:
-            player.verdicts.append((command.number, player.settled[command.number]))
-        elif len(player.commands) >= self._limits.commands_waiting_max or command.tick > self.newest + self._ahead:
-            player.verdicts.append((command.number, messages.TOO_MANY))
-        else:
-            player.commands.append(command)
+IN_TIME_S = 0.5
+"""Time for which all inputs of a client have to be in time over its second connection before it changes to that, in
+seconds."""
 
 
 class EdgeServer(Front):
@@ -150,30 +55,38 @@ class EdgeServer(Front):
         name: name of the edge, which no other edge of the world has had.
         replica: the replica of the world at some tick of the log.
         limits: the limits.
-        authenticate: returns the subject of a client's token, as for `Game`; None: anyone may play.
+        address: address of the edge for clients, as in ws://HOST:PORT, which the other edges tell theirs; empty: none.
+        authenticate: returns the subject of a client's token, as for `Game`.
+        rules: the rules, whose `load_player` is run here; its results have to be what MessagePack can hold.
     """
 
     commands: EdgeCommands
     joining: Joining
+    takes_second = True
 
     def __init__(
         self,
         name: str,
         replica: Replica,
         limits: Limits | None = None,
+        *,
+        address: str = "",
         authenticate: Callable[[str], str] | None = None,
+        rules: Rules | None = None,
     ) -> None:
         world = replica.world
         self.name, self.replica, self.world, self.scene = name, replica, world, world.scene
         self.limits, self.counters, self.faults = limits or Limits(), Counters(), FaultReporter()
         self._row_bytes, self._bounds = self.scene.input_row_bytes, bounds(self.scene.tick_rate)
-        self._roster, self.commands = EdgeRoster(), EdgeCommands(self.limits, self._bounds.ahead)
-        self._half = Edge(world, replica.kept, self.limits, self.counters, lambda: world.tick)
+        self._roster = EdgeRoster(replica.kept.players)
+        self.commands = EdgeCommands(self.limits, self._bounds.ahead)
+        self._half = Edge(world, replica.kept, self.limits, self.counters, lambda: world.tick, apart=True)
         self.log, self.sender = self._half.log, self._half.sender
         self.log.faults = self.faults
         roster = cast("Roster", self._roster)
         self.connections = Connections(roster, self.counters, self.faults)
         self.clocks = Clocks(self.scene.tick_rate, self.limits, self.connections, roster)
+        self.moves = Moves(name, address, replica, self.connections)
         self.joining = Joining(
             world,
             self.limits,
@@ -183,12 +96,13 @@ class EdgeServer(Front):
             roster,
             _Durable(world),
             authenticate,
-            Rules(),
+            rules or Rules(),
         )
         self._values = SharedValues(world, replica.kept.shared)
         self.commands.newest = world.tick
         self._unrecorded: deque[Batch] = deque()
         self._resent = 0
+        self._in_time = in_ticks(IN_TIME_S, self.scene.tick_rate, 8)
         self._next, self._before = 0, -1
         self._tokens: dict[int, bytes] = {}
         self._mine = self._roster.mine
@@ -204,6 +118,22 @@ class EdgeServer(Front):
         """The persisted state, with all players of the world, also those of other edges."""
         return self.replica.kept
 
+    def hello(self, session: Session, hello: Hello, now: float) -> None:
+        """Takes the first message of a client: it wants to join, or to go on here. An edge that drains refuses it."""
+        if self.moves.draining:
+            self.moves.refuse(session)
+        else:
+            self.joining.hello(session, hello, now)
+
+    def drain(self) -> None:
+        """Begins to send all clients to other edges, because this one is about to stop."""
+        self.moves.draining = True
+
+    @property
+    def drained(self) -> bool:
+        """Whether no client plays over this edge."""
+        return not any(session.entity and not session.closed for session in self.sessions)
+
     # -- to the sequencer ----------------------------------------------------------------------------------
 
     def collect(self, deadline: float, now: float) -> Batch | None:
@@ -216,6 +146,9 @@ class EdgeServer(Front):
         self._ask_to_join(now)
         inputs: list[int] = []
         requests = self._roster.requests
+        address = self.moves.request
+        if address is not None:
+            requests.append([HERE, 0, address])
         for session, client in self._roster.clients.items():
             player = session.player
             if player is None or session.closed:
@@ -223,16 +156,19 @@ class EdgeServer(Front):
             queue = session.inputs
             assert isinstance(queue, EdgeInputs)
             input_ = queue.take(tick)
-            if session.beside and not queue.switching and queue.takes == USED:
+            if session.beside and not queue.switching and queue.in_time >= self._in_time:
                 queue.switching = True
                 requests.append([SWITCH, client])
-            if input_ != queue.sent:
+            beside = session.beside and not queue.switching
+            if input_ != queue.sent and not beside:
                 queue.sent = input_
                 inputs += input_record(player.entity, input_, aim=self.scene.aim)
             if session.stream.acked >= 0 and session not in self._known:
                 self._known.add(session)
                 requests.append([KNOWS, client])
-            while player.commands and player.commands[0].tick <= tick:
+            while beside and player.commands and player.commands[0].number in player.settled:
+                player.commands.popleft()  # the other edge has sent it
+            while not beside and player.commands and player.commands[0].tick <= tick:
                 requests.append([COMMAND, client, *player.commands.popleft(), session.stream.gaps])
         batch = Batch(self.name, tick, self._before, inputs, list(requests))
         self._before = tick
@@ -248,6 +184,8 @@ class EdgeServer(Front):
         """Adds the requests of clients that wait to join."""
         joining = [each for each in self.sessions if each.hello is not None and not each.closed]
         for session in joining[: self.limits.joins_per_tick]:
+            if not self._can_send(session):
+                continue
             hello, session.hello, session.loading = session.hello, None, True
             assert hello is not None
             session.received_at = session.stream.sent_at = now
@@ -256,8 +194,17 @@ class EdgeServer(Front):
             token = hello.resume if session.beside else secrets.token_bytes(fields.RESUME_BYTES)
             self._tokens[client] = token
             resume = digest_of(hello.resume) if hello.resume else b""
-            request = [JOIN, client, hello.name, session.subject, resume, digest_of(token), session.beside]
-            self._roster.requests.append(request)
+            known = [hello.name, session.subject, resume, digest_of(token), session.beside]
+            self._roster.requests.append([JOIN, client, *known, session.loaded])
+
+    def _can_send(self, session: Session) -> bool:
+        """Returns whether the loaded data of a client can be in a batch. If not, the client is closed."""
+        try:
+            msgpack.packb(session.loaded)
+            return True
+        except Exception:
+            self.connections.fail(session, "sending the result of load_player to the sequencer")
+            return False
 
     # -- from the log --------------------------------------------------------------------------------------
 
@@ -302,6 +249,8 @@ class EdgeServer(Front):
             if edge == self.name and code != GONE:
                 self._end(client, code, reason)
         self._forget_others()
+        self.moves.tell(self.sessions)
+        self.moves.check(now, 1 / self.scene.tick_rate)
         self.clocks.check(now)
         return self._is_lost(record.tick)
 
@@ -353,6 +302,7 @@ class EdgeServer(Front):
             welcome = encode(Welcome(messages.VERSION, record.tick - 1, entity, self._scene_table, token))
             session.stream.private_due = self.replica.kept.private_of(entity)
             session.greeting = (record.tick, welcome)
+            session.beginning = self.moves.message()
 
     def _forget_others(self) -> None:
         """Drops events and verdicts for players of other edges. An edge that seats them later has these as settled."""

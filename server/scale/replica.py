@@ -40,6 +40,8 @@ class Replica:
         """Number of game events for each player so far."""
         self.beside: dict[tuple[str, int], int] = {}
         """Players of the clients that prepare a change to another edge, by that edge and its client."""
+        self.edges: dict[str, str] = {}
+        """Addresses of the edges that take clients, by edge."""
         self.outcome = Outcome()
         """Outcome of the newest record; the caller clears it."""
         self.shared_changed = False
@@ -52,7 +54,7 @@ class Replica:
         notes = msgpack.unpackb(msgpack.packb(persisted_state.whole(self.kept)), strict_map_key=False)
         other = Replica(world, persisted_state.restored(notes))
         other.epoch, other.batches, other.homes = self.epoch, dict(self.batches), dict(self.homes)
-        other.beside, other.events = dict(self.beside), dict(self.events)
+        other.beside, other.events, other.edges = dict(self.beside), dict(self.events), dict(self.edges)
         return other
 
     def take(self, record: Record) -> bool:
@@ -69,6 +71,8 @@ class Replica:
         if record.tick != self.world.tick + 1 or record.epoch != self.epoch:
             raise GapError(f"tick {record.tick} of epoch {record.epoch} after {self.world.tick} of {self.epoch}")
         self.batches = dict(rows(record.batches, 2))
+        if record.edges is not None:
+            self.edges = dict(rows(record.edges, 2))
         outcome = self.outcome
         outcome.acted.update(record.acted)
         outcome.removed += record.removed

@@ -25,7 +25,7 @@ from server.rewind import Rewind
 from server.rules import Rules
 from server.scale.remote import BatchInputs, RemoteJoining, RemoteLink, RemoteRoster
 from server.scale.replica import Replica
-from server.scale.wire import COMMAND, GONE, JOIN, KNOWS, LEAVE, LOST, SWITCH, Batch, Record, packed, rows
+from server.scale.wire import COMMAND, GONE, HERE, JOIN, KNOWS, LEAVE, LOST, SWITCH, Batch, Record, packed, rows
 from shared import messages
 from shared.bounds import in_ticks
 from shared.messages import Command, Hello
@@ -85,6 +85,9 @@ class WorldSequencer:
         self._newest: dict[str, int] = {} if replica is None else dict(replica.batches)
         self._taken = dict.fromkeys(self._newest, world.tick)
         """Tick that took the newest batch of each edge."""
+        self._edges: dict[str, str] = {} if replica is None else dict(replica.edges)
+        """Addresses of the edges that take clients, by edge."""
+        self._edges_changed = False
         self._sessions: dict[tuple[str, int], Session] = {}
         self._silent = in_ticks(SILENT_S, world.scene.tick_rate, 2)
         self._gone = in_ticks(GONE_S, world.scene.tick_rate, 2)
@@ -131,13 +134,28 @@ class WorldSequencer:
                 self.connections.lost(session, now)
         seated, self._joining.seated = self._joining.seated, []
         placed = sorted(self.world.placed)
-        batches = self._batches()
-        return packed(Record(self.epoch, tick, batches, journal, placed, acted, removed, events, seated, ended))
+        batches, edges = self._batches(), self._told_edges()
+        return packed(Record(self.epoch, tick, batches, journal, placed, acted, removed, events, seated, ended, edges))
 
     # -- batches -------------------------------------------------------------------------------------------
 
     def _batches(self) -> list[object]:
         return [part for pair in sorted(self._newest.items()) for part in pair]
+
+    def _told_edges(self) -> list[str] | None:
+        """Returns the addresses of the edges for a record if they have changed."""
+        if not self._edges_changed:
+            return None
+        self._edges_changed = False
+        return [part for pair in sorted(self._edges.items()) for part in pair]
+
+    def _address(self, edge: str, address: str) -> None:
+        """Notes the address of an edge; empty: it takes no clients."""
+        if address != self._edges.get(edge, ""):
+            self._edges_changed = True
+            self._edges.pop(edge, None)
+            if address:
+                self._edges[edge] = address
 
     def _take(self, batch: Batch, now: float) -> None:
         """Carries out the requests of a batch, and takes its inputs."""
@@ -145,10 +163,12 @@ class WorldSequencer:
         for kind, client, *parts in batch.requests:
             key = (batch.edge, client)
             session = self._sessions.get(key)
-            if kind == JOIN and session is None:
-                name, subject, resume, token, beside = parts
+            if kind == HERE:
+                self._address(batch.edge, parts[0])
+            elif kind == JOIN and session is None:
+                name, subject, resume, token, beside, loaded = parts
                 session = self._sessions[key] = self._open(batch.edge, client, token, now)
-                session.subject = subject
+                session.subject, session.loaded = subject, loaded
                 if beside:
                     self._joining.seat_beside(session, resume)
                 else:
@@ -192,6 +212,8 @@ class WorldSequencer:
             self._waiting.pop(edge, None)
         silent = {edge for edge, taken in self._taken.items() if tick - taken > self._silent}
         if silent:
+            for edge in silent:
+                self._address(edge, "")
             for key in [key for key in self._sessions if key[0] in silent]:
                 session = self._sessions.pop(key)
                 session.close(messages.TOO_SLOW, "the edge was silent")

@@ -3,16 +3,19 @@
 batch     [edge, number, before, inputs, requests]
           number: the tick that the inputs are for   before: number of the edge's batch before; -1: none
           inputs: as in a recording (`server.journal.records`)
-request   [JOIN, client, name, subject, resume, token, beside]
+request   [JOIN, client, name, subject, resume, token, beside, loaded]
           resume, token: digests of the presented resume token (empty: none) and of the new one
           beside: whether the client goes on over another connection until SWITCH   [SWITCH, client]
+          loaded: result of `Rules.load_player`
+          [HERE, 0, address]   the edge's address for clients; empty: it takes no more of them
           [KNOWS, client]   the client has the new token     [LOST, client]   [LEAVE, client]
           [COMMAND, client, number, tick, seen, name, payload, gaps]
-record    [epoch, tick, batches, journal, placed, acted, removed, events, seated, ended]
+record    [epoch, tick, batches, journal, placed, acted, removed, events, seated, ended, edges]
           batches: edge, newest batch in it, ...   journal: a tick of a recording; nil: the record begins an epoch
           placed, acted, removed: entities   events: [players or nil, message], ...
           seated: edge, client, player, beside, ...   ended: edge, client, code, reason, ...
           code: the close code; `GONE`: the edge knows
+          edges: edge, address, ... of all edges that take clients; nil: as before
 
 A client is a number that its edge gives to a connection. All of it is MessagePack.
 """
@@ -23,7 +26,7 @@ import msgpack
 
 GONE = 0
 """Close code in a record of a connection that its edge has lost."""
-JOIN, KNOWS, LOST, LEAVE, COMMAND, SWITCH = range(6)
+JOIN, KNOWS, LOST, LEAVE, COMMAND, SWITCH, HERE = range(7)
 
 
 class Batch(NamedTuple):
@@ -49,6 +52,7 @@ class Record(NamedTuple):
     events: list[Any]
     seated: list[Any]
     ended: list[Any]
+    edges: list[str] | None = None
 
 
 def packed(value: Batch | Record) -> bytes:

@@ -51,6 +51,11 @@ class Player:
         self._away = False
 
     @property
+    def place(self) -> str:
+        """The path of the next connection."""
+        return self.core.travel.path
+
+    @property
     def local(self) -> float:
         """Time on the client's own clock."""
         return self.clock_start + self.match.now * (1 + self.drift)
@@ -62,7 +67,7 @@ class Player:
 
     def connect(self) -> None:
         """Opens the connection to the path that the core names."""
-        way = self.match.route(self.core.travel.path)
+        way = self.match.route(self.place)
         if isinstance(way, str):
             self.core.port.lost(1006, way, self.local)
         else:

@@ -109,7 +109,7 @@ class SequencerPart(Part):
         if not self.alive:
             return
         data, world = self.core.tick(self._match.now), self.core.world
-        hashed = world.state_hash()
+        hashed = world.state_hash() if world.tick % self._match.hash_every == 0 else None
         self._match.bus.send(self.name, "log", lambda: self._append(data, hashed))
         self._schedule()
 
@@ -150,7 +150,7 @@ class Reader(Part):
         """Takes a record."""
         before = self.replica.world.tick
         self.take(record)
-        if self.replica.world.tick > before:
+        if self.replica.world.tick > before and self.replica.world.tick % self.match.hash_every == 0:
             self.match.seen(self.name, self.replica.world.tick, self.replica.world.state_hash())
 
     def take(self, record: Record) -> None:
@@ -184,7 +184,9 @@ class EdgePart(Reader):
 
     def __init__(self, match: "ScaledMatch", name: str, replica: Replica, limits: Limits | None) -> None:
         super().__init__(match, name, replica)
-        self.core = EdgeServer(name, replica, limits)
+        self.address = f"ws://{name.replace(' ', '-')}"
+        """Address of the edge for clients."""
+        self.core = EdgeServer(name, replica, limits, address=self.address)
         self.clock = EdgeClock(match.rate)
 
     def take(self, record: Record) -> None:

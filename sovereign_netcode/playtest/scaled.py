@@ -16,6 +16,7 @@ from typing import Any, cast
 
 from client_sdk.core import Core
 from client_sdk.netsim.links import Link, TcpStream
+from client_sdk.port import Port
 from server.config.limits import Limits
 from server.game.session import Session
 from server.journal.recorded_world import RecordedWorld
@@ -58,13 +59,15 @@ class Seat(Player):
             self._way = cast("EdgeServer", _Dead())
             self.disconnect()
 
+    @property
+    def place(self) -> str:
+        """The address of the edge to connect to; a path stands for any edge."""
+        return self.core.travel.server or self.core.travel.path
+
     def move(self, edge: EdgePart) -> bool:
-        """Changes to another edge without a pause. Returns whether it has begun."""
-        handover = self.core.begin_handover() if self.session is not None else None
-        if handover is None:
-            return False
-        self.second = _Second(self, edge)
-        return True
+        """Lets the edge of the client ask it to go on at another edge. Returns whether it has."""
+        here = self.edge
+        return here is not None and here.core.moves.ask(self.session, edge.address, "a move", self.match.now)
 
     def _update(self) -> None:
         if self.session is not None and self.session.closed and self.core.state == "reconnecting":
@@ -73,6 +76,13 @@ class Seat(Player):
 
     def _flush(self) -> None:
         super()._flush()
+        core = self.core
+        if self.second is None and core.second is not None and core.handover is not None:
+            edge = self.match.at_address(core.handover.address)
+            if edge is None:
+                core.second.lost(1006, "no server there", self.local)
+            else:
+                self.second = _Second(self, edge, core.second)
         if self.second is not None:
             self.second.flush()
 
@@ -89,12 +99,13 @@ class Seat(Player):
 class _Second:
     """The second connection of a client, to another edge; also the `Link` of that edge."""
 
-    def __init__(self, seat: Seat, edge: EdgePart) -> None:
-        self._seat, self.edge = seat, edge
+    def __init__(self, seat: Seat, edge: EdgePart, port: Port) -> None:
+        self._seat, self.edge, self._port = seat, edge, port
+        self._handover = seat.core.handover
         self.up = TcpStream(seat.match, seat.link_events, seat.match.rng.getrandbits(30), self._at_server)
         self.down = TcpStream(seat.match, seat.link_events, seat.match.rng.getrandbits(30), self._at_client)
         self.session: Session = edge.core.open(self, seat.match.now)
-        self.session.beside = True
+        port.open(seat.local)
 
     def send(self, message: bytes) -> None:
         self.down.send(message)
@@ -108,16 +119,23 @@ class _Second:
         else:
             self.edge.core.lost(self.session, self._seat.match.now)
 
+    def broke(self) -> None:
+        """Breaks the connection, because its edge was killed."""
+        self._port.lost(1006, "gone", self._seat.local)
+
     def flush(self) -> None:
-        """Sends what the client has for the second connection, or ends it."""
-        seat, handover = self._seat, self._seat.core.handover
-        if handover is not None:
-            for message in handover.outgoing():
-                self.up.send(message)
-        elif seat.second is self:  # it has failed
+        """Sends what the client has for the second connection, makes it the first, or ends it."""
+        seat, handover = self._seat, self._handover
+        if seat.core.second is not self._port:
             seat.second = None
-            if self.edge.alive:
+            if handover is not None and handover.complete:
+                seat.take_place(self)
+                seat._flush()
+            elif self.edge.alive:
                 self.edge.core.lost(self.session, seat.match.now)
+            return
+        for message in self._port.outgoing():
+            self.up.send(message)
 
     def _at_server(self, message: bytes) -> None:
         if self.edge.alive:
@@ -127,13 +145,9 @@ class _Second:
         seat = self._seat
         if seat.session is self.session:
             seat._at_client(message)
-            return
-        handover = seat.core.handover
-        if seat.second is self:
-            seat.core.receive_beside(message, seat.local)
-            if handover is not None and handover.complete:
-                seat.take_place(self)
-            seat._flush()
+        elif seat.second is self:
+            self._port.receive(message, seat.local)
+            self.flush()
 
 
 class ScaledMatch(Simulation):
@@ -146,6 +160,8 @@ class ScaledMatch(Simulation):
         limits: the limits.
         rules: makes the rules of the game, once per sequencer; None: players only walk and edit.
         bus: properties of the bus, as for `Bus`.
+        hash_every: all parts compare hashes of their worlds at every tick that this divides. The marks of the records
+            compare what has changed at every tick.
     """
 
     def __init__(
@@ -158,8 +174,10 @@ class ScaledMatch(Simulation):
         limits: Limits | None = None,
         rules: Callable[[], Rules] | None = None,
         bus: Mapping[str, Any] = MappingProxyType({}),
+        hash_every: int = 1,
     ) -> None:
         super().__init__(seed)
+        self.hash_every = hash_every
         self.rng = random.Random(seed + 29)
         self._limits, self._rules = limits, rules
         made = None if rules is None else rules()
@@ -192,8 +210,14 @@ class ScaledMatch(Simulation):
         return player
 
     def route(self, path: str) -> Way | str:
-        named = [edge for edge in self.edges if edge.alive and edge.name == path]
-        return (named[0] if named else self.some_edge()).core
+        if path.startswith("ws://"):
+            edge = self.at_address(path)
+            return "no server there" if edge is None else edge.core
+        return self.some_edge().core
+
+    def at_address(self, address: str) -> EdgePart | None:
+        """Returns the living edge at an address; None: there is none."""
+        return next((edge for edge in self.edges if edge.alive and edge.address == address), None)
 
     def some_edge(self) -> EdgePart:
         """Returns a living edge by chance."""
@@ -218,8 +242,8 @@ class ScaledMatch(Simulation):
         part.alive = False
         for player in self.players:
             if isinstance(player, Seat) and player.second is not None and player.second.edge is part:
-                player.core.lost_beside(player.local)
-                player.second = None
+                second, player.second = player.second, None
+                second.broke()
             if isinstance(player, Seat) and player.edge is part:
                 player.cut()
 

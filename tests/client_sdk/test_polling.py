@@ -43,8 +43,8 @@ def play(client: Client, until: Callable[[], bool], seconds: float = 20.0) -> li
 def raw_socket(client: Client) -> socket.socket:
     transport = client._transport
     assert isinstance(transport, PollingTransport)
-    assert transport._socket is not None
-    return transport._socket
+    assert transport._first._socket is not None
+    return transport._first._socket
 
 
 def test_a_player_joins_walks_and_leaves(url: str) -> None:
@@ -132,7 +132,7 @@ def test_a_server_that_stops_reading_is_left() -> None:
         while not client.closed:
             core._out.append(bytes(1000))
             client.update()
-            most = max(most, len(transport._unsent))
+            most = max(most, len(transport._first._unsent))
         over.set()
         (left,) = client.poll()
         client.close()
@@ -160,7 +160,7 @@ def test_what_does_not_fit_goes_out_later_in_order() -> None:
         client.update()
         transport = client._transport
         assert isinstance(transport, PollingTransport)
-        assert transport._unsent
+        assert transport._first._unsent
         go.set()
         client.close(timeout=10)
     assert [data for data in heard if len(data) == 3000] == wanted
@@ -230,4 +230,4 @@ def test_a_way_that_has_become_silent_ends(monkeypatch: pytest.MonkeyPatch) -> N
         (left,) = play(client, lambda: client.closed)
     assert isinstance(left, Left)
     assert left.reason == "nothing received for 0.3 s"
-    assert client._transport._socket is None  # type: ignore[attr-defined]
+    assert client._transport._first._socket is None  # type: ignore[attr-defined]

@@ -14,18 +14,19 @@ from client_sdk.events import (
     Disconnected,
     Diverged,
     EventsDropped,
+    HandedOver,
     Happened,
     Resumed,
     Resynchronised,
 )
-from client_sdk.netsim.links import Link
+from client_sdk.netsim.links import PRESETS, Link
 from server.config.limits import Limits
 from server.journal.recorded_world import RecordedWorld
 from server.players.player import Player
 from server.rules import Rules
-from server.scale import checkpoint
+from server.scale import checkpoint, moves
 from server.scale.wire import record_of
-from shared.inputs import Input
+from shared.inputs import Input, make_input
 from shared.scene import load_scene
 from sovereign_netcode.playtest.match import Policy, wander
 from sovereign_netcode.playtest.scaled import ScaledMatch, Seat
@@ -280,7 +281,7 @@ def test_a_new_edge_catches_up_and_serves() -> None:
     match.run(5)
     edge = match.add_edge()
     core = Core("late", patience_s=60.0)
-    core.travel.path = edge.name
+    core.travel.server = edge.address
     second = match.join(wander, PATH, core)
     match.run(5)
     assert (second.edge, second.core.state) == (edge, "playing")
@@ -345,6 +346,112 @@ def test_a_lone_player_who_is_moved_between_edges_has_no_corrections(seed: int, 
     assert stats.inputs_used > 30 * seconds
     assert not any(isinstance(event, (Disconnected, Resumed, Resynchronised)) for event in player.events)
     assert {event.done for event in player.events if isinstance(event, Answered)} >= {True}
+    hashes_agree(match)
+
+
+@pytest.mark.parametrize("seed", [1, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(2, 6))])
+def test_a_change_while_batches_of_the_former_edge_are_late_is_exact(seed: int) -> None:
+    match = ScaledMatch(load_scene("hills"), seed, edges=2, bus={"jitter_s": 0.002})
+
+    def turns(core: Core, rng: random.Random) -> Input:
+        held = int(core.prediction.predicted.tick / 40) % 2 if core.prediction else 0  # the same for a second and more
+        return make_input(1.0 - 2.0 * held, 0.0)
+
+    player = match.join(turns, PATH)
+    match.run(3)
+    for _ in range(6):
+        here, there = player.edge, next(edge for edge in match.edges if edge is not player.edge)
+        assert here is not None
+        player.move(there)
+        while player.edge is here:
+            match.bus.hold(here.name, "sequencer", match.rng.uniform(0.0, 0.2))
+            match.run(0.1)
+    assert set(causes(player)) <= {"late input"}
+    assert player.core.stats.divergences == 0
+    hashes_agree(match)
+
+
+@pytest.mark.parametrize(
+    "path",
+    [
+        pytest.param(Link(delay_s=0.03, jitter_s=0.02, loss=0.02), id="loss"),
+        pytest.param(Link(delay_s=0.09, jitter_s=0.025, loss=0.02), id="far", marks=pytest.mark.slow),
+        pytest.param(PRESETS["wifi"], id="wifi", marks=pytest.mark.slow),
+    ],
+)
+def test_a_hand_over_on_a_bad_line_costs_late_inputs_only(path: Link) -> None:
+    match = ScaledMatch(load_scene("hills"), 3, edges=3)
+    player = match.join(edits, path)
+    match.run(5)
+    assert tour(match, player, 20) >= 3
+    assert set(causes(player)) <= {"late input"}
+    assert (player.core.stats.divergences, player.core.stats.reconnects) == (0, 0)
+    hashes_agree(match)
+
+
+def test_an_edge_that_drains_hands_over_all_its_clients_and_takes_no_more() -> None:
+    match = ScaledMatch(load_scene("meadow"), 4, edges=3, rules=Tally)
+    sent: Counter[str] = Counter()
+    players = [match.join(asks(sent), PATH) for _ in range(6)]
+    match.run(3)
+    edge = match.edges[0]
+    here = [player for player in players if player.edge is edge]
+    edge.core.drain()
+    match.run(4)
+    assert here
+    assert edge.core.drained
+    assert [each.address for each in match.edges[1:]] == sorted(match.edges[0].core.moves.others)
+    for player in here:
+        assert [type(event) for event in player.events if isinstance(event, (HandedOver, Resumed, Disconnected))] == [
+            HandedOver
+        ]
+    core = Core("late", patience_s=60.0)
+    core.travel.server = edge.address
+    late = match.join(wander, PATH, core)
+    match.run(3)
+    assert late.core.state == "playing", "it was sent to another edge before it had joined"
+    assert late.edge in match.edges[1:]
+    match.kill(edge)
+    calm(match)
+    for player in players:
+        assert [event.data for event in player.events if isinstance(event, Happened)] == [
+            *range(1, sent[player.core.name] + 1)
+        ]
+    hashes_agree(match)
+
+
+def test_a_client_that_ignores_the_request_is_closed_and_comes_back_elsewhere(monkeypatch: pytest.MonkeyPatch) -> None:
+    match = ScaledMatch(load_scene("meadow"), 5, edges=2)
+    player = match.join(wander, PATH)
+    match.run(3)
+    edge, entity = player.edge, player.core.entity
+    assert edge is not None
+    monkeypatch.setattr(player.core, "_begin_handover", lambda asked, now: None)
+    edge.core.drain()
+    match.run(moves.HANDOVER_S + 3)
+    assert (player.core.state, player.core.entity) == ("playing", entity)
+    assert player.edge not in (None, edge)
+    assert [type(event) for event in player.events if isinstance(event, (Disconnected, Resumed))] == [
+        Disconnected,
+        Resumed,
+    ]
+
+
+def test_clients_know_the_edges_that_live() -> None:
+    match = ScaledMatch(load_scene("flat"), 6, edges=3)
+    player = match.join(wander, PATH)
+    match.run(3)
+    here = player.edge
+    others = [edge for edge in match.edges if edge is not here]
+    assert sorted(player.core.travel.edges) == [edge.address for edge in others]
+    match.kill(others[0])
+    match.run(2)
+    assert player.core.travel.edges == [others[1].address]
+    match.add_standby()
+    match.kill(match.sequencer)
+    added = match.add_edge()
+    match.run(2)
+    assert sorted(player.core.travel.edges) == sorted([others[1].address, added.address])
     hashes_agree(match)
 
 

@@ -48,13 +48,18 @@ class Cluster:
     ) -> None:
         self.hub = LocalHub()
         self._make_bus = make_bus or (lambda: LocalBus(self.hub))
-        self._rules = rules
-        self.scene: Scene = prepared(rules(), load_scene(scene))
+        self._scene = scene
+        self.use(rules)
         self.tasks: dict[Part, asyncio.Task[None]] = {}
         self.gateways: dict[Part, Gateway] = {}
         self.urls: dict[Part, str] = {}
         self.clients: list[AsyncClient] = []
         self._names = 0
+
+    def use(self, rules: Callable[[], Rules]) -> None:
+        """Sets the rules of the sequencers that are started from now on."""
+        self._rules = rules
+        self.scene: Scene = prepared(rules(), load_scene(self._scene))
 
     def fresh(self) -> RecordedWorld:
         """Returns a new world with its terrain."""
