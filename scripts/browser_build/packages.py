@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import base64
+import contextlib
 import hashlib
 import io
-import shutil
 import subprocess
 import sys
 import tarfile
 import tempfile
 from pathlib import Path
 
+from scripts.browser_build.tools import FetchError as FetchError
+from scripts.browser_build.tools import npm
 from scripts.environment import ROOT
 
 FETCHED = ROOT / "build" / "packages"
@@ -31,27 +33,20 @@ WHEELS = "--platform pyemscripten_2026_0_wasm32 --implementation cp --abi cp314 
 """Options of pip that select wheels for the Python of `pyodide`."""
 
 
-class FetchError(Exception):
-    """A package cannot be fetched, or is another one than the pinned; the message says which and why."""
-
-
 def npm_package(name: str) -> Path:
     """Returns the folder of a package of `NPM`. It is fetched if it is missing.
 
     Raises:
-        FetchError: there is no npm, it fails, or the archive has another hash.
+        FetchError: npm cannot be had or fails, or the archive has another hash.
     """
     version, wanted = NPM[name]
     folder = FETCHED / f"{name.replace('/', '-').strip('@')}-{version}"
     if folder.exists():
         return folder
-    npm = shutil.which("npm")
-    if npm is None:
-        raise FetchError(f"{name} {version}: there is no npm on this machine; install Node.js")
     print(f"fetching {name} {version} ...", flush=True)
     FETCHED.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=FETCHED) as place:
-        command = (npm, "pack", f"{name}@{version}", "--silent", "--pack-destination", place)
+        command = (*npm(), "pack", f"{name}@{version}", "--silent", "--pack-destination", place)
         done = subprocess.run(command, cwd=place, capture_output=True, text=True, check=False)
         archives = list(Path(place).glob("*.tgz"))
         if done.returncode or not archives:
@@ -62,7 +57,8 @@ def npm_package(name: str) -> Path:
             raise FetchError(f"{name} {version}: the archive differs from its pinned hash")
         with tarfile.open(fileobj=io.BytesIO(data)) as archive:
             archive.extractall(place, filter="data")
-        (Path(place) / "package").rename(folder)
+        with contextlib.suppress(OSError):  # another process was faster
+            (Path(place) / "package").rename(folder)
     return folder
 
 

@@ -6,6 +6,7 @@ client needs are left out (`LEFT_OUT`): a game's behaviours may import all other
 
 from __future__ import annotations
 
+import contextlib
 import gzip
 import hashlib
 import io
@@ -18,6 +19,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from scripts.browser_build.packages import NPM, PINS, FetchError
+from scripts.browser_build.tools import node
 from scripts.environment import ROOT
 
 OUT = ROOT / "build" / "browser"
@@ -66,27 +68,28 @@ def make(pyodide: Path, wheels: list[Path]) -> None:
     Raises:
         FetchError: the standard library cannot be compiled.
     """
-    OUT.mkdir(parents=True, exist_ok=True)
-    (OUT / STAMP).unlink(missing_ok=True)
     print("compiling the standard library for browsers ...", flush=True)
     library = _compiled(pyodide, _zip(dict(_library(pyodide / LIBRARY))))
     packages = _zip({name: data for each in wheels for name, data in _wheel(each)})
-    for name in TAKEN:
-        _write(name, (pyodide / name).read_bytes())
     lock = json.loads((pyodide / "pyodide-lock.json").read_text("utf-8"))
-    _write("pyodide-lock.json", json.dumps({"info": lock["info"], "packages": {}}).encode())
-    _write(LIBRARY, library)
-    _write(PACKAGES, packages)
-    (OUT / STAMP).write_text(_stamp(), "utf-8")
+    files = {name: (pyodide / name).read_bytes() for name in TAKEN}
+    files["pyodide-lock.json"] = json.dumps({"info": lock["info"], "packages": {}}).encode()
+    files |= {LIBRARY: library, PACKAGES: packages}
+    OUT.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(dir=OUT.parent) as place:
+        made = Path(place) / OUT.name
+        made.mkdir()
+        for name, data in files.items():
+            (made / f"{name}.gz").write_bytes(gzip.compress(data, 9, mtime=0))
+        (made / STAMP).write_text(_stamp(), "utf-8")
+        shutil.rmtree(OUT, ignore_errors=True)
+        with contextlib.suppress(OSError):  # another process was faster
+            made.rename(OUT)
 
 
 def _stamp() -> str:
     code = hashlib.sha256(b"\0".join(Path(each).read_bytes() for each in (__file__, COMPILE, PINS))).hexdigest()
     return json.dumps({"pyodide": NPM["pyodide"], "code": code})
-
-
-def _write(name: str, data: bytes) -> None:
-    (OUT / f"{name}.gz").write_bytes(gzip.compress(data, 9, mtime=0))
 
 
 def _library(path: Path) -> Iterator[tuple[str, bytes]]:
@@ -123,15 +126,12 @@ def _compiled(pyodide: Path, sources: bytes) -> bytes:
     """Returns the archive with compiled modules in place of sources, compiled by the same Python, in Node.js.
 
     Raises:
-        FetchError: there is no Node.js, or it fails.
+        FetchError: Node.js cannot be had, or fails.
     """
-    node = shutil.which("node")
-    if node is None:
-        raise FetchError("there is no Node.js on this machine to compile the standard library with")
     with tempfile.TemporaryDirectory() as folder:
         given, made = Path(folder) / "in.zip", Path(folder) / "out.zip"
         given.write_bytes(sources)
-        command = (node, str(COMPILE), str(pyodide), str(given), str(made))
+        command = (node(), str(COMPILE), str(pyodide), str(given), str(made))
         done = subprocess.run(command, capture_output=True, text=True, check=False)
         if done.returncode:
             raise FetchError(f"compiling the standard library: {(done.stderr or done.stdout)[-2000:]}")

@@ -11,6 +11,7 @@ import subprocess
 import time
 from concurrent.futures import ThreadPoolExecutor
 
+from scripts.browser_build import tools
 from scripts.environment import PYTHON, ROOT, Step, run
 
 CHECKS = {
@@ -28,6 +29,9 @@ def main(arguments: list[str]) -> int:
     """Runs what the arguments of `scripts/test` ask for. Returns the exit code."""
     # Without files of bytecode each worker and each process that a test starts compiles all sources again.
     os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+    if arguments in (["--long"], ["--all"]):
+        run("browsers", "-m", "scripts.browser_build.app", "--tests")  # without it, tests in browsers are skipped
+        os.environ["PATH"] = tools.path()
     if arguments == ["--long"]:
         steps = [together(LONG, "long"), alone(LONG, "long")]
     elif arguments == ["--all"]:

@@ -4,7 +4,6 @@ import base64
 import json
 import os
 import re
-import shutil
 import subprocess
 import tempfile
 import time
@@ -15,7 +14,8 @@ from typing import Any
 
 from websockets.sync.client import ClientConnection, connect
 
-NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
+from scripts.browser_build import tools
+
 FLAGS = (
     "--headless --disable-gpu --disable-quic --no-first-run --disable-background-networking --disable-component-update "
     "--disable-sync --hide-scrollbars --remote-debugging-port=0"
@@ -26,7 +26,7 @@ ANSWER_S = 30.0
 
 def installed() -> str | None:
     """Returns the path of a Chromium or Chrome; None if there is none."""
-    return next(filter(None, map(shutil.which, NAMES)), None)
+    return tools.browser()
 
 
 class Tab:
@@ -96,6 +96,7 @@ def chromium(path: str, *flags: str) -> Iterator[Tab]:
             stdout=subprocess.DEVNULL,
             stderr=subprocess.PIPE,
             text=True,
+            env=os.environ | tools.libraries(path),
         )
         try:
             with connect(_page(_address(browser)), compression=None, max_size=None) as link:

@@ -5,10 +5,14 @@ Everything runs in a bare environment outside the repository (`tests.packaging.b
 
 import ast
 import email
+import gzip
+import json
+import re
 import shutil
 import subprocess
 import tarfile
 import tomllib
+import urllib.request
 import zipfile
 from contextlib import AbstractContextManager
 from pathlib import Path
@@ -277,3 +281,31 @@ def test_types_are_checked(installed: Installed) -> None:
     assert said[0].startswith('mine.py:6: error: Return type "int" of "on_start" incompatible with return type "None"')
     assert 'mine.py:8: note: Revealed type is "sovereign_netcode.client_sdk.view.View"' in said
     assert said[-1] == "Found 1 error in 1 file (checked 1 source file)"
+
+
+def test_an_installed_server_has_the_page_to_play_on(installed: Installed) -> None:
+    with installed.served("--scene", "flat") as url:
+        address = url.replace("ws:", "http:")
+        with urllib.request.urlopen(f"{address}/play", timeout=60) as answer:
+            page = answer.read().decode()
+        scripts = re.findall(r'src="(/play/[0-9a-f]+/play.js)"', page)
+        with urllib.request.urlopen(address + scripts[0], timeout=60) as answer:
+            assert b"sovereign.js" in gzip.decompress(answer.read())
+        with urllib.request.urlopen(f"{address}/play/kernel.wasm", timeout=60) as answer:
+            assert gzip.decompress(answer.read()).startswith(b"\0asm")
+    told = installed.run("-c", SOURCES)
+    assert json.loads(told) == {"others": [], "core": True, "kernel": True}
+
+
+SOURCES = """
+import gzip, io, json, zipfile
+from sovereign_netcode.server.play.bundles import source_bundle
+(file,) = source_bundle().files.values()
+names = zipfile.ZipFile(io.BytesIO(gzip.decompress(file.packed))).namelist()
+places = tuple(f"sovereign_netcode/{name}" for name in ("client_sdk/", "shared/", "__init__.py"))
+print(json.dumps({
+    "others": [name for name in names if not name.startswith(places)],
+    "core": "sovereign_netcode/client_sdk/core.py" in names,
+    "kernel": "sovereign_netcode/shared/prebuilt/kernel-emscripten.so" in names,
+}))
+"""
