@@ -131,12 +131,16 @@ async def peer(attack: Attack, port: int, rng: random.Random, made: Counter[str]
 
 
 async def connects(port: int, per_s: float, made: Counter[str]) -> None:
-    """Makes connections at a steady rate and resets each at once."""
+    """Makes connections at a steady rate and resets each at once.
+
+    A machine that is too slow for the rate makes those of the last half second, and the task can still be cancelled.
+    """
     loop = asyncio.get_running_loop()
     begun, n = loop.time(), 0
     while True:
-        n = max(n, int((loop.time() - begun - 0.5) * per_s))  # connections that could not be made in time are skipped
-        while n < (loop.time() - begun) * per_s:
+        due = int((loop.time() - begun) * per_s)
+        n = max(n, due - int(0.5 * per_s))  # connections that could not be made in time are skipped
+        while n < due:
             n += 1
             with contextlib.suppress(OSError), socket.socket() as sock:
                 sock.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, AT_ONCE)
