@@ -335,10 +335,11 @@ class Blocks:
         """
         self._stale = set(other._stale)
         if self.rows == other.rows and len(self.kinds) == len(other.kinds):
-            for row in np.flatnonzero(self.versions[: self.count] != other.versions[: self.count]):
-                self.kinds[row] = other.kinds[row]
-                self.solid[row] = other.solid[row]
-            self.versions[:] = other.versions
+            if self.versions.tobytes() != other.versions.tobytes():
+                for row in np.flatnonzero(self.versions[: self.count] != other.versions[: self.count]).tolist():
+                    self.kinds[row] = other.kinds[row]
+                    self.solid[row] = other.solid[row]
+                self.versions[:] = other.versions
             self.digests[:] = other.digests
             return False
         self.count, self.rows, self._free = other.count, dict(other.rows), list(other._free)

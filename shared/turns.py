@@ -14,7 +14,7 @@ changes are not reported to the world's observer, because a replay of a recordin
 from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING, NamedTuple
 
-from shared.arrays import PLAIN, Truths, np
+from shared.arrays import FEW, Truths, np
 from shared.body import Body
 from shared.body_fields import body_class
 from shared.checks import SceneError
@@ -24,8 +24,6 @@ from shared.layout import BUTTONS, CELL, FALLING, FLAGS, ID, MOVE_X, MOVE_Y, TEM
 if TYPE_CHECKING:
     from shared.world_turns import TurnWorld
 
-FEW = 1 << 31 if PLAIN else 16
-"""Number of entities with behaviours up to which Python looks for the active ones; numpy takes about 10 us at least."""
 FAILURES_MAX = 64
 """Limit of the failed turns that a world keeps until they are taken."""
 

@@ -10,7 +10,7 @@ from typing import Protocol
 
 from shared import blocks, layout
 from shared.aim import NO_AIM
-from shared.arrays import np
+from shared.arrays import FEW, np
 from shared.checks import Cell, SceneError, shown
 from shared.extras import RESERVED
 from shared.free_places import OverlapError, box_at, free_place, overlapping
@@ -361,9 +361,8 @@ class UncheckedWorld(WorldState):
         if theirs is not mine and theirs.fingerprint != mine.fingerprint:
             differ = sorted(name for name, digest in mine.digests.items() if theirs.digests[name] != digest)
             raise SceneError(f"other = a world of {theirs.name!r}: its scene differs in {', '.join(differ)}")
-        cells = self._entities[: self._rows, layout.CELL]
-        self.blocks.heads[cells[cells >= 0]] = -1
-        moved = len(self._entities) != len(other._entities)
+        self._set_heads(there=False)
+        before, moved = self._rows, len(self._entities) != len(other._entities)
         if moved:
             self._allocate(len(other._entities))
         self.editing, self.edited = dict(other.editing), dict(other.edited)
@@ -378,14 +377,24 @@ class UncheckedWorld(WorldState):
             self._fields_setting, self.fields_set = dict(other._fields_setting), dict(other.fields_set)
             if self.turns is not None:
                 self.turns.rows = None
-        self._entities[n:, ID] = 0
+        if before > n:
+            self._entities[n:before, ID] = 0
         self._lengths[:] = other._lengths
         for name, length in LISTS:
             count = int(self._lengths[length])
             getattr(self, name)[:count] = getattr(other, name)[:count]
         moved |= self.blocks.restore(other.blocks)
-        rows = self._entities[:n]
-        first = np.flatnonzero((rows[:, layout.CELL] >= 0) & (rows[:, PREV] < 0) & (rows[:, ID] != 0))
-        self.blocks.heads[rows[first, layout.CELL]] = first
+        self._set_heads(there=True)
         if moved:
             self._bind()
+
+    def _set_heads(self, *, there: bool) -> None:
+        """Sets the heads of all cells with entities to the first row of each, or to none."""
+        heads, rows, cell = self.blocks.heads, self._entities[: self._rows], layout.CELL
+        if len(rows) <= FEW:
+            for first, row in enumerate(rows.tolist()):
+                if row[cell] >= 0 > row[PREV] and row[ID]:
+                    heads[row[cell]] = first if there else -1
+            return
+        firsts = np.flatnonzero((rows[:, cell] >= 0) & (rows[:, PREV] < 0) & (rows[:, ID] != 0))
+        heads[rows[firsts, cell]] = firsts if there else -1

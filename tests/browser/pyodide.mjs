@@ -5,12 +5,13 @@
 //     files     paths of further files, by their path within Pyodide
 //     program   Python source, whose last expression is a text
 //
-// Prints the text.
+// Prints the text. The program may call `js.cpu`, which returns the CPU time so far in seconds.
 
 import { readFileSync } from "node:fs";
 import { pathToFileURL } from "node:url";
 
 const { pyodide, archives, files, program } = JSON.parse(readFileSync(0, "utf-8"));
+globalThis.cpu = () => process.cpuUsage().user / 1e6;
 const read = path => new Uint8Array(readFileSync(path));
 try {
   const { loadPyodide } = await import(pathToFileURL(`${pyodide}/pyodide.mjs`).href);

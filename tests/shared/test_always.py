@@ -2,11 +2,11 @@
 
 import pytest
 
+from shared.arrays import FEW
 from shared.behaviours import Behaviour, field
 from shared.body import Body
 from shared.checks import SceneError
 from shared.scene import Scene, load_scene
-from shared.turns import FEW
 from shared.world import World
 
 
