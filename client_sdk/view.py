@@ -1,14 +1,17 @@
 """The view: what to draw at one moment, as the program gets it. `client_sdk.view_builder` makes it."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
-from typing import Any
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import Any, NamedTuple
 
 from shared.checks import Vec
 
+NO_VALUES: Mapping[str, Any] = MappingProxyType({})
+"""Attributes or fields of an entity that has none."""
 
-@dataclass(frozen=True)
-class EntityView:
+
+class EntityView(NamedTuple):
     """One entity to draw: its number, position in blocks, velocity in blocks/s, and the name of its template.
 
     `attributes` are the named values that the rules of the game gave to the entity, for example "name". `fields` are
@@ -20,8 +23,8 @@ class EntityView:
     template: str
     position: Vec
     velocity: Vec
-    attributes: Mapping[str, Any] = field(default_factory=dict)
-    fields: Mapping[str, int] = field(default_factory=dict)
+    attributes: Mapping[str, Any] = NO_VALUES
+    fields: Mapping[str, int] = NO_VALUES
     facing: tuple[float, float] = (1.0, 0.0)
 
 
