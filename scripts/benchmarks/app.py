@@ -28,6 +28,9 @@ and bytes. It also measures a replay of ten ticks of a lone player, with a behav
 `worlds` searches for the most worlds of four players each that one server process holds at 30 Hz, and measures what an
 empty world costs (memory, CPU time), and the time from asking for a match to playing in a new world.
 
+`scale` measures what a world on many processes costs beside one process: CPU time per client on an edge, per player in
+a replica and in the sequencer, bytes and latency of the bus, and the time to take over.
+
 `peers` plays Colyseus 0.18 (installed from npm into build/) and this project in turn, with their own clients over the
 same line, and says where this project is behind. One run takes about ten minutes.
 """
@@ -45,7 +48,7 @@ from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
-from scripts.benchmarks import abilities, capacity, entities, jitter, memory, physics, rss, step_c, wire, worlds
+from scripts.benchmarks import abilities, capacity, entities, jitter, memory, physics, rss, scale, step_c, wire, worlds
 from scripts.benchmarks.crowds import Samples
 from scripts.benchmarks.peers import app as peers
 from scripts.benchmarks.server import RigError
@@ -297,6 +300,10 @@ def parser() -> argparse.ArgumentParser:
     command = commands.add_parser("worlds", parents=[each], help="worlds per server process (Linux)")
     command.add_argument("--quick", action="store_true", help="one step of few worlds, within a minute")
     command.set_defaults(run=worlds.run)
+    command = commands.add_parser("scale", parents=[each], help="one world on many processes, on a NATS server")
+    command.add_argument("--quick", action="store_true", help="20 bots and one round, within two minutes")
+    command.add_argument("--players", type=int, default=100, help="number of bots (default: %(default)s)")
+    command.set_defaults(run=scale.run)
     peers.add(commands, each)
     return parser
 

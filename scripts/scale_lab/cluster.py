@@ -17,7 +17,7 @@ from typing import Any
 from scripts.environment import ROOT
 from scripts.scale_lab.nats_server import NatsServer
 
-START_S = 60.0
+START_S = 120.0
 """Seconds until a part has to be ready."""
 TIME_OUT_S = 2.0
 """Seconds that a page may take."""
@@ -40,6 +40,8 @@ class PartProcess:
         self.folder, self.name, self._arguments = folder, name, arguments
         self.role = name.rstrip("0123456789 ")
         self.port, self._bus = 0, ""
+        self.recorded = False
+        """Whether its world is recorded."""
         self.starts = 0
         self._process: subprocess.Popen[bytes] | None = None
 
@@ -69,9 +71,9 @@ class PartProcess:
         """
         self.starts += 1
         self._bus = bus or self._bus
-        recording = ("--record", str(self.recording))
-        command = (sys.executable, "-m", "server", *self._arguments, "--bus", self._bus)
-        command += ("--port", str(self.port), *recording)
+        command = [sys.executable, "-m", "server", *self._arguments, "--port", str(self.port)]
+        command += ["--bus", self._bus] if self._bus else []
+        command += ["--record", str(self.recording)] if self.recorded else []
         with self.log.open("wb") as log:
             self._process = subprocess.Popen(
                 command, cwd=ROOT, stdin=subprocess.DEVNULL, stdout=log, stderr=log, env={**os.environ, **ENVIRONMENT}

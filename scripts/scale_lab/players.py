@@ -54,8 +54,8 @@ class Player:
         """Whether it sends commands."""
         self.count = 0
         self.answers: Counter[int] = Counter()
-        self.refused: list[int] = []
-        """Numbers of count commands that the server refused."""
+        self.refused: list[str] = []
+        """Count commands that the server refused, with the reason."""
         self._numbers: dict[int, bool] = {}
         """Numbers of the commands that were sent, and whether each is one that counts."""
         self.corrections: Counter[str] = Counter()
@@ -98,7 +98,7 @@ class Player:
         counted = -1 if me is None else me.attributes.get("count", 0)
         wrong = list(self.faults)
         wrong += [f"command {number} was answered {times} times" for number, times in self.answers.items() if times > 1]
-        wrong += [f"count command {number} was refused" for number in self.refused]
+        wrong += [f"count command {number} was refused" for number in self.refused[:2]]
         if counted != self.count:
             wrong.append(f"{self.count} counts were sent, and the world has {counted}")
         if self.unanswered:
@@ -137,7 +137,7 @@ class Player:
                 case Answered():
                     self.answers[event.number] += 1
                     if self._numbers.get(event.number) and not event.done:
-                        self.refused.append(event.number)
+                        self.refused.append(f"{event.number} ({event.verdict})")
                 case Corrected():
                     self.corrections[event.cause] += 1
                 case Disconnected():

@@ -74,6 +74,11 @@ class Reader(Protocol):
 class Bus(Protocol):
     """One world's part of a bus, and the keys of all worlds."""
 
+    bytes_out: int
+    """Bytes of batches and records that were sent."""
+    bytes_in: int
+    """Bytes of batches and records that were received."""
+
     def publish(self, batch: bytes) -> None:
         """Sends a batch to the sequencer. It may be lost; the edge then sends it again."""
 

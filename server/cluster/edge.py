@@ -24,11 +24,12 @@ from server.config.limits import Limits
 from server.game.session import Session
 from server.journal.recorded_world import RecordedWorld
 from server.journal.records import DivergedError
+from server.observability.histogram import Histogram
 from server.rules import Rules
 from server.runtime.tasks import Tasks
 from server.runtime.ticker import Alarm, best_alarm
 from server.scale.clock import EdgeClock
-from server.scale.edge import EdgeServer
+from server.scale.edge import AHEAD_MAX, EdgeServer
 from server.scale.wire import packed
 from shared import messages
 
@@ -78,6 +79,9 @@ class EdgePart(Part):
         self._limits, self._authenticate, self._rules = limits or Limits(), authenticate, rules
         self._tasks: Tasks | None = None
         self._empty = asyncio.Event()
+        self.round_trip = Histogram()
+        """Durations from a tick's batch to its record: the latency that the bus adds to an input."""
+        self._sent: dict[int, float] = {}
         self._alarm: Alarm | None = None
         self._shed_at = round(SHED_S * self.scene.tick_rate)
 
@@ -147,8 +151,9 @@ class EdgePart(Part):
 
     def stats(self) -> dict[str, Any]:
         core = self.core
-        figures = {"edge_lead_ms": round(1e3 * self.clock.lead_s, 3), "batches_late": self.clock.late}
-        return {**super().stats(), **({} if core is None else core.stats()), **figures, "sheds": self.sheds}
+        figures: dict[str, Any] = {"edge_lead_ms": round(1e3 * self.clock.lead_s, 3), "batches_late": self.clock.late}
+        figures |= {"bus_round_trip_ms": self.round_trip.summary(), "sheds": self.sheds}
+        return {**super().stats(), **({} if core is None else core.stats()), **figures}
 
     def shut_down(self, reason: str, wait: float) -> None:
         if self.core is not None:  # at another edge, a client can go on at once
@@ -178,6 +183,8 @@ class EdgePart(Part):
             newest = self.following.replica.batches.get(self.name)
             if newest is None and self.ready.is_set() and record.epoch == self.following.replica.epoch:
                 raise PartError(f"the sequencer has forgotten the edge {self.name}")
+            if (sent := self._sent.pop(record.tick, None)) is not None:
+                self.round_trip.record(now - sent)
             self.clock.arrived(record.tick, 0 if newest is None else record.tick - newest, now)
             self.lateness.record(max(now - self.clock.due(record.tick) - self.clock.lead_s, 0.0))
             self.ticks += 1
@@ -224,4 +231,7 @@ class EdgePart(Part):
                 self._alarm.set(now + 1 / self.scene.tick_rate)
                 return
             self.bus.publish(packed(batch))
+            if len(self._sent) > AHEAD_MAX:  # their records came before them
+                self._sent.clear()
+            self._sent[batch.number] = now
         self._schedule(core)

@@ -74,6 +74,7 @@ class LocalBus:
 
     def __init__(self, hub: LocalHub) -> None:
         self._hub = hub
+        self.bytes_out = self.bytes_in = 0
         self._mine: list[Callable[[bytes], None]] = []
 
     def publish(self, batch: bytes) -> None:

@@ -31,8 +31,8 @@ from server.scale.writer import EMPTY, Entry
 
 ACK_S = 0.5
 """Seconds to wait for the acknowledgement of a record."""
-ANSWER_S = 2.0
-"""Seconds to wait for other answers."""
+ANSWER_S, LOOK_S = 2.0, 0.3
+"""Seconds to wait for other answers, and for the one about the newest record, which is asked for again and again."""
 CONNECT_S = 5.0
 """Seconds to wait for a connection at the start."""
 RECONNECT_S = 0.1
@@ -62,7 +62,6 @@ class NatsBus:
         self._store: Any = None
         self._tasks: set[asyncio.Task[None]] = set()
         self.bytes_out = self.bytes_in = 0
-        """Bytes of batches and records that were sent and received."""
 
     @classmethod
     async def connect(cls, url: str, world: str, *, replicas: int = 1) -> "NatsBus":
@@ -401,8 +400,9 @@ class NatsReader:
 
     async def _look_at_the_end(self) -> None:
         """Asks for the newest record, because it may have been missed."""
-        with contextlib.suppress(BusError):
-            self._newest = max(self._newest, (await self._bus.end())[0])
+        with contextlib.suppress(BusError, TimeoutError):
+            async with asyncio.timeout(LOOK_S):
+                self._newest = max(self._newest, (await self._bus.end())[0])
 
     async def _fetch(self) -> None:
         """Fetches the records that are missing before the first one that has come."""

@@ -92,6 +92,8 @@ class Part:
             "segments": len(self.world.blocks.rows),
             "epoch": self.following.replica.epoch,
             "log_seq": self.following.seq,
+            "bus_bytes_out": self.bus.bytes_out,
+            "bus_bytes_in": self.bus.bytes_in,
             "ticks": self.ticks,
             "tick_work_ms": self.work.summary(),
         }

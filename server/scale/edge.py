@@ -41,6 +41,8 @@ from shared.messages import Hello, Welcome, encode
 RESEND_TICKS, RESENT_MAX = 8, 64
 """Ticks without a batch in the records after which the unrecorded batches are sent again: one of them was lost on the
 way. Maximum number of batches that are sent again at once."""
+STILL_S = 30.0
+"""Seconds for which time may stand still, while clients go on, before commands are refused as too far ahead."""
 AHEAD_MAX = 8
 """Maximum number of batches that are in no record yet. An edge that hears nothing of the sequencer stops there."""
 IN_TIME_S = 0.5
@@ -79,7 +81,7 @@ class EdgeServer(Front):
         self.limits, self.counters, self.faults = limits or Limits(), Counters(), FaultReporter()
         self._row_bytes, self._bounds = self.scene.input_row_bytes, bounds(self.scene.tick_rate)
         self._roster = EdgeRoster(replica.kept.players)
-        self.commands = EdgeCommands(self.limits, self._bounds.ahead)
+        self.commands = EdgeCommands(self.limits, self._bounds.ahead + in_ticks(STILL_S, self.scene.tick_rate, 1))
         self._half = Edge(world, replica.kept, self.limits, self.counters, lambda: world.tick, apart=True)
         self.log, self.sender = self._half.log, self._half.sender
         self.log.faults = self.faults

@@ -17,7 +17,7 @@ class RemoteLink:
 
     Args:
         edge, client: the edge, and its number of the client.
-        token: digest of the resume token that the edge gives the client.
+        token: digest of the resume token that the edge gives the client; empty: it was taken over with its player.
         ended: where an end is reported (`Record.ended`).
     """
 
@@ -62,6 +62,12 @@ class RemoteRoster(Roster):
 
     def _digest(self, token: bytes) -> bytes:
         return token
+
+    def lost(self, session: Session, now: float) -> None:
+        super().lost(session, now)
+        player, link = session.player, session.link
+        if player is not None and player.session is None and isinstance(link, RemoteLink) and not link.token:
+            player.reconnect_until = now + self._limits.resume_s  # taken over; the log does not say what it has seen
 
     def issue(self, player: Player) -> bytes:
         assert player.session is not None

@@ -212,6 +212,37 @@ def test_the_clients_of_an_edge_that_is_cut_off_go_on_at_another_one() -> None:
     hashes_agree(match)
 
 
+def test_a_player_may_come_back_for_long_after_a_takeover(monkeypatch: pytest.MonkeyPatch) -> None:
+    match = ScaledMatch(load_scene("flat"), 1, edges=2, standbys=1)
+    player = match.join(wander, PATH)
+    match.run(3)
+    entity, edge = player.core.entity, player.edge
+    assert edge is not None
+    match.kill(match.sequencer)
+    match.run(1)
+    with monkeypatch.context() as patch:
+        patch.setattr(match, "route", lambda path: "no edge answers")
+        match.kill(edge)
+        match.run(5)
+    match.run(10)
+    assert (player.core.state, player.core.entity) == ("playing", entity)
+    hashes_agree(match)
+
+
+def test_commands_wait_while_time_stands_still() -> None:
+    match = ScaledMatch(load_scene("flat"), 1, edges=1, standbys=0, rules=Tally)
+    sent: Counter[str] = Counter()
+    player = match.join(asks(sent), PATH)
+    match.run(3)
+    match.bus.hold(match.sequencer.name, "log", 3.0)
+    match.run(3)
+    calm(match, 8)
+    answers = [event for event in player.events if isinstance(event, Answered)]
+    assert len(answers) == sent[player.core.name]
+    assert {event.verdict for event in answers} == {"done"}
+    hashes_agree(match)
+
+
 @pytest.mark.parametrize("seed", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_a_lost_batch_is_sent_again(seed: int) -> None:
     match = ScaledMatch(load_scene("meadow"), seed, edges=2, rules=Tally, bus={"lost": 0.01, "twice": 0.02})
