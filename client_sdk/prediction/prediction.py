@@ -372,10 +372,7 @@ class Prediction:
 
     def _difference(self, predicted_states: Int64s, confirmed_states: Int64s) -> tuple[tuple[str, ...], float] | None:
         """Returns the fields and the distance (blocks) by which the own entity differs; None if it does not."""
-        was, mine = (
-            predicted_states[predicted_states[:, ID] == self.entity],
-            confirmed_states[confirmed_states[:, ID] == self.entity],
-        )
+        was, mine = (states[states[:, ID] == self.entity] for states in (predicted_states, confirmed_states))
         if not len(mine) or not len(was) or np.array_equal(mine, was):
             return None
         now, before = mine[0].tolist(), was[0].tolist()

@@ -2,20 +2,20 @@
 
 import gzip
 import json
-import shutil
 import subprocess
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from scripts.browser_build.packages import FetchError, npm_package, wheels
+from scripts.browser_build import tools
+from scripts.browser_build.packages import npm_package, wheels
+from scripts.browser_build.tools import FetchError
 from server.play.bundles import source_bundle
 from tests.acrobat import CLASSES
 from tests.browser.replayed import SAME, replayed
 from tests.browser.tapes import Recorded, acrobats, walkers
 
-NODE = shutil.which("node")
 ROOT = Path(__file__).parent.parent.parent
 MODULES = ("tests/acrobat.py", "tests/browser/replayed.py")
 PROGRAM = """
@@ -31,24 +31,23 @@ found = [
 json.dumps(found)
 """
 
-pytestmark = [pytest.mark.slow, pytest.mark.skipif(NODE is None, reason="there is no Node.js")]
+pytestmark = pytest.mark.slow
+Packages = tuple[str, Path, list[Path]]
+"""Node.js, the folder of Pyodide, and the wheels for it."""
 
 
 @pytest.fixture(scope="module")
-def packages() -> tuple[Path, list[Path]]:
-    """The folder of Pyodide, and the wheels for it."""
+def packages() -> Packages:
+    """The packages, which are fetched if they are missing."""
     try:
-        return npm_package("pyodide"), wheels()
+        return tools.node(), npm_package("pyodide"), wheels()
     except FetchError as error:
         pytest.skip(str(error))
 
 
-def in_pyodide(
-    packages: tuple[Path, list[Path]], recorded: list[Recorded], folder: Path, form: str = ""
-) -> list[dict[str, Any]]:
+def in_pyodide(packages: Packages, recorded: list[Recorded], folder: Path, form: str = "") -> list[dict[str, Any]]:
     """Returns the results of tapes that are played in Pyodide, with the archive that a server hands out."""
-    assert NODE is not None
-    pyodide, own = packages
+    node, pyodide, own = packages
     sources = folder / "sources.zip"
     sources.write_bytes(gzip.decompress(source_bundle().files["sources.zip"].packed))
     files = {f"/site/{name}": str(ROOT / name) for name in MODULES}
@@ -61,7 +60,7 @@ def in_pyodide(
         "files": files,
         "program": PROGRAM.format(form=form, behaves=[each.tape.behaves for each in recorded]),
     }
-    command = (NODE, str(Path(__file__).with_name("pyodide.mjs")))
+    command = (node, str(Path(__file__).with_name("pyodide.mjs")))
     done = subprocess.run(command, input=json.dumps(given), capture_output=True, text=True, timeout=300, check=False)
     assert done.returncode == 0, done.stderr
     found: list[dict[str, Any]] = json.loads(done.stdout.splitlines()[-1])
@@ -74,7 +73,7 @@ def natively(recorded: Recorded) -> dict[str, Any]:
     return {name: found[name] for name in SAME}
 
 
-def test_the_same_bytes_views_worlds_and_corrections(packages: tuple[Path, list[Path]], tmp_path: Path) -> None:
+def test_the_same_bytes_views_worlds_and_corrections(packages: Packages, tmp_path: Path) -> None:
     recorded = [walkers(10, players=20, link="far"), walkers(6, players=4, scene="hills"), acrobats(15)]
     assert recorded[0].replayed > 20
     assert recorded[2].corrections > 0
@@ -85,7 +84,7 @@ def test_the_same_bytes_views_worlds_and_corrections(packages: tuple[Path, list[
     print(json.dumps({"CPU time in ms (mean, median, p99)": [each["ms"] for each in found]}))
 
 
-def test_the_plain_kernel_too(packages: tuple[Path, list[Path]], tmp_path: Path) -> None:
+def test_the_plain_kernel_too(packages: Packages, tmp_path: Path) -> None:
     recorded = [acrobats(2, players=3)]
     (found,) = in_pyodide(packages, recorded, tmp_path, "plain")
     assert found["kernel"] == "plain"

@@ -16,11 +16,12 @@ import pytest
 from client_sdk.async_client import AsyncClient
 from client_sdk.bots import Bot, RunAndJump
 from scripts.browser_build import runtime
-from scripts.browser_build.packages import FetchError, npm_package, wheels
+from scripts.browser_build.packages import npm_package, wheels
+from scripts.browser_build.tools import FetchError
 from scripts.live_page.chromium import chromium, installed
 from tests.client_sdk.servers import real_server
-from tests.e2e.test_live_page import BROWSER
 
+BROWSER = installed()
 MINUTE_S = 60
 BOTS = 12
 JOIN_S = 240.0
@@ -28,7 +29,7 @@ pytestmark = [
     pytest.mark.e2e,
     pytest.mark.slow,
     pytest.mark.alone,
-    pytest.mark.skipif(installed() is None, reason="there is no Chromium on this machine"),
+    pytest.mark.skipif(BROWSER is None, reason="there is no Chromium on this machine"),
 ]
 
 PLAY = """(async () => {
