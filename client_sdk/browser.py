@@ -25,6 +25,7 @@ from client_sdk.pending_events import PendingEvents
 from client_sdk.transports.browser import BrowserTransport, OpenSocket, browser_socket
 from shared.behaviours import Behaviour
 from shared.checks import duration
+from shared.inputs import make_input
 from shared.scene import Scene
 
 if TYPE_CHECKING:
@@ -196,8 +197,6 @@ class BrowserClient(BaseClient):
             buttons: bits of the buttons that are held, in the order of the scene's `buttons`.
             aim: direction (x, y, z) in space; None: none.
         """
-        from shared.inputs import make_input
-
         self.core.set_input(make_input(x, y, buttons=buttons, aim=None if aim is None else tuple(aim)))
 
     def set_link(self, name: str) -> None:

@@ -39,7 +39,8 @@ class PictureBlocks:
     def changed(self) -> set[Cell]:
         """Returns the segments that have changed, arrived or gone since the last call. The first call returns all."""
         blocks = self._blocks
-        now = {} if blocks is None else {cell: int(blocks.versions[row]) for cell, row in blocks.rows.items()}
+        versions: list[int] = [] if blocks is None else blocks.versions.tolist()
+        now = {} if blocks is None else {cell: versions[row] for cell, row in blocks.rows.items()}
         before, self._seen = self._seen, now
         return {cell for cell in before.keys() | now.keys() if before.get(cell) != now.get(cell)}
 

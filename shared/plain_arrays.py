@@ -150,3 +150,12 @@ def searchsorted(values: Vector, wanted: Vector) -> Vector:
     """Returns for each wanted value the place of the first element that is not less, in ascending values."""
     given = values.tolist()
     return shaped(int64, [bisect_left(given, each) for each in wanted.tolist()], None)  # type: ignore[no-any-return]
+
+
+def __getattr__(name: str) -> Any:
+    """Refuses what only a server uses.
+
+    Raises:
+        AttributeError: always.
+    """
+    raise AttributeError(f"{name}: numpy is not installed, and arrays in plain Python do not have this")

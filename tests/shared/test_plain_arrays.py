@@ -174,3 +174,8 @@ def test_what_does_not_fit_is_an_error() -> None:
         plain.array([1 << 63], plain.int64)
     with pytest.raises(TypeError):
         hash(ours)
+
+
+def test_what_only_a_server_needs_says_that_numpy_is_missing() -> None:
+    with pytest.raises(AttributeError, match=r"^argwhere: numpy is not installed, and"):
+        plain.argwhere  # noqa: B018
