@@ -3,10 +3,11 @@
 import asyncio
 import contextlib
 import secrets
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import structlog
+from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
 
 from server.cluster.bus import BusError
 from server.cluster.edge import EdgePart
@@ -20,6 +21,7 @@ from server.journal.recorded_world import RecordedWorld
 from server.net.addresses import bracketed, reachable
 from server.net.gateway import Events
 from server.observability.histogram import Histogram
+from server.observability.metrics import PREFIX
 from server.observability.pages import Page, line
 from server.play.play import PlayPages, play_pages
 from server.rules import Rules
@@ -31,6 +33,25 @@ from shared.scene import Scene
 
 LEAVE_S = 12.0
 """Seconds that the shutdown waits until the clients have gone on at other edges."""
+
+PART_GAUGES = {
+    "epoch": "Epoch of the newest record.",
+    "log_seq": "Sequence number of the newest record that the part has.",
+    "leads": "1 if the part is the sequencer now, otherwise 0.",
+    "unacknowledged": "Records that the log has not acknowledged.",
+    "takeover_ms": "Length of the pause that ended with this part's takeover, in milliseconds.",
+    "edge_lead_ms": "Time by which an edge takes inputs ahead of the sequencer, in milliseconds.",
+}
+"""Gauges of the parts by the name of the figure in `/stats`, with their help texts. A part has those of its role."""
+PART_COUNTERS = {
+    "checkpoints": "Checkpoints saved.",
+    "repeated": "Records sent again.",
+    "ticks_still": "Ticks that were left out because the log did not answer.",
+    "batches_late": "Records that lacked the batch of this edge.",
+    "sheds": "Times that this edge sent its clients away because it was behind.",
+    "handovers_asked": "Clients that were asked to go on at another edge.",
+}
+"""Counters of the parts by the name of the figure in `/stats`, with their help texts."""
 
 logger = structlog.stdlib.get_logger("server")
 
@@ -89,6 +110,18 @@ class PartServer(Serving):
 
     def _durations(self) -> dict[str, Histogram]:
         return {"tick_lateness_seconds": self.part.lateness, "tick_work_seconds": self.part.work}
+
+    def _metrics(self) -> Iterator[Metric]:
+        figures = self.part.stats()
+        part = GaugeMetricFamily(PREFIX + "part", "1: a part with this role runs.", labels=["role", "world"])
+        part.add_metric([self.settings.role, self.settings.world], 1)
+        yield part
+        for name, text in PART_GAUGES.items():
+            if name in figures:
+                yield GaugeMetricFamily(PREFIX + name, text, figures[name])
+        for name, text in PART_COUNTERS.items():
+            if name in figures:
+                yield CounterMetricFamily(PREFIX + name, text, figures[name])
 
     def _route(self, target: str, address: str) -> Events | Page:
         part = self.part

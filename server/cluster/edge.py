@@ -153,7 +153,9 @@ class EdgePart(Part):
         core = self.core
         figures: dict[str, Any] = {"edge_lead_ms": round(1e3 * self.clock.lead_s, 3), "batches_late": self.clock.late}
         figures |= {"bus_round_trip_ms": self.round_trip.summary(), "sheds": self.sheds}
-        return {**super().stats(), **({} if core is None else core.stats()), **figures}
+        if core is not None:
+            figures |= {**core.stats(), "handovers_asked": core.moves.asked}
+        return {**super().stats(), **figures}
 
     def shut_down(self, reason: str, wait: float) -> None:
         if self.core is not None:  # at another edge, a client can go on at once

@@ -40,6 +40,8 @@ class Moves:
         self._name, self._address, self._replica, self._connections = name, address, replica, connections
         self.draining = False
         """Whether the edge is about to stop."""
+        self.asked = 0
+        """Number of clients that were asked to go on elsewhere so far."""
         self._asked: dict[Session, float] = {}
         """Times in seconds at which clients were asked to go on elsewhere."""
         self._told: list[str] = []
@@ -106,6 +108,7 @@ class Moves:
         if not self._plays(session):
             return False
         self._asked[session] = now
+        self.asked += 1
         session.send(encode(HandOver(address, reason)))
         return True
 

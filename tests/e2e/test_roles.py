@@ -42,5 +42,8 @@ async def test_a_standby_takes_over_from_a_sequencer_that_was_killed(cluster: Cl
     await client.close()
     status, page = await standby.page("/metrics")
     assert (status, b"sovereign_tick " in page) == (200, True)
+    assert b'sovereign_part{role="standby",world="world"} 1.0' in page
+    assert b"sovereign_leads 1.0" in page
+    assert b"sovereign_epoch 2.0" in page
     assert await asyncio.to_thread(other.wait, 30.0) == 2, "a part of another world does not start"
     assert "error: the world 'world' on the bus is another one (scene." in other.log.read_text("utf-8")
