@@ -86,15 +86,19 @@ class Handover:
                 self.waiting.append(message)
 
     def copy(self, message: Any, commands: Callable[[], list[bytes]]) -> None:
-        """Sends a message of the input loop over the second connection, too, if its replica is complete.
+        """Sends a message of the input loop over the second connection, too, once its replica is complete.
+
+        It goes on even if the terrain of another segment is missing for a while: the server expects every tick.
 
         Args:
             message: the message.
             commands: returns the commands without a result, which are sent ahead of the first message.
         """
-        if self.replica is None or not self.replica.complete:
+        if self.replica is None:
             return
         if not self._copies:
+            if not self.replica.complete:
+                return
             self._copies = True
             self._out += commands()
         if isinstance(message, Inputs):

@@ -420,6 +420,25 @@ def test_a_hand_over_on_a_bad_line_costs_late_inputs_only(path: Link) -> None:
     hashes_agree(match)
 
 
+def test_inputs_have_no_gap_while_terrain_is_on_its_way(monkeypatch: pytest.MonkeyPatch) -> None:
+    match = ScaledMatch(load_scene("hills"), 7, edges=2)
+    player = match.join(wander, Link(delay_s=0.03))
+    match.run(3)
+    here, there = player.edge, next(edge for edge in match.edges if edge is not player.edge)
+    player.move(there)
+    match.run_until(lambda: any(getattr(each.inputs, "switching", False) for each in there.core.sessions), 3)
+    assert player.core.handover is not None
+    assert player.core.handover.replica is not None
+    monkeypatch.setattr(player.core.handover.replica.confirmed, "grounded", lambda: False)
+    match.run(0.1)
+    assert player.edge is here
+    monkeypatch.undo()
+    match.run(3)
+    stats = player.core.stats
+    assert player.edge is there
+    assert (stats.inputs_refused, stats.inputs_substituted, stats.resyncs, stats.corrections) == (0, 0, 0, 0)
+
+
 def test_an_edge_that_drains_hands_over_all_its_clients_and_takes_no_more() -> None:
     match = ScaledMatch(load_scene("meadow"), 4, edges=3, rules=Tally)
     sent: Counter[str] = Counter()
