@@ -38,7 +38,7 @@ EXPORTS = {
         "take_messages": "QDQbqdBqd",
         "take_inputs": "QQQnnn",
         "due_rows": "QdQd",
-        "write_snapshots": "QDqqqbBQqd",
+        "write_snapshots": "QDiqqbBQqd",
     },
 }
 """Argument kinds of each function, by source: one letter per argument. A function returns nothing, a truth value, or a

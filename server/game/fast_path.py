@@ -156,7 +156,11 @@ class FastPath:
         data, spans, times, rows = self._data, self._spans, self._times, self._rows
         self._renew()
         fates, rules, clock = bytearray(len(data)), self._rules, self._clock
-        rules.values[0], rules.values[1], rules.values[2] = self._world.tick, self._bounds.ahead, self._row_bytes
+        rules.values[0], rules.values[1], rules.values[2] = (
+            self._world.tick,
+            min(self._bounds.ahead, rows.slots),
+            self._row_bytes,
+        )
         rules.values[3], rules.values[4] = self._limits.input_rows_max, rows.slots
         clock.values[0], clock.values[1], clock.values[2] = self._clocks.deadline, self._rate, self._catch_up
         clock.values[3], clock.values[4] = self._bounds.margin_one, self._clocks.burst
@@ -323,7 +327,7 @@ class FastPath:
         if session.plain < max(session.patience, PATIENCE):
             return
         tick = self._world.tick
-        if not fits(session, tick):
+        if not fits(session, tick, self._rows.slots):
             session.plain = 0
             return
         if self._n == 0:

@@ -7,7 +7,7 @@ import numpy as np
 
 from server.game.session import Session
 from server.players.input_queue import InputQueue, decoded
-from shared.bounds import bounds
+from shared.bounds import in_ticks
 from shared.inputs import ROW, Input, row
 from shared.kernels import NUMBA, Kernel
 from shared.scene import Scene
@@ -50,7 +50,9 @@ from shared.traffic import (
 )
 
 ROWS_MIN = 4
-"""Number of rows at first. It doubles when all are in use."""
+"""Number of rows at first. It grows by half when all are in use."""
+WAITING_S, SLOTS_MIN = 0.5, 16
+"""Seconds for which inputs can wait in a row, and the minimum in ticks. Clients are not further ahead by themselves."""
 INPUTS_KEPT = 4096
 """Maximum number of decoded inputs that are kept."""
 
@@ -94,8 +96,8 @@ class Rows:
 
     def __init__(self, scene: Scene, kernel: Kernel) -> None:
         self._kernel, self._aim = kernel, scene.aim
-        self.slots = bounds(scene.tick_rate).ahead + 1
-        """Number of slots of a row's ring. An input waits at most `Bounds.ahead` ticks, so no two share a slot."""
+        self.slots = in_ticks(WAITING_S, scene.tick_rate, SLOTS_MIN)
+        """Number of slots of a row's ring: for how many ticks ahead a row can have inputs."""
         self.sessions: list[Session | None] = []
         """Session of each row; None: the row is free."""
         self._inputs: dict[tuple[int, int], Input] = {}
@@ -109,7 +111,7 @@ class Rows:
             ("numbers", WIDTH, "q"),
             ("floats", FLOATS, "d"),
             ("ring", self.slots * SLOT, "q"),
-            ("views", SEGMENTS, "q"),
+            ("views", SEGMENTS, "i"),
             ("taken", 2, "q"),
             ("spans", 2, "q"),
             ("due", 1, "q"),
@@ -142,7 +144,7 @@ class Rows:
             segments: numbers of the segments of its client view.
         """
         if None not in self.sessions:
-            self._grow(2 * len(self.sessions))
+            self._grow(len(self.sessions) * 3 // 2)
         at = self.sessions.index(None)
         self.sessions[at] = session
         queue, stream = session.inputs, session.stream
@@ -163,7 +165,7 @@ class Rows:
         reals[RECEIVED_AT], reals[ALLOWANCE], reals[SENT_AT] = session.received_at, session.allowance, stream.sent_at
         reals[MEASURE_AT], reals[HELD_SHARE], reals[PROBE_AT] = flow.measure_at, flow.held_share, probe_at
         self.floats[at * FLOATS : (at + 1) * FLOATS] = array("d", reals)
-        self.views[at * SEGMENTS : at * SEGMENTS + len(segments)] = array("q", segments)
+        self.views[at * SEGMENTS : at * SEGMENTS + len(segments)] = array("i", segments)
         start, end = at * self.slots * SLOT, (at + 1) * self.slots * SLOT
         self.ring[start:end] = array("q", [-1]) * (end - start)
         for tick, input_ in queue.waiting.items():
@@ -256,8 +258,14 @@ class Rows:
         return int.from_bytes(packed[: ROW.size], "little"), int.from_bytes(packed[ROW.size :], "little")
 
 
-def fits(session: Session, tick: int) -> bool:
-    """Returns whether a row can hold the state of a session that was just sent the snapshot of a tick."""
+def fits(session: Session, tick: int, slots: int) -> bool:
+    """Returns whether a row can hold the state of a session that was just sent the snapshot of a tick.
+
+    Args:
+        session: the session.
+        tick: the tick.
+        slots: slots of a row.
+    """
     queue, stream, player = session.inputs, session.stream, session.player
     view, segments = stream.view, stream.view.plain
     return (
@@ -267,6 +275,7 @@ def fits(session: Session, tick: int) -> bool:
         and not session.closed
         and session.greeting is None
         and 0 <= queue.first <= tick
+        and queue.accepted <= tick + slots
         and len(queue.margins) <= KEPT // 2
         and len(queue.statuses) <= 1
         and stream.acked >= 0

@@ -1,6 +1,5 @@
 """The sending side of one connection: what the client has been sent, what it has acknowledged, and what is due."""
 
-from collections import deque
 from typing import Protocol
 
 from server.replication.client_view import ClientView
@@ -46,7 +45,7 @@ class ClientStream:
         """Pairs of ticks of consecutive snapshots between which other ticks were left out, for lag compensation."""
         self.probe: tuple[int, float, int] | None = None
         """Snapshot that measures the round trip, sent when nothing was on the way: its tick, time in seconds, bytes."""
-        self.terrain_due: deque[Cell] = deque()
+        self.terrain_due: list[Cell] = []
         """Segments whose blocks are still to be sent, nearest first."""
         self.terrain_now: tuple[Cell, bytes, int] | None = None
         """The segment that is being sent: its cell, its packed blocks, and how many bytes of them have been sent."""

@@ -28,7 +28,6 @@ snapshot count as on the way until the client acknowledges it.
 """
 
 import math
-from collections import deque
 from collections.abc import Callable
 
 RATE_WINDOW_S = 1.0
@@ -73,7 +72,7 @@ class FlowControl:
         # If the link cannot tell: the snapshots that are not acknowledged, with the total of bytes after each. They
         # count from the first acknowledgement on, because a client that waits for terrain sends none.
         self._blind = False
-        self._unheard: deque[tuple[int, int]] = deque()
+        self._unheard: list[tuple[int, int]] = []
         self._heard = -1
         self.measure_at = -math.inf
         """Time in seconds of the next measurement."""
@@ -122,7 +121,7 @@ class FlowControl:
         if self._heard < 0:
             self._heard = self.sent_bytes
         while self._unheard and self._unheard[0][0] <= tick:
-            self._heard = self._unheard.popleft()[1]
+            self._heard = self._unheard.pop(0)[1]
 
     def answered(self, rtt_s: float, size: int, now: float) -> None:
         """Takes a measured round trip.

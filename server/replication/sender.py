@@ -8,7 +8,6 @@ the entities it names (`server.players.outbox`). The blocks of new segments foll
 room, so terrain never delays a snapshot.
 """
 
-from collections import deque
 from collections.abc import Collection, Iterable
 
 import numpy as np
@@ -107,10 +106,10 @@ class Sender:
         due = {segment for segment in segments if segment in self._world.blocks}
         stream.terrain_due = self._nearest(stream, sorted(due.union(stream.terrain_due)))
 
-    def _nearest(self, stream: ClientStream, segments: Iterable[Cell]) -> deque[Cell]:
+    def _nearest(self, stream: ClientStream, segments: Iterable[Cell]) -> list[Cell]:
         """Returns segments in the order in which their blocks are sent: the nearest first."""
         own = stream.view.near[0] if stream.view.near else (0, 0, 0)
-        return deque(sorted(segments, key=lambda segment: interest.distance(segment, own)))
+        return sorted(segments, key=lambda segment: interest.distance(segment, own))
 
     def _send_snapshot(self, stream: ClientStream, player: Player, room: int) -> None:
         tick, inputs, sight = self._world.tick, player.inputs, stream.view

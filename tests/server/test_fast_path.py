@@ -159,7 +159,7 @@ class Peer:
             aim = (rng.randrange(-99, 99), 5, 7) if self.crowd.game.scene.aim else (0, 0, 0)
             self.move = clamp(Input(rng.randrange(-127, 128), rng.randrange(-127, 128), rng.randrange(2) * JUMP, aim))
         if self.next >= 0 and not (busy and rng.random() < 0.03):
-            self.say_inputs(1 if rng.random() < 0.9 else rng.randrange(0, 5))
+            self.say_inputs(1 if rng.random() < 0.9 else rng.randrange(3))
         if rng.random() < 1 / 30:
             self.say(encode(Ping(rng.random(), rng.randrange(3))))
         if self.next >= 0 and rng.random() < busy:
@@ -195,7 +195,7 @@ class Peer:
         elif kind == 10 and rng.random() < 0.2:
             self.say(encode(Bye(1000, "", -1.0))) if rng.random() < 0.3 else self.lose()
         elif kind == 11:
-            for _ in range(rng.randrange(1, 30)):
+            for _ in range(rng.randrange(1, 30)):  # then it is far ahead
                 self.say_inputs(1)
 
 
