@@ -6,8 +6,7 @@ do not overflow here: a value that an array cannot hold is an error.
 """
 
 from array import array as buffer
-from bisect import bisect_left
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 from shared.plain_views import (
@@ -45,10 +44,8 @@ __all__ = [
     "full",
     "int32",
     "int64",
-    "isin",
     "lexsort",
     "ndarray",
-    "searchsorted",
     "sort",
     "uint8",
     "uint32",
@@ -138,18 +135,6 @@ def lexsort(keys: Sequence[Vector]) -> Vector:
 def sort(values: Vector) -> Vector:
     """Returns a sorted copy."""
     return shaped(values.dtype, sorted(values.tolist()), None)  # type: ignore[no-any-return]
-
-
-def isin(values: Vector, among: Iterable[Any]) -> Vector:
-    """Returns for each element whether it is one of several values."""
-    known = set(among)
-    return shaped(bool_, [value in known for value in values.tolist()], None)  # type: ignore[no-any-return]
-
-
-def searchsorted(values: Vector, wanted: Vector) -> Vector:
-    """Returns for each wanted value the place of the first element that is not less, in ascending values."""
-    given = values.tolist()
-    return shaped(int64, [bisect_left(given, each) for each in wanted.tolist()], None)  # type: ignore[no-any-return]
 
 
 def __getattr__(name: str) -> Any:

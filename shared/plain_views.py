@@ -181,10 +181,6 @@ class Vector(ndarray):
         """Returns whether any element is true."""
         return any(self.data.tolist())
 
-    def max(self) -> Any:
-        """Returns the greatest element."""
-        return max(self.data.tolist())
-
     def reshape(self, *shape: Any) -> Any:
         """Returns a view with other dimensions, at most two."""
         if shape == (-1,):
