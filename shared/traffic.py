@@ -1,12 +1,9 @@
 """The part of the kernel for the messages of many clients at once: taking their inputs, writing their snapshots.
 
-Nothing here moves an entity. Only servers use it (`server.game.fast_path`, which describes the rows). It handles plain
-messages alone and reports all others, for which the code in Python is both the specification and the implementation.
-This source runs compiled by Numba and, unchanged, in plain Python. Its floats give the same bits everywhere, because it
-only adds, subtracts, multiplies and compares them.
-
-A session has a row of whole numbers, a row of floats, the segments of its client view, and a ring of slots for the
-inputs that wait, one per tick.
+Only servers use it (`server.game.fast_path`). It handles plain messages alone and reports all others. This source runs
+compiled and, unchanged, in plain Python. It adds, subtracts, multiplies and compares floats, so their bits are the same
+everywhere. A session has a row of whole numbers, a row of floats, the segments of its client view, and a ring of slots
+for the inputs that wait, one per tick.
 """
 
 from typing import Any
