@@ -53,6 +53,7 @@ export class Client extends EventTarget {
     this.closed = false;
     this._attributes = new Map();
     this._blocks = new Map();
+    this._near = {}; // the segment that was looked up last
     this._view = { tick: 0, me: null, others: [], state: "joining" };
     this._asked = false;
     this._sent = "";
@@ -110,7 +111,9 @@ export class Client extends EventTarget {
 
   // Returns the kind of a block; undefined if its segment is not loaded.
   block(x, y, z) {
-    return this._blocks.get(`${x >> 5},${y >> 5},${z >> 5}`)?.[(z & 31) << 10 | (y & 31) << 5 | (x & 31)];
+    const i = x >> 5, j = y >> 5, k = z >> 5, near = this._near;
+    if (near.i !== i || near.j !== j || near.k !== k) this._near = { i, j, k, kinds: this.segment(i, j, k) };
+    return this._near.kinds?.[(z & 31) << 10 | (y & 31) << 5 | (x & 31)];
   }
 
   // The indices of the segments that are loaded.
@@ -164,6 +167,7 @@ export class Client extends EventTarget {
     this.scene = scene;
     this._fields = fields;
     this._blocks.clear();
+    this._near = {};
     this._attributes.clear();
   }
 
@@ -186,6 +190,7 @@ export class Client extends EventTarget {
       else this._attributes.set(Number(entity), given);
     }
     for (const { at, kinds } of blocks) this._blocks.set(at.join(), kinds);
+    if (blocks.length) this._near = {};
     if (game) Object.assign(this, { shared: game.shared, private: game.private, world: game.world, code: game.code });
     this.stats = Object.fromEntries(Object.entries(head).map(([name, i]) => [name, values[i]]));
     this.stats.worker_ms = frameMs;

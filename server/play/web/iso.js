@@ -83,8 +83,11 @@ export class Ground {
     const left = project(low[0], low[1], 0)[0], right = project(high[0], high[1], 0)[0];
     const top = project(low[0], high[1], high[2])[1], bottom = project(high[0], low[1], low[2])[1];
     let found = false;
-    for (const [x, y, z] of ahead(low, high)) {
-      const [px, py] = project(x, y, z);
+    const [x0, y0, z0] = low.map(Math.floor);
+    for (const [dx, dy, dz] of AHEAD) {
+      const x = x0 + dx, y = y0 + dy, z = z0 + dz;
+      if (x < high[0] && y + 1 > low[1] && z < high[2]) continue; // not in front of it
+      const px = (x + y) * HALF, py = (x - y) * QUARTER - z * RISE;
       if (px + 2 * HALF <= left || px >= right || py + QUARTER <= top || py - QUARTER - RISE >= bottom) continue;
       if (!this._blocks.block(x, y, z)) continue;
       const picture = this._pictures.get(`${x >> 5},${y >> 5},${z >> 5}`);
@@ -192,15 +195,16 @@ function fill(context, { points, colour }, dx, dy) {
   context.stroke();
 }
 
-function ahead(low, high) { // the cells that may hide a box, the furthest first
-  const [x0, y0, z0] = low.map(Math.floor), cells = [];
+// Offsets of the cells that may hide a box, the furthest first: those on the line of sight, and next to it.
+const AHEAD = (() => {
+  const cells = new Map();
   for (let step = 0; step < 7; step++)
     for (let i = -1; i <= 1; i++) for (let j = -1; j <= 1; j++) for (let k = -1; k <= 2; k++) {
-      const cell = [x0 + step + i, y0 - step + j, z0 + step + k];
-      if (cell[0] >= high[0] || cell[1] + 1 <= low[1] || cell[2] >= high[2]) cells.push(cell);
+      const cell = [step + i, j - step, step + k];
+      cells.set(cell.join(), cell);
     }
-  return cells.sort((a, b) => depth(...a) - depth(...b) || a[0] - b[0] || b[1] - a[1] || a[2] - b[2]);
-}
+  return [...cells.values()].sort((a, b) => depth(...a) - depth(...b) || a[0] - b[0] || b[1] - a[1] || a[2] - b[2]);
+})();
 
 // Returns the visible block at a point of the plane and the free cell in front of it; null if there is none.
 export function targetOf(blocks, [px, py], height) {
