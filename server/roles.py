@@ -44,6 +44,8 @@ PART_GAUGES = {
 }
 """Gauges of the parts by the name of the figure in `/stats`, with their help texts. A part has those of its role."""
 PART_COUNTERS = {
+    "bus_bytes_in": "Bytes of batches and records received.",
+    "bus_bytes_out": "Bytes of batches and records sent.",
     "checkpoints": "Checkpoints saved.",
     "repeated": "Records sent again.",
     "ticks_still": "Ticks that were left out because the log did not answer.",

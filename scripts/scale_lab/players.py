@@ -5,13 +5,11 @@ import random
 import time
 from collections import Counter
 from collections.abc import Sequence
-from functools import partial
 
 from client_sdk.async_client import AsyncClient
 from client_sdk.core import Core
 from client_sdk.events import Answered, Corrected, Disconnected, Diverged, Left
 from client_sdk.transports.common import ConnectError
-from client_sdk.transports.connection import Connection
 from shared.inputs import Input, make_input
 
 PATIENCE_S = 60.0
@@ -22,19 +20,6 @@ JOIN_S = 90.0
 """Seconds within which all players have to play."""
 COUNT_SHARE, EDIT_SHARE, TURN_SHARE = 0.1, 0.05, 0.03
 """Shares of the updates in which a player counts, digs or builds, and turns."""
-
-
-class Roving(AsyncClient):
-    """A client that knows several addresses of one world, and reconnects at the next one."""
-
-    urls: Sequence[str] = ()
-    at = 0
-
-    async def _redial(self) -> None:
-        self.at += 1
-        self._host = ""
-        self._connection = Connection(self.urls[self.at % len(self.urls)], self.core)
-        await super()._redial()
 
 
 class Player:
@@ -49,7 +34,7 @@ class Player:
         self.name = name
         self._rng = random.Random(seed)
         self._input: Input = make_input(1.0, 0.0)
-        self.client: Roving | None = None
+        self.client: AsyncClient | None = None
         self.counting = True
         """Whether it sends commands."""
         self.count = 0
@@ -65,15 +50,11 @@ class Player:
         self._tick, self._since, self._gap = -1, 0.0, 0.0
         self._listening: asyncio.Task[None] | None = None
 
-    async def join(self, urls: Sequence[str], at: int) -> None:
-        """Connects to one of the addresses, and reconnects to any of them later."""
-        before = partial(self._update)
-        client = await Roving.connect(urls[at % len(urls)], name=self.name, patience_s=PATIENCE_S, before_update=before)
-        assert isinstance(client, Roving)
-        client.urls, client.at = urls, at
-        self.client = client
+    async def join(self, url: str) -> None:
+        """Connects to an edge. If that ends, the client goes on at another one that the server has named."""
+        self.client = await AsyncClient.connect(url, name=self.name, patience_s=PATIENCE_S, before_update=self._update)
         self._since = time.monotonic()
-        self._listening = asyncio.create_task(self._listen(client))
+        self._listening = asyncio.create_task(self._listen(self.client))
 
     def take_gap(self) -> float:
         """Returns the longest time in seconds between two new ticks since the last call, up to now."""
@@ -157,7 +138,7 @@ async def joined(names: int, urls: Sequence[str], seed: int) -> list[Player]:
         for number, player in enumerate(players):
             while player.client is None:
                 try:
-                    await player.join(urls, number)
+                    await player.join(urls[number % len(urls)])
                 except ConnectError:
                     await asyncio.sleep(0.1)
         while not all(player.playing for player in players):  # noqa: ASYNC110
