@@ -107,8 +107,7 @@ class EdgePart(Part):
         self._alarm = best_alarm(asyncio.get_running_loop(), self._ring)
         try:
             while True:
-                assert following.reader is not None
-                stored = await following.reader.take(WAIT_S)
+                stored = await following.next(WAIT_S)
                 if following.reader is None:
                     return  # the part was stopped while it waited
                 if stored is not None:

@@ -1,5 +1,6 @@
 """Following a log: a replica that begins with a checkpoint and takes every record after it."""
 
+import asyncio
 import logging
 import time
 
@@ -56,6 +57,17 @@ class Following:
                     raise
                 self.close()
 
+    async def next(self, wait_s: float) -> Stored | None:
+        """Returns the next record; None: there was none within the time.
+
+        Raises:
+            PurgedError: the log does not have it any more.
+            CancelledError: the stream was closed. A timeout at the same moment may hide that the task was cancelled.
+        """
+        if self.reader is None:
+            raise asyncio.CancelledError
+        return await self.reader.take(wait_s)
+
     def take(self, stored: Stored) -> Record:
         """Returns the record in a stored one, and notes that the replica has it."""
         self.seq, self.last = stored.seq, stored.id
@@ -88,8 +100,7 @@ class Following:
         began = reported = time.monotonic()
         first, rate = self.replica.world.tick, self._fresh.scene.tick_rate
         while self.seq < self.target:
-            assert self.reader is not None
-            stored = await self.reader.take(WAIT_S)
+            stored = await self.next(WAIT_S)
             if stored is not None:
                 self.replica.take(self.take(stored))
                 self.replica.settle()

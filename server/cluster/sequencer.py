@@ -135,8 +135,7 @@ class SequencerPart(Part):
     async def _follow(self) -> Entry | None:
         """Takes one record, or takes over if there is none for too long. Returns the record that begins the epoch."""
         following = self.following
-        assert following.reader is not None
-        stored = await following.reader.take(SILENCE_S)
+        stored = await following.next(SILENCE_S)
         if stored is not None:
             self._take(stored)
             await asyncio.sleep(0)
