@@ -9,7 +9,7 @@ import gzip
 import hashlib
 import io
 import zipfile
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import NamedTuple
 
@@ -112,8 +112,3 @@ def archive(files: Mapping[str, bytes]) -> bytes:
 def pack(data: bytes) -> bytes:
     """Returns data compressed for HTTP (gzip)."""
     return gzip.compress(data, 9, mtime=0)
-
-
-def total(bundles: Iterable[Bundle]) -> int:
-    """Returns the number of bytes that a browser gets for bundles."""
-    return sum(len(file.packed) for each in bundles for file in each.files.values())
