@@ -46,6 +46,7 @@ class Bus:
         self._delay_s, self._jitter_s, self._stop, self._twice = delay_s, jitter_s, stop, twice
         self._lost = lost
         self._free: dict[tuple[str, str], float] = {}
+        self._cut: set[str] = set()
         self.log: list[bytes] = []
         """All records that the log has accepted."""
         self.refused = 0
@@ -63,7 +64,11 @@ class Bus:
         for _ in range(2 if rng.random() < self._twice else 1):
             due = max(due, self._free.get((source, target), 0.0))
             self._free[source, target] = due
-            self._match.at(due, deliver)
+            self._match.at(due, lambda: None if source in self._cut else deliver())
+
+    def cut(self, source: str) -> None:
+        """Loses all messages from one part that are on their way."""
+        self._cut.add(source)
 
     def hold(self, source: str, target: str, seconds: float) -> None:
         """Makes all messages from one part to another wait for some time from now on."""

@@ -237,9 +237,17 @@ class ScaledMatch(Simulation):
         self.standbys.append(standby)
         return standby
 
-    def kill(self, part: Part) -> None:
-        """Kills a part. What it has sent still arrives; the connections of an edge's clients break."""
+    def kill(self, part: Part, *, lossy: bool = False) -> None:
+        """Kills a part. The connections of an edge's clients break.
+
+        Args:
+            part: the part.
+            lossy: whether messages of the part that are on their way are lost: batches, and records that the log does
+                not have yet.
+        """
         part.alive = False
+        if lossy:
+            self.bus.cut(part.name)
         for player in self.players:
             if isinstance(player, Seat) and player.second is not None and player.second.edge is part:
                 second, player.second = player.second, None

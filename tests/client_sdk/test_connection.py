@@ -220,3 +220,14 @@ def test_something_else_there_is_named(answer: bytes, says: str) -> None:
 def test_a_wrong_address_is_explained(url: str) -> None:
     with pytest.raises(ConnectError, match="looks like ws://localhost:8765"):
         Connection(url, Core())
+
+
+def test_another_server_of_the_world_keeps_path_and_tls() -> None:
+    core = Core()
+    assert Connection("wss://play.example/arena?a=1", core).url == "wss://play.example/arena?a=1"
+    core.travel.server = "ws://10.0.0.2:8766"
+    connection = Connection("wss://play.example/arena?a=1", core)
+    assert connection.url == "wss://10.0.0.2:8766/arena?a=1"
+    assert (connection.uri.secure, connection.uri.host, connection.uri.port) == (True, "10.0.0.2", 8766)
+    core.travel.server = "wss://edge.example"
+    assert Connection("ws://play.example", core).url == "wss://edge.example/arena?a=1"

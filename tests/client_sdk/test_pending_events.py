@@ -6,6 +6,7 @@ import pytest
 
 from client_sdk import pending_events
 from client_sdk.events import (
+    Announced,
     Answered,
     Disconnected,
     Event,
@@ -16,7 +17,8 @@ from client_sdk.events import (
     Resumed,
     SegmentLoaded,
 )
-from client_sdk.pending_events import PendingEvents
+from client_sdk.pending_events import GameEvents, PendingEvents
+from shared import messages
 from shared.scene import load_scene
 
 FLAT = load_scene("flat")
@@ -105,3 +107,20 @@ def test_one_by_one_or_all_at_once_nothing_is_missing_that_was_not_counted(seed:
     assert dropped > 0
     with pytest.raises(IndexError):
         queue.next()
+
+
+def test_announcements_without_numbers_that_may_be_missing_are_reported() -> None:
+    events = PendingEvents()
+    game = GameEvents(events)
+    announce, happened = messages.Announce(1, 7, "hit", b"\xc0"), messages.Happened(1, "did", b"\xc0")
+    game.apart = True
+    game.next(0, hold=False)
+    game.happened(happened, hold=False)
+    game.next(1, hold=False)
+    assert not any(isinstance(event, EventsDropped) for event in events.take()), "there was no announcement yet"
+    game.happened(announce, hold=False)
+    game.next(1, hold=False, sure=True)
+    assert [type(event) for event in events.take()] == [Announced], "a hand-over misses none"
+    game.next(1, hold=False)
+    game.next(4, hold=False)
+    assert events.take() == [EventsDropped(0), EventsDropped(3)]

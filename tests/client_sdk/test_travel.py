@@ -504,3 +504,30 @@ def test_paths(path: str, kept: str, world: str) -> None:
     travel = Travel()
     travel.path = path
     assert (without_seat(path), travel.world) == (kept, world)
+
+
+def test_go_may_lead_to_another_server() -> None:
+    travel = Travel()
+    travel.path = LOBBY
+    assert travel.go(Go("ws://10.0.0.2:8766/arena-1?seat=x", "", [], ""), 0.0, lobby=True) == Matched("arena-1", "", ())
+    assert (travel.server, travel.path) == ("ws://10.0.0.2:8766", "/arena-1?seat=x")
+    assert travel.again(Bye(messages.FULL, "full", -1.0))
+    assert (travel.server, travel.path) == ("", LOBBY), "the lobby is at the server that the program has named"
+    travel.go(Go("wss://b/arena-2", "", [], ""), 1.0, lobby=True)
+    travel.welcomed()
+    travel.go(Go("/final", "", [], ""), 2.0, lobby=False)
+    assert (travel.server, travel.path) == ("wss://b", "/final"), "a path is one of the present server"
+
+
+def test_a_client_tries_the_other_servers_of_its_world_in_turn_and_then_the_first_address() -> None:
+    travel = Travel()
+    assert not travel.elsewhere(1)
+    travel.edges = ["ws://a", "ws://b", "ws://c"]
+    tried = []
+    for _ in range(8):
+        assert travel.elsewhere(4)
+        tried.append(travel.server)
+    assert tried == ["ws://b", "ws://c", "ws://a", ""] * 2
+    travel.plays(0.0)
+    travel.elsewhere(4)
+    assert travel.server == "ws://b"

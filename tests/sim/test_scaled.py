@@ -81,7 +81,10 @@ def edits(core: Core, rng: random.Random) -> Input:
 
 
 def torment(match: ScaledMatch, seconds: float, seed: int) -> None:
-    """Runs a match and kills an edge or the sequencer every second or two. Replaces each part that was killed."""
+    """Runs a match and kills an edge or the sequencer every second or two. Replaces each part that was killed.
+
+    Half of them lose what they have sent last: batches that are on their way, and records ahead of the log.
+    """
     rng, until = random.Random(seed), match.now + seconds
 
     def kill() -> None:
@@ -90,10 +93,10 @@ def torment(match: ScaledMatch, seconds: float, seed: int) -> None:
         living = [edge for edge in match.edges if edge.alive]
         if rng.random() < 0.4 and len(living) > 1:
             match.add_edge()
-            match.kill(rng.choice(living))
+            match.kill(rng.choice(living), lossy=rng.random() < 0.5)
         elif match.sequencer.alive:
             match.add_standby()
-            match.kill(match.sequencer)
+            match.kill(match.sequencer, lossy=rng.random() < 0.5)
         match.at(match.now + rng.uniform(0.8, 2.5), kill)
 
     match.at(match.now + rng.random(), kill)
@@ -418,6 +421,24 @@ def test_a_hand_over_on_a_bad_line_costs_late_inputs_only(path: Link) -> None:
     assert set(causes(player)) <= {"late input"}
     assert (player.core.stats.divergences, player.core.stats.reconnects) == (0, 0)
     hashes_agree(match)
+
+
+@pytest.mark.slow
+def test_edits_come_at_their_ticks_while_a_player_changes_edges() -> None:
+    match = ScaledMatch(load_scene("hills"), 5, edges=4, hash_every=32)
+
+    def builds(core: Core, rng: random.Random) -> Input:
+        if rng.random() < 0.3:
+            assert core.prediction is not None
+            x, y, z = (int(part) + rng.randint(-1, 1) for part in core.prediction.predicted.position(core.entity))
+            core.edit(x, y, z, rng.randint(0, 1))
+        return wander(core, rng)
+
+    player = match.join(builds, Link(delay_s=0.03))
+    match.run(3)
+    assert tour(match, player, 60, every=2.0) == 30
+    assert [event for event in player.events if isinstance(event, (Corrected, Diverged, Resynchronised))] == []
+    assert sum(isinstance(event, Answered) for event in player.events) > 400
 
 
 def test_inputs_have_no_gap_while_terrain_is_on_its_way(monkeypatch: pytest.MonkeyPatch) -> None:
