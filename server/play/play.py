@@ -152,11 +152,15 @@ def described(games: Sequence[PlayedGame]) -> dict[str, Any]:
     """Returns what a browser needs of games: titles, keys and commands, and their behaviours with their files."""
     entries = [entry for game in games for entry in game.scene.behaviours]
     modules = modules_of(entry.code for entry in entries if entry.code is not None)
-    first = games[0]
+    keys: dict[str, str] = {}
+    commands: dict[str, list[str]] = {}
+    for game in reversed(games):  # where two games differ, the default world's counts
+        keys |= game.rules.keys
+        commands |= {name: list(fields) for name, fields in game.rules.commands.items()}
     return {
-        "title": first.title,
-        "keys": dict(first.rules.keys),
-        "commands": {name: list(fields) for name, fields in first.rules.commands.items()},
+        "title": games[0].title,
+        "keys": keys,
+        "commands": commands,
         "behaviours": modules.classes,
         "trouble": modules.trouble,
         "files": modules.files,

@@ -53,7 +53,7 @@ export class Hud {
     const { _client: client } = this, { shared, stats, scene } = client;
     const points = shared.points && typeof shared.points === "object"
       ? Object.entries(shared.points).map(([team, count]) => `    ${team} ${count}`).join("") : "";
-    element("title").textContent = client.game.title + points;
+    element("title").textContent = (client.world || client.game.title) + points;
     const left = Number.isInteger(shared.ends) ? Math.max(shared.ends - view.tick, 0) / scene.tick_rate : null;
     element("clock").textContent = left === null ? ""
       : `${Math.floor(left / 60)}:${String(Math.floor(left % 60)).padStart(2, "0")}`;

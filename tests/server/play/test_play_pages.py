@@ -128,6 +128,16 @@ def test_the_same_content_has_the_same_address_and_other_content_another_one(run
     assert "game" not in first["bundles"], "a game without behaviours"
 
 
+def test_games_of_other_worlds(runtime: Path) -> None:
+    games = [
+        PlayedGame("Game", load_scene("flat"), Rules()),
+        *(PlayedGame(type(rules).__name__, prepared(rules, load_scene("flat")), rules) for rules in (Dodge(), Chat())),
+    ]
+    found = described(PlayPages(games))
+    assert (found["title"], found["keys"], found["commands"]["say"]) == ("Game", dict(Dodge.keys), ["text"])
+    assert [name for _, name in found["behaviours"]] == ["Dodger", "Ball"]
+
+
 def test_commands_that_the_rules_declare(runtime: Path) -> None:
     assert described(pages(Chat()))["commands"]["say"] == ["text"]
 
