@@ -43,12 +43,12 @@ const reader = (bin, at = 0) => ({
 });
 function* records(size, bin = []) { for (let at = 0; at < bin.length; at += size) yield bin.subarray(at, at + size); }
 
-function connect() { // to a path of the server; host and port stay those of the URL
+function connect() { // to a path of the server, or to the address of another one with a path
   [acked, sent, pongs, margins, lead, joined, going] = [-1, -1, [], [], undefined, false, false];
   entities.clear();
   said.clear();
   const { protocol, host } = new URL(url);
-  socket = new WebSocket(`${protocol}//${host}${path}`, { perMessageDeflate: false });
+  socket = new WebSocket(path[0] === "/" ? `${protocol}//${host}${path}` : path, { perMessageDeflate: false });
   socket.on("open", () => send(HELLO, 3, {}, "node", "", resume));
   socket.on("message", data => {
     const [kind, ...fields] = decode(data); // each bin in it is a Buffer, as `data` is

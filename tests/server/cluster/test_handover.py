@@ -105,8 +105,8 @@ def each_once(player: Program) -> None:
 CLIENTS = [
     pytest.param("AsyncClient", None, id="asyncio"),
     pytest.param("Client", None, id="polling"),
-    pytest.param("AsyncClient", SLOW, id="asyncio-link"),
-    pytest.param("Client", SLOW, id="polling-link"),
+    pytest.param("AsyncClient", SLOW, id="asyncio-link", marks=pytest.mark.slow),
+    pytest.param("Client", SLOW, id="polling-link", marks=pytest.mark.slow),
 ]
 
 
