@@ -27,18 +27,19 @@ from nats.js.errors import APIError, KeyNotFoundError, KeyWrongLastSequenceError
 from nats.js.kv import KeyValue
 
 from server.cluster.bus import BusError, ConflictError, PurgedError, RefusedError, Revised, Snapshot, Stored
+from server.cluster.log_reader import LogReader
 from server.scale.writer import EMPTY, Entry
 
 ACK_S = 0.5
 """Seconds to wait for the acknowledgement of a record."""
-ANSWER_S, LOOK_S = 2.0, 0.3
-"""Seconds to wait for other answers, and for the one about the newest record, which is asked for again and again."""
+ANSWER_S = 2.0
+"""Seconds to wait for other answers."""
 CONNECT_S = 5.0
 """Seconds to wait for a connection at the start."""
 RECONNECT_S = 0.1
 """Seconds between two attempts to reconnect."""
-FETCHED_MAX, ONE_BY_ONE = 512, 16
-"""Maximum number of missing records that are fetched at once. Number from which they are fetched by a consumer."""
+ONE_BY_ONE = 16
+"""Number of missing records from which they are fetched by a consumer."""
 ATTEMPTS = 20
 """Attempts to fetch a record that the stream has, and that did not come."""
 WRONG_LAST_ID, NAME_IN_USE = 10070, 10058
@@ -168,9 +169,16 @@ class NatsBus:
             raise BusError(_said(error)) from error
         return message.seq or 0, _id_of(message.headers)
 
-    async def follow(self, seq: int) -> "NatsReader":
-        reader = NatsReader(self, seq)
-        await reader.begin(self._client, f"{self._subject}.told")
+    async def follow(self, seq: int) -> LogReader:
+        reader = LogReader(self, seq)
+
+        async def take(message: Msg) -> None:
+            self.bytes_in += len(message.data)
+            number = int((message.headers or {}).get("Nats-Sequence", 0))
+            reader.come(Stored(number, _id_of(message.headers), message.data))
+
+        subscription = await self._client.subscribe(f"{self._subject}.told", cb=take)
+        reader.on_close = lambda: self._begin(subscription.unsubscribe())
         return reader
 
     async def fetch(self, first: int, last: int) -> list[Stored]:
@@ -342,76 +350,6 @@ class NatsBus:
         task = asyncio.get_running_loop().create_task(sent())
         self._tasks.add(task)
         task.add_done_callback(self._tasks.discard)
-
-
-class NatsReader:
-    """A stream of the records of a world. Missing ones are fetched."""
-
-    def __init__(self, bus: NatsBus, seq: int) -> None:
-        self._bus, self._next = bus, seq
-        self._come: dict[int, Stored] = {}
-        self._newest = seq - 1
-        self._news = asyncio.Event()
-        self._subscription: Any = None
-        self._closing: asyncio.Task[None] | None = None
-
-    async def begin(self, client: Client, subject: str) -> None:
-        """Subscribes to what the stream has accepted."""
-        self._subscription = await client.subscribe(subject, cb=self._take)
-
-    @property
-    def waiting(self) -> int:
-        return max(self._newest - self._next + 1, 0)
-
-    async def take(self, wait_s: float) -> Stored | None:
-        until = time.monotonic() + wait_s
-        while self._next not in self._come:
-            if self._newest < self._next:
-                self._news.clear()
-                try:
-                    await asyncio.wait_for(self._news.wait(), max(until - time.monotonic(), 0.001))
-                except TimeoutError:
-                    await self._look_at_the_end()
-            if self._newest >= self._next and self._next not in self._come:
-                await self._fetch()
-            if time.monotonic() >= until and self._next not in self._come:
-                return None
-        self._next += 1
-        return self._come.pop(self._next - 1)
-
-    def close(self) -> None:
-        if self._subscription is not None:
-            subscription, self._subscription = self._subscription, None
-
-            async def end() -> None:
-                with contextlib.suppress(NatsError):
-                    await subscription.unsubscribe()
-
-            self._closing = asyncio.get_running_loop().create_task(end())
-
-    async def _take(self, message: Msg) -> None:
-        headers = message.headers or {}
-        seq = int(headers.get("Nats-Sequence", 0))
-        self._bus.bytes_in += len(message.data)
-        if seq >= self._next:
-            self._come[seq] = Stored(seq, _id_of(headers), message.data)
-            self._newest = max(self._newest, seq)
-            self._news.set()
-
-    async def _look_at_the_end(self) -> None:
-        """Asks for the newest record, because it may have been missed."""
-        with contextlib.suppress(BusError, TimeoutError):
-            async with asyncio.timeout(LOOK_S):
-                self._newest = max(self._newest, (await self._bus.end())[0])
-
-    async def _fetch(self) -> None:
-        """Fetches the records that are missing before the first one that has come."""
-        last = min([*self._come, self._newest + 1]) - 1
-        try:
-            for stored in await self._bus.fetch(self._next, min(last, self._next + FETCHED_MAX - 1)):
-                self._come[stored.seq] = stored
-        except BusError:
-            await asyncio.sleep(RECONNECT_S)
 
 
 class _Connection:
