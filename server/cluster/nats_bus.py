@@ -13,6 +13,7 @@ import contextlib
 import json
 import logging
 import re
+import secrets
 import time
 from collections.abc import AsyncIterator, Callable
 from typing import Any
@@ -250,7 +251,7 @@ class NatsBus:
         former = {"seq": 0} if known is None else json.loads(known.value)
         if former["seq"] >= snapshot.seq:
             return
-        name = f"{snapshot.seq}-{time.time_ns()}"
+        name = f"{snapshot.seq}-{secrets.token_hex(8)}"
         await self._store.put(name, snapshot.data)
         value = json.dumps({"object": name, "seq": snapshot.seq}).encode()
         try:
