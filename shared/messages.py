@@ -60,6 +60,10 @@ from typing import Any, NamedTuple
 import msgpack
 
 from shared import fields
+from shared.connection_messages import Beside as Beside
+from shared.connection_messages import Bye as Bye
+from shared.connection_messages import Hello as Hello
+from shared.connection_messages import Welcome as Welcome
 from shared.fields import (
     CLIENT_MESSAGE_MAX,
     INPUT_ROW_BYTES,
@@ -121,19 +125,6 @@ class ProtocolError(ValueError):
     """The peer sent something that is not a valid message; the text says what is wrong."""
 
 
-class Hello(NamedTuple):
-    """The first message of a client.
-
-    `scene` has the digests of the scene that the client was built for; it is empty if the client accepts any scene.
-    """
-
-    version: int
-    scene: dict[str, bytes]
-    name: str
-    token: str = ""
-    resume: bytes = b""
-
-
 class Inputs(NamedTuple):
     """Inputs for the consecutive ticks from `first` on. `acked` is the newest snapshot that the client has applied."""
 
@@ -167,38 +158,6 @@ class Restart(NamedTuple):
     """Withdraws the inputs for `tick` and later that the server has not used yet; the client sends them again."""
 
     tick: int
-
-
-class Beside(NamedTuple):
-    """The first message of a second connection, over which the player goes on."""
-
-    version: int
-    token: str
-    resume: bytes
-
-
-class Bye(NamedTuple):
-    """The last message before the connection closes, from either side.
-
-    `code` is the close code. `wait` is the time in seconds after which to connect again; negative: do not.
-    """
-
-    code: int
-    reason: str
-    wait: float
-
-
-class Welcome(NamedTuple):
-    """The answer to `Hello` for an accepted client: its entity, the scene and a resume token.
-
-    `tick` is the server's tick, and `scene` the table of `Scene.to_table`.
-    """
-
-    version: int
-    tick: int
-    entity: int
-    scene: dict[str, Any]
-    resume: bytes = b""
 
 
 class Snapshot(NamedTuple):
