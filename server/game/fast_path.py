@@ -22,6 +22,7 @@ Clients cannot tell the difference: tests compare every byte that is sent (`test
 
 from array import array
 from collections.abc import Callable, Mapping
+from functools import partial
 
 from server.config.limits import Limits, catch_up_ticks
 from server.game.clocks import Clocks
@@ -29,6 +30,7 @@ from server.game.connections import Connections
 from server.game.fast_rows import Arguments, Rows, fits, lent
 from server.game.session import Session
 from server.observability.counters import Counters
+from server.players.input_queue import InputQueue
 from server.players.player import Player
 from server.replication.change_log import ChangeLog
 from server.replication.flow_control import HELD_S
@@ -339,7 +341,9 @@ class FastPath:
         numbers = [self._number(segment) for segment in segments]
         for number in numbers:
             self._used[number] += 1
+        queue = session.inputs
         self._rows.write(session, numbers)
+        queue.settle = partial(self.count, session.row, queue)
         session.fast_path, session.enrolled, session.plain = self, tick, 0
         self._n += 1
 
@@ -377,7 +381,10 @@ class FastPath:
         """Notes that a message besides the snapshots was sent to a session here."""
         self._rows.numbers[row * WIDTH + SENT_BYTES] += size
 
-    def count(self) -> None:
-        """Completes the counts of the players' input queues."""
+    def count(self, row: int, queue: InputQueue) -> None:
+        """Completes the counts of an input queue whose player's session is here."""
         self.flush()
-        self._rows.count()
+        settle, queue.settle = queue.settle, None
+        if settle is not None:  # the session is still here
+            self._rows.count(row, queue)
+            queue.settle = settle

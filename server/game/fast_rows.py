@@ -190,7 +190,7 @@ class Rows:
         reals = self.floats[at * FLOATS : (at + 1) * FLOATS].tolist()
         queue, stream = session.inputs, session.stream
         flow = stream.flow
-        self.add_counts(queue, values)
+        self.count(at, queue)
         queue.newest, queue.accepted, queue.missing = values[NEWEST], values[ACCEPTED], values[MISSING]
         queue.held = self.input_of(values[HELD], values[HELD_AIM])
         queue.margins = array("h", values[MARGINS : MARGINS + values[N_MARGINS]])
@@ -212,21 +212,14 @@ class Rows:
         segments: list[int] = self.views[at * SEGMENTS : at * SEGMENTS + values[N_SEGMENTS]].tolist()
         return segments
 
-    def count(self) -> None:
-        """Adds the counts of inputs since the rows were written, or since the latest call, to the input queues."""
-        for at, session in enumerate(self.sessions):
-            if session is not None and session.player is not None:
-                base = at * WIDTH
-                self.add_counts(session.player.counts, self.numbers[base : base + WIDTH].tolist())
-                for column in (LATE, USED, SUBSTITUTED):
-                    self.numbers[base + column] = 0
-
-    @staticmethod
-    def add_counts(queue: InputQueue, values: list[int]) -> None:
-        """Adds the counts of a row to an input queue."""
-        queue.late += values[LATE]
-        queue.used += values[USED]
-        queue.substituted += values[SUBSTITUTED]
+    def count(self, at: int, queue: InputQueue) -> None:
+        """Adds the counts of a row since it was written, or since the latest call, to an input queue."""
+        queue.settle = None
+        base = at * WIDTH
+        queue.late += self.numbers[base + LATE]
+        queue.used += self.numbers[base + USED]
+        queue.substituted += self.numbers[base + SUBSTITUTED]
+        self.numbers[base + LATE] = self.numbers[base + USED] = self.numbers[base + SUBSTITUTED] = 0
 
     def inputs(self) -> list[Input]:
         """Returns the inputs that `traffic.take_inputs` has taken, by row."""

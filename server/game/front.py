@@ -94,8 +94,6 @@ class Front:
 
     def stats(self) -> dict[str, Any]:
         """Returns all counters, including the inputs of the present players, and the size of the game."""
-        if self.fast_path is not None:
-            self.fast_path.count()
         totals = dataclasses.replace(self.counters)
         for player in self.players.values():
             totals.add(player.counts)

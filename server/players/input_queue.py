@@ -10,6 +10,7 @@ one, the neutral one, or none expected yet). From these it controls how far ahea
 import math
 import sys
 from array import array
+from collections.abc import Callable
 from functools import lru_cache
 
 from shared.bounds import Bounds, bounds
@@ -53,9 +54,46 @@ class InputQueue:
         `bounds.statuses` of them."""
         self.statuses = bytearray()
         """Input statuses of the ticks that are not sent yet, as on the wire. At most `bounds.statuses` of them."""
-        self.late = self.refused = self.used = self.substituted = 0
+        self.refused = 0
+        self._used = self._late = self._substituted = 0
+        self.settle: Callable[[], None] | None = None
+        """Adds the counts of the fast path to those here; None: the queue is not on it."""
         self.override: Input | None = None
         """Input of an in-process player. If it is set, it is used in every tick and queued inputs are ignored."""
+
+    @property
+    def used(self) -> int:
+        """Number of ticks in which the player's own input was used."""
+        self._settle()
+        return self._used
+
+    @used.setter
+    def used(self, n: int) -> None:
+        self._used = n
+
+    @property
+    def late(self) -> int:
+        """Number of inputs that arrived after their tick."""
+        self._settle()
+        return self._late
+
+    @late.setter
+    def late(self, n: int) -> None:
+        self._late = n
+
+    @property
+    def substituted(self) -> int:
+        """Number of ticks in which another input stood in for a missing one."""
+        self._settle()
+        return self._substituted
+
+    @substituted.setter
+    def substituted(self, n: int) -> None:
+        self._substituted = n
+
+    def _settle(self) -> None:
+        if self.settle is not None:
+            self.settle()
 
     def file(self, message: Inputs, tick: int, ahead: float) -> None:
         """Queues the inputs of a message.
@@ -105,7 +143,7 @@ class InputQueue:
         if at > tick:
             self.waiting[at] = decoded(row)
         else:
-            self.late += 1
+            self._late += 1
             self.held, self.missing = decoded(row), 0
             margin = min(margin, -1)
         return margin if abs(margin) < -MARGIN_REFUSED else max(MARGIN_REFUSED + 1, min(margin, -MARGIN_REFUSED - 1))
@@ -133,17 +171,17 @@ class InputQueue:
     def take(self, tick: int) -> Input:
         """Takes the input for the tick that is about to be computed, or a substitute, and notes the input status."""
         if self.override is not None:
-            self.used += 1
+            self._used += 1
             return self.override
         input_ = self.waiting.pop(tick, None)
         if input_ is not None:
             status, self.missing, self.held = USED, 0, input_
-            self.used += 1
+            self._used += 1
         elif self.first < 0 or tick < self.first:
             status = IDLE
         else:
             self.missing += 1
-            self.substituted += 1
+            self._substituted += 1
             status = REPEATED if self._bounds.stands_in(self.missing) else NEUTRALISED
         self.statuses.append(status)
         if len(self.statuses) > self._bounds.statuses:

@@ -77,7 +77,7 @@ class Player:
 
     @property
     def counts(self) -> InputQueue:
-        """The input queue, for its counts alone. On the fast path they lack the latest (`FastPath.count`)."""
+        """The input queue, for its counts alone; reading it does not recall the session."""
         return self._inputs
 
     @property

@@ -3,6 +3,7 @@
 import json
 import re
 import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -68,7 +69,7 @@ def test_a_manifest_follows_the_schema_of_kubernetes(manifest: dict[str, Any]) -
 
 
 def test_the_compose_file_follows_its_schema(tmp_path: Path) -> None:
-    command = ["check-jsonschema", "--builtin-schema", "vendor.compose-spec"]
+    command = [sys.executable, "-m", "check_jsonschema", "--builtin-schema", "vendor.compose-spec"]
     assert subprocess.run([*command, str(DEPLOY / "compose.yaml")], check=False).returncode == 0
     wrong = tmp_path / "compose.yaml"
     wrong.write_text((DEPLOY / "compose.yaml").read_text().replace("stop_grace_period", "stop_grace"))
