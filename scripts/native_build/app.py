@@ -22,7 +22,7 @@ from scripts.environment import ROOT
 SOURCES = ("client_sdk", "scripts", "server", "shared", "sovereign_netcode", "tests")
 BUILT = ROOT / "build" / "native"
 MODULES = (
-    "client_sdk/commands.py", "client_sdk/core.py", "client_sdk/events.py", "client_sdk/input_loop.py",
+    "client_sdk/changing.py", "client_sdk/commands.py", "client_sdk/core.py", "client_sdk/input_loop.py",
     "client_sdk/interpolation/interpolation.py", "client_sdk/interpolation/smoothing.py", "client_sdk/netsim/linked.py",
     "client_sdk/netsim/links.py", "client_sdk/prediction/confirmed.py", "client_sdk/prediction/prediction.py",
     "client_sdk/program_side.py", "client_sdk/reconnect.py", "client_sdk/replica.py", "client_sdk/stats.py",

@@ -5,10 +5,9 @@ taken, and the newest snapshot is sent. Python takes some 15 us for that. The co
 `InputQueue`, `Sender.serve`) is the specification, and runs for every session that does anything else. A session that
 has needed nothing else for some ticks comes to the fast path: its state moves to a row of arrays. From then on
 
-    its input messages only wait in a list when they arrive (`post`). Compiled code takes the messages of all sessions
-    at once, before the next tick (`flush`), with the times at which they arrived;
-    its input of a tick is taken by compiled code (`take`);
-    its snapshot is written by compiled code (`send`); Python passes the bytes to its connection.
+    its input messages only wait in a list when they arrive (`post`). Before the next tick, compiled code takes those of
+    all sessions at once, with the times at which they arrived (`flush`);
+    compiled code takes its input of a tick (`take`), and writes its snapshot, which Python sends (`send`).
 
 The compiled code (`shared.traffic`) does exactly what the specification does, or nothing. Whatever it does not handle
 takes the session off the fast path: another message, an input out of order, a verdict, an event, another segment, a
@@ -44,7 +43,6 @@ from shared.traffic import (
     ALLOWANCE,
     ANSWERED,
     CARRIES,
-    DONE,
     FLOATS,
     HEADER_BYTES,
     HELD_SHARE,
@@ -63,17 +61,15 @@ from shared.traffic import (
 )
 from shared.world import World
 
-PATIENCE, PATIENCE_MAX = 3, 96
-"""Ticks without anything special after which a session comes to the fast path, at first and at most."""
-SOON = 12
-"""Ticks. A session that is recalled sooner after it came waits twice as long before it comes again."""
+PATIENCE, PATIENCE_MAX, SOON = 3, 96, 12
+"""Ticks without anything special after which a session comes to the fast path, at first and at most. If it is recalled
+sooner than `SOON` ticks later, it waits twice as long before it comes again."""
 WAITING_MAX = 4096
 """Maximum number of messages that wait for the next tick."""
 OUT_BYTES, SEGMENTS_MIN = 2048, 32
 """Initial sizes: bytes of the buffer for snapshots, number of segments."""
 INPUTS, PING = head_of(Inputs), head_of(Ping)
 """First two bytes of the messages that do not take a session off the fast path."""
-assert DONE < ANSWERED < LEFT
 
 
 class FastPath:
@@ -113,9 +109,11 @@ class FastPath:
         self._catch_up, self._rate = catch_up_ticks(rate), rate
         self._row_bytes = scene.input_row_bytes
         self._numbers: dict[Cell, int] = {}
-        """Number of each segment that a session on the fast path has seen."""
-        self._used: list[int] = []
-        """Number of sessions that see a segment, by its number."""
+        """Number of each segment that a session here sees."""
+        self._seen: list[tuple[Cell, int]] = []
+        """Each segment with the number of sessions here that see it, by its own number."""
+        self._free: list[int] = []
+        """Numbers of no segment."""
         self._starts, self._lengths = Arguments(kernel, "q", SEGMENTS_MIN), Arguments(kernel, "q", SEGMENTS_MIN)
         self._changed: list[int] = []
         """Numbers of the segments that have a length."""
@@ -182,7 +180,7 @@ class FastPath:
         sessions = rows.sessions.copy()
         for i, fate in enumerate(fates):
             session = sessions[spans[2 * i]]
-            if fate == DONE or session is None:
+            if session is None:
                 continue
             if fate == ANSWERED and session.row >= 0:
                 sent_at = rows.floats[session.row * FLOATS + PROBE_AT]
@@ -256,12 +254,11 @@ class FastPath:
         parts = self._parts()
         if len(self._out.values) < HEADER_BYTES + len(parts):
             self._out = Arguments(self._kernel, "B", 2 * (HEADER_BYTES + len(parts)))
-        clock.values[0], clock.values[1] = now, self._clocks.burst
-        clock.values[2], clock.values[3] = self._limits.messages_per_tick, self._decay
-        rules.values[1], rules.values[2] = self._world.tick, SNAPSHOT_BYTES
         at, left = 0, list[Session]()
         while at < n:
-            rules.values[0] = at
+            rules.values[0], rules.values[1], rules.values[2] = at, self._world.tick, SNAPSHOT_BYTES
+            clock.values[0], clock.values[1] = now, self._clocks.burst
+            clock.values[2], clock.values[3] = self._limits.messages_per_tick, self._decay
             end = self._kernel.write_snapshots(
                 rows.numbers_lent,
                 rows.floats_lent,
@@ -285,7 +282,7 @@ class FastPath:
         data = bytes(self._out.values[: max(spans, default=0)])
         sent, size, left = 0, 0, []
         for start, end, session in zip(spans[::2], spans[1::2], self._rows.sessions[row:], strict=False):
-            if session is None or start == UNUSED:
+            if session is None or session.row < 0 or start == UNUSED:
                 continue
             if start == UNWRITTEN:
                 left.append(session)
@@ -309,7 +306,7 @@ class FastPath:
         deltas, parts, at = self._log.since(self._world.tick - 1), [], 0
         for segment in deltas.changed:
             number = self._numbers.get(segment)
-            if number is not None and self._used[number] and (part := deltas[segment]):
+            if number is not None and (part := deltas[segment]):
                 parts.append(part)
                 self._changed.append(number)
                 starts[number], lengths[number] = at, len(part)
@@ -338,26 +335,38 @@ class FastPath:
             return
         segments = session.stream.view.plain
         assert segments is not None
-        numbers = [self._number(segment) for segment in segments]
-        for number in numbers:
-            self._used[number] += 1
         queue = session.inputs
-        self._rows.write(session, numbers)
+        self._rows.write(session, [self._see(segment) for segment in segments])
         queue.settle = partial(self.count, session.row, queue)
         session.fast_path, session.enrolled, session.plain = self, tick, 0
         self._n += 1
 
-    def _number(self, segment: Cell) -> int:
-        """Returns the number of a segment."""
+    def _see(self, segment: Cell) -> int:
+        """Notes that one more session sees a segment. Returns the segment's number."""
         number = self._numbers.get(segment)
-        if number is None:
-            number = self._numbers[segment] = len(self._used)
-            self._used.append(0)
+        if number is not None:
+            self._seen[number] = segment, self._seen[number][1] + 1
+            return number
+        if self._free:
+            number = self._free.pop()
+            self._seen[number] = segment, 1
+        else:
+            number = len(self._seen)
+            self._seen.append((segment, 1))
             if number >= len(self._starts.values):
                 self._starts, self._lengths = (
                     Arguments(self._kernel, "q", 2 * number, old.values) for old in (self._starts, self._lengths)
                 )
+        self._numbers[segment] = number
         return number
+
+    def _leave(self, number: int) -> None:
+        """Notes that one session less sees a segment."""
+        segment, n = self._seen[number]
+        self._seen[number] = segment, n - 1
+        if n == 1:
+            del self._numbers[segment]
+            self._free.append(number)
 
     def recall(self, session: Session) -> None:
         """Takes a session off the fast path: its state is where the specification expects it again."""
@@ -365,7 +374,7 @@ class FastPath:
         if session.row < 0:  # it was recalled because of one of its messages
             return
         for number in self._rows.restore(session, self._world.tick):
-            self._used[number] -= 1
+            self._leave(number)
         soon = self._world.tick - session.enrolled < SOON
         session.patience = min(2 * max(session.patience, PATIENCE), PATIENCE_MAX) if soon else PATIENCE
         session.plain = 0

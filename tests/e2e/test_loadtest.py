@@ -73,7 +73,7 @@ def test_it_takes_a_server_that_runs_already(tmp_path: Path) -> None:
 def test_a_game_is_played_with_its_behaviours_and_its_bots(tmp_path: Path) -> None:
     out = tmp_path / "out.json"
     game = "sovereign_netcode.examples.dodge:Dodge"
-    done = loadtest("--game", game, "--clients", "2", "--seconds", "1", "--json", str(out))
+    done = loadtest("--game", game, "--clients", "2", "--seconds", "4", "--json", str(out))
     assert done.returncode == 0, done.stdout + done.stderr
     figures = json.loads(out.read_text())
     assert (figures["game"], figures["policy"], figures["scene"]) == (game, None, None)
