@@ -111,7 +111,7 @@ class FastPath:
         self._numbers: dict[Cell, int] = {}
         """Number of each segment that a session here sees."""
         self._seen: list[tuple[Cell, int]] = []
-        """Each segment with the number of sessions here that see it, by its own number."""
+        """Segments with the number of sessions here that see them, by their own numbers."""
         self._free: list[int] = []
         """Numbers of no segment."""
         self._starts, self._lengths = Arguments(kernel, "q", SEGMENTS_MIN), Arguments(kernel, "q", SEGMENTS_MIN)
