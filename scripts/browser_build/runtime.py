@@ -9,7 +9,6 @@ from __future__ import annotations
 import contextlib
 import gzip
 import hashlib
-import io
 import json
 import shutil
 import subprocess
@@ -21,6 +20,7 @@ from pathlib import Path
 from scripts.browser_build.packages import NPM, PINS, FetchError
 from scripts.browser_build.tools import node
 from scripts.environment import ROOT
+from server.play import bundles
 
 OUT = ROOT / "build" / "browser"
 """Folder of the files."""
@@ -69,8 +69,8 @@ def make(pyodide: Path, wheels: list[Path]) -> None:
         FetchError: the standard library cannot be compiled.
     """
     print("compiling the standard library for browsers ...", flush=True)
-    library = _compiled(pyodide, _zip(dict(_library(pyodide / LIBRARY))))
-    packages = _zip({name: data for each in wheels for name, data in _wheel(each)})
+    library = _compiled(pyodide, bundles.archive(dict(_library(pyodide / LIBRARY))))
+    packages = bundles.archive({name: data for each in wheels for name, data in _wheel(each)})
     lock = json.loads((pyodide / "pyodide-lock.json").read_text("utf-8"))
     files = {name: (pyodide / name).read_bytes() for name in TAKEN}
     files["pyodide-lock.json"] = json.dumps({"info": lock["info"], "packages": {}}).encode()
@@ -111,15 +111,6 @@ def _wheel(path: Path) -> Iterator[tuple[str, bytes]]:
         for entry in archive.infolist():
             if entry.filename.endswith((".py", ".so")):
                 yield entry.filename, archive.read(entry)
-
-
-def _zip(files: dict[str, bytes]) -> bytes:
-    """Returns a zip archive with fixed times and without compression."""
-    data = io.BytesIO()
-    with zipfile.ZipFile(data, "w") as archive:
-        for name in sorted(files):
-            archive.writestr(zipfile.ZipInfo(name, (2024, 1, 1, 0, 0, 0)), files[name])
-    return data.getvalue()
 
 
 def _compiled(pyodide: Path, sources: bytes) -> bytes:

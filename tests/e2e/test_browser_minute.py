@@ -15,9 +15,6 @@ import pytest
 
 from client_sdk.async_client import AsyncClient
 from client_sdk.bots import Bot, RunAndJump
-from scripts.browser_build import runtime
-from scripts.browser_build.packages import npm_package, wheels
-from scripts.browser_build.tools import FetchError
 from scripts.live_page.chromium import chromium, installed
 from tests.client_sdk.servers import real_server
 
@@ -27,6 +24,7 @@ BOTS = 12
 JOIN_S = 240.0
 pytestmark = [
     pytest.mark.e2e,
+    pytest.mark.usefixtures("python_for_browsers"),
     pytest.mark.slow,
     pytest.mark.alone,
     pytest.mark.skipif(BROWSER is None, reason="there is no Chromium on this machine"),
@@ -93,15 +91,6 @@ async def bots(url: str) -> AsyncIterator[list[AsyncClient]]:
     finally:
         for client in made:
             await client.close()
-
-
-@pytest.fixture(scope="module", autouse=True)
-def _python_for_browsers() -> None:
-    try:
-        if not runtime.ready():
-            runtime.make(npm_package("pyodide"), wheels())
-    except FetchError as error:
-        pytest.skip(str(error))
 
 
 async def test_a_minute_beside_bots() -> None:

@@ -17,8 +17,7 @@ from typing import Any
 
 import pytest
 
-from scripts.browser_build import runtime
-from scripts.browser_build.packages import FetchError, npm_package, wheels
+from scripts.browser_build.packages import FetchError, npm_package
 from scripts.live_page.chromium import Tab, chromium, installed
 from tests.client_sdk.servers import ROOT, real_server
 
@@ -27,21 +26,13 @@ JOIN_S = 240.0
 """Longest time until the page has joined, in seconds. It takes 10 s on a machine that does nothing else."""
 pytestmark = [
     pytest.mark.e2e,
+    pytest.mark.usefixtures("python_for_browsers"),
     pytest.mark.slow,
     pytest.mark.alone,
     pytest.mark.skipif(BROWSER is None, reason="there is no Chromium on this machine"),
 ]
 ME = "globalThis.play?.view?.me"
 PLACE = f"{ME}?.position"
-
-
-@pytest.fixture(scope="module", autouse=True)
-def _python_for_browsers() -> None:
-    try:
-        if not runtime.ready():
-            runtime.make(npm_package("pyodide"), wheels())
-    except FetchError as error:
-        pytest.skip(str(error))
 
 
 def stats(url: str) -> dict[str, Any]:
