@@ -30,6 +30,8 @@ FOLDERS = ("client_sdk", "server", "shared")
 ALIAS = "_checkout.py"
 """The file in the folder `PACKAGE` that is of use in a checkout only."""
 
+KERNEL_SOURCES = ("kernel.py", "bulk.py", "traffic.py", "delivery.py", "pacing.py")
+"""The files in shared/ of which shared/prebuilt is made."""
 BROWSER, RUNTIME = Path("build/browser"), Path("server/play/runtime")
 """Folder of Python for browsers, if `scripts/browser` has made it, and its place in the wheel."""
 
@@ -103,10 +105,10 @@ def refuse_stale_kernels(root: Path) -> None:
     spec.loader.exec_module(freshness)
     folder = root / "shared" / "prebuilt"
     manifest = json.loads((folder / "manifest.json").read_text("utf-8"))
-    texts = freshness.sources(root / "shared" / name for name in ("kernel.py", "bulk.py", "traffic.py"))
+    texts = freshness.sources(root / "shared" / name for name in KERNEL_SOURCES)
     if freshness.code_crc(texts) != manifest["code_crc"]:
         raise StaleError(
-            "shared/prebuilt is not made from shared/kernel.py, bulk.py and traffic.py: run scripts/kernels"
+            f"shared/prebuilt is not made from the present {', '.join(KERNEL_SOURCES)}: run scripts/kernels"
         )
     for name, told in manifest["files"].items():
         if hashlib.sha256((folder / name).read_bytes()).hexdigest() != told["sha256"]:

@@ -35,15 +35,19 @@ EXPORTS = {
         "recall": "qqQQn",
     },
     "traffic": {
-        "take_messages": "QDQbqdBqd",
+        "unmask": "Bq",
+        "take_messages": "QDQbqqdBqd",
         "take_inputs": "QQQnnn",
+    },
+    "delivery": {"write_snapshots": "QDiqqbBQQd"},
+    "pacing": {
         "due_rows": "QdQd",
-        "write_snapshots": "QDiqqbBQqd",
+        "measure_rows": "QDqqnd",
     },
 }
 """Argument kinds of each function, by source: one letter per argument. A function returns nothing, a truth value, or a
 whole number that fits into 32 bits."""
-SERVER_SOURCES = frozenset({"traffic"})
+SERVER_SOURCES = frozenset({"traffic", "delivery", "pacing"})
 """Sources that only servers use. The libraries for browsers do not have their functions."""
 
 FIELDS = {name: {"solid": "u", "heads": "i"}.get(name, "q") for name in Arrays._fields}

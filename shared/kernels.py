@@ -1,4 +1,4 @@
-"""The choice of the kernel: `shared.kernel`, `shared.bulk` and `shared.traffic` in three forms.
+"""The choice of the kernel: the sources of the kernel (`SOURCES`) in three forms.
 
     prebuilt  a library of this package for this platform (`scripts/kernels` makes it); it loads in a millisecond
     numba     compiled at its first use, by Numba if that is installed: up to a minute, then from a cache on disk
@@ -25,7 +25,7 @@ from pathlib import Path
 from types import ModuleType, SimpleNamespace
 from typing import Any
 
-from shared import bulk, exports, freshness, kernel, numba_kernel, traffic, wasm_kernel
+from shared import bulk, delivery, exports, freshness, kernel, numba_kernel, pacing, traffic, wasm_kernel
 
 VARIABLE = "SOVEREIGN_KERNEL"
 """Name of the environment variable that forces a form."""
@@ -35,7 +35,7 @@ AUTO = "auto"
 """Setting that takes the first form that is available."""
 CHOICES = (AUTO, *FORMS)
 """Values of the setting."""
-SOURCES: tuple[ModuleType, ...] = (kernel, bulk, traffic)
+SOURCES: tuple[ModuleType, ...] = (kernel, bulk, traffic, delivery, pacing)
 """Modules that the kernel is made from."""
 LIBRARIES = Path(__file__).parent / "prebuilt"
 """Folder of the prebuilt libraries."""
@@ -256,8 +256,8 @@ def _library() -> ModuleType:
     built: Callable[[int], int] = module.built_from
     if built(CONSTANTS_CRC) != constants_crc() or not _made_from_the_sources(built(CODE_CRC), known):
         raise ImportError(
-            "the prebuilt kernel was not made from the present shared/kernel.py, bulk.py and traffic.py; "
-            "run scripts/kernels"
+            "the prebuilt kernel was not made from the present shared/kernel.py, bulk.py, traffic.py, delivery.py and "
+            "pacing.py; run scripts/kernels"
         )
     return module
 

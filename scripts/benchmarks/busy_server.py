@@ -238,7 +238,7 @@ def in_view(game: Game) -> float:
     """Returns the average number of entities in the segments that a client sees."""
     cells = game.world.states()[:, X : X + 3] >> TO_SEGMENT
     inhabitants = collections.Counter(map(tuple, cells.tolist()))
-    views = [sum(inhabitants[segment] for segment in session.stream.view.sees) for session in game.sessions]
+    views = [sum(inhabitants[segment] for segment in session.sees) for session in game.sessions]
     return sum(views) / max(len(views), 1)
 
 

@@ -1,4 +1,4 @@
-"""Builds the kernels in shared/prebuilt. Run it after every change of shared/kernel.py, bulk.py or traffic.py.
+"""Builds the kernels in shared/prebuilt. Run it after every change of a kernel source.
 
 Installs the compiler (Numba) and the linker (from the package ziglang, 100 MB) if they are missing.
 """

@@ -88,6 +88,6 @@ class Edge:
             if session is None:
                 continue
             own = player.entity <= entity <= player.entity + reserved
-            if own or segment is None or segment in session.stream.view.sees:
+            if own or segment is None or segment in session.sees:
                 most = self._limits.outbox_max
                 self._counters.events_dropped += player.outbox.add(tick, message, most, self._numbered)

@@ -5,71 +5,49 @@ taken, and the newest snapshot is sent. Python takes some 15 us for that. The co
 `InputQueue`, `Sender.serve`) is the specification, and runs for every session that does anything else. A session that
 has needed nothing else for some ticks comes to the fast path: its state moves to a row of arrays. From then on
 
-    its input messages only wait in a list when they arrive (`post`). Before the next tick, compiled code takes those of
-    all sessions at once, with the times at which they arrived (`flush`);
-    compiled code takes its input of a tick (`take`), and writes its snapshot, which Python sends (`send`).
+    its input messages only wait in a list when they arrive (`fast_arrivals`), those from a WebSocket still in their
+    frames. Before the next tick, compiled code takes those of all sessions at once, with the times of their arrival;
+    compiled code takes its input of a tick (`take`), measures its connection, and writes its snapshot, which Python
+    sends (`send`).
 
-The compiled code (`shared.traffic`) does exactly what the specification does, or nothing. Whatever it does not handle
-takes the session off the fast path: another message, an input out of order, a verdict, an event, another segment, a
-connection without room. Then the state moves back (`recall`), and the specification goes on with it. Reading
-`Session.stream`, or the input queue, the verdicts or the events of a player, recalls the session as well. So no other
-code can see old state, and none has to know about rows. A session that was recalled soon after it came waits longer
-before it comes again.
+The compiled code (`shared.traffic`, `pacing`, `delivery`) does exactly what the specification does, or nothing.
+Whatever it does not handle takes the session off the fast path: another message, an input out of order, a verdict, an
+event, another segment, a connection without room. Then the state moves back (`recall`), and the specification goes on
+with it. Reading `Session.stream`, or the input queue, the verdicts or the events of a player, recalls the session as
+well. So no other code can see old state, and none has to know about rows. A session that was recalled soon after it
+came waits longer before it comes again.
 
 Clients cannot tell the difference: tests compare every byte that is sent (`tests/server/test_fast_path.py`).
 """
 
-from array import array
 from collections.abc import Callable, Mapping
 from functools import partial
 
-from server.config.limits import Limits, catch_up_ticks
+from server.config.limits import Limits
 from server.game.clocks import Clocks
 from server.game.connections import Connections
-from server.game.fast_rows import Arguments, Rows, fits, lent
+from server.game.fast_arrivals import Arrivals
+from server.game.fast_rows import Arguments, Rows, fits
 from server.game.session import Session
 from server.observability.counters import Counters
 from server.players.input_queue import InputQueue
 from server.players.player import Player
+from server.replication import flow_control
 from server.replication.change_log import ChangeLog
-from server.replication.flow_control import HELD_S
 from server.replication.sender import SNAPSHOT_BYTES
 from shared.bounds import bounds
 from shared.checks import Cell
+from shared.delivery import HEADER_BYTES, UNWRITTEN
 from shared.inputs import Input
 from shared.kernels import Kernel
-from shared.messages import Inputs, Ping, head_of
-from shared.traffic import (
-    ALLOWANCE,
-    ANSWERED,
-    CARRIES,
-    FLOATS,
-    HEADER_BYTES,
-    HELD_SHARE,
-    LEFT,
-    MEASURE_AT,
-    ODD,
-    PROBE_AT,
-    PROBE_BYTES,
-    RECEIVED_AT,
-    SENT_BYTES,
-    STATE,
-    TAKEN_BYTES,
-    UNUSED,
-    UNWRITTEN,
-    WIDTH,
-)
+from shared.session_rows import ODD, SENT_BYTES, STATE, WIDTH
 from shared.world import World
 
 PATIENCE, PATIENCE_MAX, SOON = 3, 96, 12
 """Ticks without anything special after which a session comes to the fast path, at first and at most. If it is recalled
 sooner than `SOON` ticks later, it waits twice as long before it comes again."""
-WAITING_MAX = 4096
-"""Maximum number of messages that wait for the next tick."""
 OUT_BYTES, SEGMENTS_MIN = 2048, 32
 """Initial sizes: bytes of the buffer for snapshots, number of segments."""
-INPUTS, PING = head_of(Inputs), head_of(Ping)
-"""First two bytes of the messages that do not take a session off the fast path."""
 
 
 class FastPath:
@@ -101,13 +79,13 @@ class FastPath:
     ) -> None:
         scene, rate = world.scene, world.scene.tick_rate
         self._world, self._log, self._limits, self._counters = world, log, limits, counters
-        self._clocks, self._receive, self._kernel = clocks, receive, kernel
+        self._clocks, self._kernel = clocks, kernel
         self._players, self._connections = players, connections
         self._rows = Rows(scene, kernel)
+        self.arrivals = Arrivals(world, self._rows, limits, clocks, self.recall, receive, kernel)
+        """Messages that wait for the next tick."""
         self._bounds, self._tick_s = bounds(rate), 1 / rate
-        self._decay = min(self._tick_s / HELD_S, 1.0)
-        self._catch_up, self._rate = catch_up_ticks(rate), rate
-        self._row_bytes = scene.input_row_bytes
+        self._decay = min(self._tick_s / flow_control.HELD_S, 1.0)
         self._numbers: dict[Cell, int] = {}
         """Number of each segment that a session here sees."""
         self._seen: list[tuple[Cell, int]] = []
@@ -118,77 +96,11 @@ class FastPath:
         self._changed: list[int] = []
         """Numbers of the segments that have a length."""
         self._out = Arguments(kernel, "B", OUT_BYTES)
-        self._rules, self._clock = Arguments(kernel, "q", 5), Arguments(kernel, "d", 5)
+        self._rules, self._clock = Arguments(kernel, "q", 5), Arguments(kernel, "d", 7)
         self._shared = 0
         """Version of the shared values that all sessions here have been sent."""
         self._n = 0
         """Number of sessions here."""
-        self._renew()
-
-    def _renew(self) -> None:
-        """Empties the list of waiting messages."""
-        self._data: list[bytes] = []
-        self._spans, self._times = array("q"), array("d")
-
-    # -- messages that arrive ------------------------------------------------------------------------------
-
-    def post(self, session: Session, data: bytes, now: float) -> bool:
-        """Handles a message of a session on the fast path. Returns False if it was recalled instead."""
-        head, row = data[:2], session.row
-        if head == INPUTS and len(data) <= self._limits.message_bytes_max:
-            self._data.append(data)
-            self._spans.extend((row, len(data)))
-            self._times.append(now)
-            if len(self._data) >= WAITING_MAX:
-                self.flush()
-            return True
-        if head == PING and self._rows.floats[row * FLOATS + ALLOWANCE] - 1 >= -self._clocks.burst:
-            self._rows.floats[row * FLOATS + RECEIVED_AT] = now
-            self._rows.floats[row * FLOATS + ALLOWANCE] -= 1
-        else:
-            self.recall(session)
-        return False
-
-    def flush(self) -> None:
-        """Takes all messages that have arrived. Call it before a tick."""
-        if not self._data:
-            return
-        data, spans, times, rows = self._data, self._spans, self._times, self._rows
-        self._renew()
-        fates, rules, clock = bytearray(len(data)), self._rules, self._clock
-        rules.values[0], rules.values[1], rules.values[2] = (
-            self._world.tick,
-            min(self._bounds.ahead, rows.slots),
-            self._row_bytes,
-        )
-        rules.values[3], rules.values[4] = self._limits.input_rows_max, rows.slots
-        clock.values[0], clock.values[1], clock.values[2] = self._clocks.deadline, self._rate, self._catch_up
-        clock.values[3], clock.values[4] = self._bounds.margin_one, self._clocks.burst
-        self._kernel.take_messages(
-            rows.numbers_lent,
-            rows.floats_lent,
-            rows.ring_lent,
-            b"".join(data),
-            lent(self._kernel, spans, "q"),
-            lent(self._kernel, times, "d"),
-            lent(self._kernel, fates, "B"),
-            rules.lent,
-            clock.lent,
-        )
-        if not any(fates):
-            return
-        sessions = rows.sessions.copy()
-        for i, fate in enumerate(fates):
-            session = sessions[spans[2 * i]]
-            if session is None:
-                continue
-            if fate == ANSWERED and session.row >= 0:
-                sent_at = rows.floats[session.row * FLOATS + PROBE_AT]
-                size = rows.numbers[session.row * WIDTH + PROBE_BYTES]
-                session.flow.answered(times[i] - sent_at, size, times[i])
-            elif fate == LEFT:
-                self.recall(session)
-                self._receive(session, data[i], times[i])
 
     # -- the tick ------------------------------------------------------------------------------------------
 
@@ -204,7 +116,7 @@ class FastPath:
 
     def coming(self, row: int, tick: int) -> Input:
         """Returns the input of a row that would be taken for a tick now, like `InputQueue.coming`."""
-        self.flush()
+        self.arrivals.flush()
         return self._rows.coming(row, tick, self._bounds.repeats)
 
     def send(self, shared: int, now: float) -> None:
@@ -228,25 +140,26 @@ class FastPath:
 
     def _measure(self, now: float) -> None:
         """Measures the connections whose time has come, or looks at them, as `FlowControl.window` does."""
-        rows = self._rows
-        numbers, floats = rows.numbers, rows.floats
-        self._clock.values[0], self._clock.values[1] = now, self._limits.silence_s
+        rows, clock = self._rows, self._clock.values
+        clock[0], clock[1] = now, self._limits.silence_s
+        clock[2], clock[3] = flow_control.NARROW, flow_control.RTT_WINDOW_S
         n = self._kernel.due_rows(rows.numbers_lent, rows.floats_lent, rows.due_lent, self._clock.lent)
-        for row in rows.due[:n].tolist():
-            at, measures = (row, True) if row >= 0 else (-1 - row, False)
-            session, base = rows.sessions[at], at * WIDTH
+        if not n:
+            return
+        sessions, told = rows.sessions, rows.told
+        for i, row in enumerate(rows.due[:n].tolist()):
+            at = row if row >= 0 else -1 - row
+            session = sessions[at]
             assert session is not None
-            flow = session.flow
-            flow.sent_bytes = numbers[base + SENT_BYTES]
-            if measures:
-                flow.held_share = floats[at * FLOATS + HELD_SHARE]
-                flow.measure(self._tick_s, now)
-                numbers[base + CARRIES], floats[at * FLOATS + MEASURE_AT] = flow.carries, flow.measure_at
-                if not flow.steady:
-                    numbers[base + STATE] = ODD
-            else:
-                flow.look()
-            numbers[base + TAKEN_BYTES] = flow.taken
+            outstanding = session.link.outstanding()
+            if outstanding is None:
+                session.flow.blind, rows.numbers[at * WIDTH + STATE] = True, ODD
+            told[i] = outstanding or 0
+        clock[1], clock[2], clock[3] = flow_control.SAMPLE_S, flow_control.RATE_SPAN_S, flow_control.RATE_WINDOW_S
+        clock[4], clock[5], clock[6] = flow_control.STALL_RTTS, flow_control.HOLD_S_MAX, self._tick_s
+        self._kernel.measure_rows(
+            rows.numbers_lent, rows.floats_lent, rows.due_lent, rows.told_lent, n, self._clock.lent
+        )
 
     def _write(self, now: float) -> list[Session]:
         """Writes the snapshots, and sends them. Returns the sessions for which it was not done."""
@@ -272,6 +185,8 @@ class FastPath:
                 clock.lent,
             )
             left += self._pass_on(at, rows.spans[2 * at : 2 * end].tolist())
+            self._counters.snapshots_sent += rules.values[3]
+            self._counters.snapshot_bytes += rules.values[4]
             if end < n:
                 self._out = Arguments(self._kernel, "B", 2 * len(self._out.values))
             at = end
@@ -279,23 +194,18 @@ class FastPath:
 
     def _pass_on(self, row: int, spans: list[int]) -> list[Session]:
         """Passes the messages of consecutive rows to their connections. Returns the sessions without one."""
-        data = bytes(self._out.values[: max(spans, default=0)])
-        sent, size, left = 0, 0, []
-        for start, end, session in zip(spans[::2], spans[1::2], self._rows.sessions[row:], strict=False):
-            if session is None or session.row < 0 or start == UNUSED:
-                continue
-            if start == UNWRITTEN:
-                left.append(session)
-                continue
-            sent += 1
-            size += end - start
-            try:
-                session.link.send(data[start:end])
-            except Exception:
-                self._connections.fail(session, "serving a client")
-        self._counters.snapshots_sent += sent
-        self._counters.snapshot_bytes += size
-        return left
+        data, starts = bytes(self._out.values[: max(spans, default=0)]), spans[::2]
+        sessions, outlets = self._rows.sessions[row:], self._rows.outlets[row:]
+        for start, end, session, outlet in zip(starts, spans[1::2], sessions, outlets, strict=False):
+            if start >= 0:
+                try:
+                    outlet(data[start:end])
+                except Exception:
+                    assert session is not None
+                    self._connections.fail(session, "serving a client")
+        if UNWRITTEN not in starts:
+            return []
+        return [s for s, start in zip(sessions, starts, strict=False) if s is not None and start == UNWRITTEN]
 
     def _parts(self) -> bytes:
         """Returns the deltas of all segments that are seen here and have changed."""
@@ -339,6 +249,8 @@ class FastPath:
         self._rows.write(session, [self._see(segment) for segment in segments])
         queue.settle = partial(self.count, session.row, queue)
         session.fast_path, session.enrolled, session.plain = self, tick, 0
+        if session.framed is not None:
+            session.framed.inlet = partial(self.arrivals.post_frame, session.row)
         self._n += 1
 
     def _see(self, segment: Cell) -> int:
@@ -370,9 +282,11 @@ class FastPath:
 
     def recall(self, session: Session) -> None:
         """Takes a session off the fast path: its state is where the specification expects it again."""
-        self.flush()
+        self.arrivals.flush()
         if session.row < 0:  # it was recalled because of one of its messages
             return
+        if session.framed is not None:
+            session.framed.inlet = None
         for number in self._rows.restore(session, self._world.tick):
             self._leave(number)
         soon = self._world.tick - session.enrolled < SOON
@@ -392,7 +306,7 @@ class FastPath:
 
     def count(self, row: int, queue: InputQueue) -> None:
         """Completes the counts of an input queue whose player's session is here."""
-        self.flush()
+        self.arrivals.flush()
         settle, queue.settle = queue.settle, None
         if settle is not None:  # the session is still here
             self._rows.count(row, queue)

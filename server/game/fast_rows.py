@@ -1,32 +1,40 @@
-"""The rows of the fast path: the state of sessions in arrays that compiled code reads and writes (`shared.traffic`)."""
+"""The rows of the fast path: the state of sessions in arrays for compiled code (`shared.session_rows`)."""
 
+import math
 from array import array
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
 from server.game.session import Session
 from server.players.input_queue import InputQueue, decoded
+from server.replication.flow_control import FlowControl
 from shared.bounds import in_ticks
 from shared.inputs import ROW, Input, row
 from shared.kernels import NUMBA, Kernel
 from shared.scene import Scene
-from shared.traffic import (
+from shared.session_rows import (
     ACCEPTED,
     ACKED,
     ALLOWANCE,
     CARRIES,
     FLOATS,
+    FRAMED,
     FREE,
+    FULL_AT,
     HELD,
     HELD_AIM,
     HELD_SHARE,
     KEPT,
     LATE,
+    LEAST_RTT,
     MARGINS,
     MEASURE_AT,
     MISSING,
     N_MARGINS,
+    N_RATES,
+    N_SAMPLES,
     N_SEGMENTS,
     N_STATUSES,
     NEWEST,
@@ -34,7 +42,15 @@ from shared.traffic import (
     PROBE_AT,
     PROBE_BYTES,
     PROBE_TICK,
+    RATE,
+    RATE_AT,
+    RATES,
     RECEIVED_AT,
+    RTT,
+    RTT_AT,
+    SAMPLE_AT,
+    SAMPLE_BYTES,
+    SAMPLES,
     SEGMENTS,
     SENT_AT,
     SENT_BYTES,
@@ -100,6 +116,8 @@ class Rows:
         """Number of slots of a row's ring: for how many ticks ahead a row can have inputs."""
         self.sessions: list[Session | None] = []
         """Session of each row; None: the row is free."""
+        self.outlets: list[Callable[[bytes], None]] = []
+        """Function of each row that sends a snapshot."""
         self._inputs: dict[tuple[int, int], Input] = {}
         self._grow(ROWS_MIN)
 
@@ -107,6 +125,7 @@ class Rows:
         """Makes room for `n` rows. Their contents stay."""
         old = len(self.sessions)
         self.sessions += [None] * (n - old)
+        self.outlets += [_refuse] * (n - old)
         for name, width, kind in (
             ("numbers", WIDTH, "q"),
             ("floats", FLOATS, "d"),
@@ -115,6 +134,7 @@ class Rows:
             ("taken", 2, "q"),
             ("spans", 2, "q"),
             ("due", 1, "q"),
+            ("told", 1, "q"),
         ):
             grown = Arguments(self._kernel, kind, n * width, getattr(self, name) if old else None)
             setattr(self, name, grown.values)
@@ -127,6 +147,7 @@ class Rows:
     taken: Any
     spans: Any
     due: Any
+    told: Any
     """Arrays of all rows; each has a form for the kernel (`numbers_lent`)."""
     numbers_lent: Any
     floats_lent: Any
@@ -135,6 +156,7 @@ class Rows:
     taken_lent: Any
     spans_lent: Any
     due_lent: Any
+    told_lent: Any
 
     def write(self, session: Session, segments: list[int]) -> None:
         """Moves the state of a session to a free row.
@@ -159,12 +181,19 @@ class Rows:
         values[TICK], values[ACKED], values[SNAPSHOT_BYTES] = stream.tick, stream.acked, stream.snapshot_bytes
         values[SENT_BYTES], values[TAKEN_BYTES], values[CARRIES] = flow.sent_bytes, flow.taken, flow.carries
         values[PROBE_TICK], probe_at, values[PROBE_BYTES] = probe or (-1, 0.0, 0)
-        values[N_SEGMENTS] = len(segments)
+        values[N_SEGMENTS], values[FRAMED] = len(segments), session.framed is not None
+        values[N_SAMPLES], values[N_RATES] = len(flow.samples), len(flow.rates)
+        values[SAMPLE_BYTES : SAMPLE_BYTES + len(flow.samples)] = [taken for _, taken in flow.samples]
         self.numbers[at * WIDTH : (at + 1) * WIDTH] = array("q", values)
         reals = [0.0] * FLOATS
         reals[RECEIVED_AT], reals[ALLOWANCE], reals[SENT_AT] = session.received_at, session.allowance, stream.sent_at
         reals[MEASURE_AT], reals[HELD_SHARE], reals[PROBE_AT] = flow.measure_at, flow.held_share, probe_at
+        reals[FULL_AT] = flow.full_at
+        reals[SAMPLE_AT : SAMPLE_AT + len(flow.samples)] = [measured for measured, _ in flow.samples]
+        reals[RATE_AT : RATE_AT + len(flow.rates)] = [measured for measured, _ in flow.rates]
+        reals[RATE : RATE + len(flow.rates)] = [rate for _, rate in flow.rates]
         self.floats[at * FLOATS : (at + 1) * FLOATS] = array("d", reals)
+        self.write_rtts(at, flow)
         self.views[at * SEGMENTS : at * SEGMENTS + len(segments)] = array("i", segments)
         start, end = at * self.slots * SLOT, (at + 1) * self.slots * SLOT
         self.ring[start:end] = array("q", [-1]) * (end - start)
@@ -173,6 +202,13 @@ class Rows:
             self.ring[slot : slot + SLOT] = array("q", (tick, *self._words(row(input_, aim=self._aim))))
         assert session.player is not None
         session.row = session.player.row = at
+        self.outlets[at] = session.link.send if session.framed is None else session.framed.outlet()
+
+    def write_rtts(self, at: int, flow: FlowControl) -> None:
+        """Writes what a row has of the measured round trips."""
+        base = at * FLOATS
+        self.floats[base + LEAST_RTT] = flow.least_rtt_s
+        self.floats[base + RTT_AT], self.floats[base + RTT] = flow.rtts[-1] if flow.rtts else (-math.inf, math.inf)
 
     def restore(self, session: Session, tick: int) -> list[int]:
         """Moves the state of a session back, and frees its row. Returns the numbers of its segments.
@@ -184,7 +220,7 @@ class Rows:
         at, session.row = session.row, -1
         assert session.player is not None
         session.player.row = -1
-        self.sessions[at] = None
+        self.sessions[at], self.outlets[at] = None, _refuse
         values = self.numbers[at * WIDTH : (at + 1) * WIDTH].tolist()
         self.numbers[at * WIDTH + STATE] = FREE
         reals = self.floats[at * FLOATS : (at + 1) * FLOATS].tolist()
@@ -209,6 +245,10 @@ class Rows:
         flow.sent_bytes, flow.taken, flow.carries = values[SENT_BYTES], values[TAKEN_BYTES], values[CARRIES]
         session.received_at, session.allowance, stream.sent_at = reals[RECEIVED_AT], reals[ALLOWANCE], reals[SENT_AT]
         flow.measure_at, flow.held_share = reals[MEASURE_AT], reals[HELD_SHARE]
+        n = values[N_SAMPLES]
+        flow.samples = list(zip(reals[SAMPLE_AT : SAMPLE_AT + n], values[SAMPLE_BYTES : SAMPLE_BYTES + n], strict=True))
+        n = values[N_RATES]
+        flow.rates = list(zip(reals[RATE_AT : RATE_AT + n], reals[RATE : RATE + n], strict=True))
         segments: list[int] = self.views[at * SEGMENTS : at * SEGMENTS + values[N_SEGMENTS]].tolist()
         return segments
 
@@ -251,6 +291,11 @@ class Rows:
         return int.from_bytes(packed[: ROW.size], "little"), int.from_bytes(packed[ROW.size :], "little")
 
 
+def _refuse(message: bytes) -> None:
+    """Stands for the outlet of a free row."""
+    raise AssertionError("a free row sends nothing")
+
+
 def fits(session: Session, tick: int, slots: int) -> bool:
     """Returns whether a row can hold the state of a session that was just sent the snapshot of a tick.
 
@@ -274,6 +319,8 @@ def fits(session: Session, tick: int, slots: int) -> bool:
         and stream.acked >= 0
         and stream.tick == view.tick == tick
         and stream.flow.steady
+        and len(stream.flow.samples) < SAMPLES
+        and len(stream.flow.rates) < RATES
         and segments is not None
         and len(segments) <= SEGMENTS
         and not (stream.terrain_now or stream.terrain_due or stream.shared_due or stream.private_due)

@@ -121,7 +121,7 @@ class Front:
         """Checks one message of a client and queues it, or closes the connection if it is not allowed."""
         if session.row >= 0:
             assert self.fast_path is not None
-            if self.fast_path.post(session, data, now):
+            if self.fast_path.arrivals.post(session, data, now):
                 return
         if session.closed:
             return

@@ -163,7 +163,7 @@ class Game(Front):
             now: the current time in seconds.
         """
         if self.fast_path is not None:
-            self.fast_path.flush()
+            self.fast_path.arrivals.flush()
         self.clocks.begin(deadline, now)
         self.edge.follow(self.sequencer.advance(now))
         self.clocks.refill()

@@ -1,12 +1,14 @@
 """A session: one connection of a client, from the handshake to its end."""
 
 import math
+from collections.abc import Collection
 from typing import TYPE_CHECKING, Any
 
 from server.players.input_queue import InputQueue
 from server.players.player import SETTLED_MAX, Player
-from server.replication.client_stream import ClientStream, Transport
+from server.replication.client_stream import ClientStream, Framed, Transport
 from server.replication.flow_control import FlowControl
+from shared.checks import Cell
 from shared.messages import Hello
 
 if TYPE_CHECKING:
@@ -27,6 +29,8 @@ class Session:
 
     def __init__(self, link: Transport, now: float) -> None:
         self.link = link
+        self.framed = link if isinstance(link, Framed) else None
+        """The connection, if it takes and gives whole frames."""
         self.row = -1
         """Number of its row on the fast path; -1: it is not on it."""
         self.fast_path: FastPath | None = None
@@ -74,6 +78,11 @@ class Session:
     def flow(self) -> FlowControl:
         """Flow control. On the fast path, it lacks what is in the row."""
         return self._stream.flow
+
+    @property
+    def sees(self) -> Collection[Cell]:
+        """Segments of the client view. They do not change on the fast path."""
+        return self._stream.view.sees
 
     @property
     def inputs(self) -> InputQueue:

@@ -1,11 +1,12 @@
 """The WebSocket of one client, which passes its messages to the game, and the game's messages to the client.
 
-Theory of operation. websockets parses the protocol (with its Sans-I/O `ServerProtocol`); only plain messages are parsed
-here. asyncio moves the bytes. Except for the TLS handshake there is no task and no await per connection: a message is
-passed to the game in the callback that brings it, and what the game sends is written in the call that sends it. Nothing
-here waits for a client. asyncio's flow control (`pause_writing`) has no effect, because the game checks `outstanding()`
-before it sends. Frames that the game does not get and so cannot count (pings, fragments, frames after the close) are
-limited here; a peer that exceeds these limits is aborted.
+Theory of operation. websockets parses the protocol (with its Sans-I/O `ServerProtocol`); plain messages are parsed
+here, or left in their frames to the game's fast path (`inlet`). asyncio moves the bytes. Except for the TLS handshake
+there is no task and no await per connection: a message is passed to the game in the callback that brings it, and what
+the game sends is written in the call that sends it. Nothing here waits for a client. asyncio's flow control
+(`pause_writing`) has no effect, because the game checks `outstanding()` before it sends. Frames that the game does not
+get and so cannot count (pings, fragments, frames after the close) are limited here; a peer that exceeds these limits is
+aborted.
 
 A connection goes through these stages: handshake (or an HTTP page), `game.open`, `game.receive` for each message, and
 exactly once `game.lost`, as soon as the peer has closed, violated the protocol or disconnected. Every stage that waits
@@ -17,6 +18,7 @@ import logging
 import socket
 import sys
 import time
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, cast
 
 from websockets.frames import CloseCode, Frame, Opcode
@@ -72,6 +74,7 @@ class Connection(AcceptedSocket):
 
     def __init__(self, gateway: "Gateway", loop: asyncio.AbstractEventLoop) -> None:
         self.opened = False
+        self.inlet: Callable[[bytes, float], bool] | None = None
         self._gateway = gateway
         self._events: Events = gateway.game  # what gets the events of this connection
         self._loop = loop
@@ -99,6 +102,11 @@ class Connection(AcceptedSocket):
         if self._live and self._transport is not None:
             self._transport.write(_frame_head(len(message)) + message)
 
+    def outlet(self) -> Callable[[bytes], None]:
+        """Returns a function that queues one binary message in its frame, until the session has ended."""
+        assert self._transport is not None
+        return self._transport.write
+
     def outstanding(self) -> int | None:
         """Returns the bytes that the peer's kernel has not acknowledged.
 
@@ -114,7 +122,7 @@ class Connection(AcceptedSocket):
 
     def close(self, code: int, reason: str) -> None:
         """Closes the WebSocket after everything that was sent. Aborts if the peer does not finish within `CLOSE_S`."""
-        self._deaf = True
+        self._deaf, self.inlet = True, None
         if self._live:
             self._protocol.send_close(code, reason.encode()[:REASON_BYTES_MAX].decode(errors="ignore"))
             self._flush()
@@ -137,6 +145,9 @@ class Connection(AcceptedSocket):
             self.abort()
 
     def data_received(self, data: bytes) -> None:
+        inlet = self.inlet
+        if inlet is not None and self._plain and not (self._tail or self._fragmented) and inlet(data, time.monotonic()):
+            return
         if not self._live and self._protocol.state is CONNECTING and not self._protocol.eof_sent:
             data = self._shake_hands(data)
             if not data:

@@ -1,6 +1,7 @@
 """The sending side of one connection: what the client has been sent, what it has acknowledged, and what is due."""
 
-from typing import Protocol
+from collections.abc import Callable
+from typing import Protocol, runtime_checkable
 
 from server.replication.client_view import ClientView
 from server.replication.flow_control import FlowControl
@@ -19,6 +20,18 @@ class Transport(Protocol):
 
     def close(self, code: int, reason: str) -> None:
         """Closes the connection once everything that was sent has gone out."""
+
+
+@runtime_checkable
+class Framed(Protocol):
+    """A transport that also takes and gives whole WebSocket frames."""
+
+    inlet: Callable[[bytes, float], bool] | None
+    """Is offered what arrives, before it is parsed, with the time in seconds. If it takes it, it returns True."""
+
+    def outlet(self) -> Callable[[bytes], None]:
+        """Returns a function that queues one message in its frame and never blocks, until the session has ended."""
+        ...
 
 
 class ClientStream:

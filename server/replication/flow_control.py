@@ -71,16 +71,20 @@ class FlowControl:
         """Lower bound of the bytes that are no longer on the way."""
         # If the link cannot tell: the snapshots that are not acknowledged, with the total of bytes after each. They
         # count from the first acknowledgement on, because a client that waits for terrain sends none.
-        self._blind = False
+        self.blind = False
+        """Whether the link could once not tell the bytes on the way."""
         self._unheard: list[tuple[int, int]] = []
         self._heard = -1
         self.measure_at = -math.inf
         """Time in seconds of the next measurement."""
-        self._acked: list[tuple[float, int]] = []  # time, bytes acknowledged by then
-        # Pairs of time and value. A pair is dropped once a later one is better, so the best is in front.
-        self._rates: list[tuple[float, float]] = []
-        self._rtts: list[tuple[float, float]] = []
-        self._full_at = -math.inf
+        self.samples: list[tuple[float, int]] = []
+        """Latest measurements: time in seconds, total of bytes that were no longer on the way."""
+        self.rates: list[tuple[float, float]] = []
+        self.rtts: list[tuple[float, float]] = []
+        """Rates and round trips, each with its time in seconds in front. One is dropped once a later one is better, so
+        the best is the first."""
+        self.full_at = -math.inf
+        """Time in seconds at which nothing could be sent for the last time."""
         self.pauses = self.narrow = False
         """Whether sending pauses to measure the round trip; whether the connection is narrow."""
         self.held_share = 0.0
@@ -92,12 +96,12 @@ class FlowControl:
     @property
     def rate(self) -> float:
         """Highest rate of the last `RATE_WINDOW_S`, in bytes per second; 0: not measured yet."""
-        return self._rates[0][1] if self._rates else 0.0
+        return self.rates[0][1] if self.rates else 0.0
 
     @property
     def least_rtt_s(self) -> float:
         """Shortest time from sending a snapshot to its acknowledgement, in seconds; 0: not measured yet."""
-        return self._rtts[0][1] if self._rtts else 0.0
+        return self.rtts[0][1] if self.rtts else 0.0
 
     @property
     def outstanding(self) -> int:
@@ -107,13 +111,13 @@ class FlowControl:
     def look(self) -> None:
         """Asks the link for the bytes on the way, which makes `outstanding` exact."""
         told = self._ask()
-        self._blind = self._blind or told is None
+        self.blind = self.blind or told is None
         unheard = self._unheard[-1][1] - self._heard if self._unheard else 0
         self.taken = self.sent_bytes - max(told or 0, unheard)
 
     def sent(self, tick: int) -> None:
         """Notes that the snapshot of a tick was handed to the transport."""
-        if self._blind and self._heard >= 0:
+        if self.blind and self._heard >= 0:
             self._unheard.append((tick, self.sent_bytes))
 
     def acked(self, tick: int) -> None:
@@ -131,15 +135,15 @@ class FlowControl:
             size: bytes of the message.
             now: the current time in seconds.
         """
-        if now - self._full_at < RATE_WINDOW_S + rtt_s and self.rate > 0:
+        if now - self.full_at < RATE_WINDOW_S + rtt_s and self.rate > 0:
             rtt_s = max(rtt_s - size / self.rate, 0.0)  # on a narrow connection, subtract the time of the transfer
-        if self._rtts and rtt_s >= self._rtts[-1][1] and now - self._rtts[-1][0] < RTT_SPAN_S:
+        if self.rtts and rtt_s >= self.rtts[-1][1] and now - self.rtts[-1][0] < RTT_SPAN_S:
             return
-        while self._rtts and (self._rtts[0][0] < now - RTT_WINDOW_S):
-            self._rtts.pop(0)
-        while self._rtts and self._rtts[-1][1] >= rtt_s:
-            self._rtts.pop()
-        self._rtts.append((now, rtt_s))
+        while self.rtts and (self.rtts[0][0] < now - RTT_WINDOW_S):
+            self.rtts.pop(0)
+        while self.rtts and self.rtts[-1][1] >= rtt_s:
+            self.rtts.pop()
+        self.rtts.append((now, rtt_s))
         self.pauses = False
 
     def window(self, snapshot_bytes: int, tick_s: float, now: float) -> int:
@@ -162,7 +166,7 @@ class FlowControl:
             return 0
         held = self.sent_bytes - self.taken > window
         if held:
-            self._full_at = now
+            self.full_at = now
         if held or self.held_share:
             self.held_share += (held - self.held_share) * min(tick_s / HELD_S, 1.0)
         return window
@@ -174,7 +178,7 @@ class FlowControl:
     @property
     def steady(self) -> bool:
         """Whether all that limits the next snapshot is `carries`, and the link tells the bytes on the way."""
-        return not (self.narrow or self.pauses or self._blind or self._heard < 0)
+        return not (self.narrow or self.pauses or self.blind or self._heard < 0)
 
     def measure(self, tick_s: float, now: float) -> None:
         """Measures the rate of the connection, and from it how many bytes may be on the way.
@@ -186,17 +190,17 @@ class FlowControl:
         self.measure_at = now + SAMPLE_S
         self.look()
         acked = self.taken
-        self._acked.append((now, acked))
-        while len(self._acked) > 1 and self._acked[1][0] <= now - RATE_SPAN_S:
-            self._acked.pop(0)
-        since, before = self._acked[0]
+        self.samples.append((now, acked))
+        while len(self.samples) > 1 and self.samples[1][0] <= now - RATE_SPAN_S:
+            self.samples.pop(0)
+        since, before = self.samples[0]
         if now - since >= RATE_SPAN_S:
             rate = (acked - before) / (now - since)
-            while self._rates and self._rates[-1][1] <= rate:
-                self._rates.pop()
-            self._rates.append((now, rate))
-        while self._rates and self._rates[0][0] < now - RATE_WINDOW_S:
-            self._rates.pop(0)
+            while self.rates and self.rates[-1][1] <= rate:
+                self.rates.pop()
+            self.rates.append((now, rate))
+        while self.rates and self.rates[0][0] < now - RATE_WINDOW_S:
+            self.rates.pop(0)
         rtt_s = self.least_rtt_s
         self.narrow = self.held_share > (WIDE if self.narrow else NARROW)
         if self.narrow:
@@ -205,4 +209,4 @@ class FlowControl:
         else:
             hold_s = min(STALL_RTTS * rtt_s, max(HOLD_S_MAX, 1.5 * rtt_s)) + tick_s
             self.carries = max(LEAST_BYTES, int(self.rate * hold_s))
-        self.pauses = bool(self._rtts) and now - self._rtts[-1][0] > RTT_WINDOW_S > now - self._full_at
+        self.pauses = bool(self.rtts) and now - self.rtts[-1][0] > RTT_WINDOW_S > now - self.full_at

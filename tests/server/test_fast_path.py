@@ -16,6 +16,7 @@ from server.config.limits import Limits
 from server.game import Game
 from server.game.fast_path import PATIENCE_MAX, FastPath
 from server.game.session import Session
+from server.net.websocket import _frame_head
 from server.players.player import Player
 from server.rules import Rules
 from shared import kernels, messages
@@ -86,6 +87,13 @@ class Busy(Rules):
         elif name == "shot":
             game.rewound(player).ray(game.position(player.entity), (1.0, 0.0, 0.0), 8.0)
         return None
+
+
+def masked(message: bytes) -> bytes:
+    """Returns a message in the frame of a client."""
+    n, mask = len(message), b"\x5a\x13\xc7\x2e"
+    head = bytes((0x82, 0x80 | n)) if n < 126 else b"\x82\xfe" + n.to_bytes(2, "big")
+    return head + mask + bytes(byte ^ mask[i % 4] for i, byte in enumerate(message))
 
 
 NAMES = "event whisper shared private attribute jump refuse shot".split()
@@ -199,10 +207,44 @@ class Peer:
                 self.say_inputs(1)
 
 
+class FramedPeer(Peer):
+    """A client whose link takes and gives whole WebSocket frames, like `server.net.websocket.Connection`."""
+
+    def open(self) -> None:
+        self.inlet: Callable[[bytes, float], bool] | None = None
+        self.in_frames = 0
+        super().open()
+
+    def outlet(self) -> Callable[[bytes], None]:
+        return self.send_frame
+
+    def send_frame(self, frame: bytes) -> None:
+        assert type(frame) is bytes
+        head = 2 if frame[1] < 126 else 4
+        message = frame[head:]
+        assert frame[:head] == _frame_head(len(message))
+        self.send(message)
+
+    def say(self, data: bytes) -> None:
+        if self.inlet is not None and self.inlet(masked(data), self.crowd.now):
+            self.in_frames += 1
+        else:
+            super().say(data)
+
+
 class Crowd:
     """A game with its clients."""
 
-    def __init__(self, seed: int, scene: Scene, attach: Callable[[Game], None], *, busy: float, rules: Rules) -> None:
+    def __init__(
+        self,
+        seed: int,
+        scene: Scene,
+        attach: Callable[[Game], None],
+        *,
+        busy: float,
+        rules: Rules,
+        kind: type[Peer] = Peer,
+    ) -> None:
         self.seed, self.busy, self.rules, self.now = seed, busy, rules, 0.0
         tokens = random.Random(seed)
         limits = Limits(resume_s=1.0, silence_s=3.0, stalled_s=2.0, input_rows_max=4, edits_per_s=50.0)
@@ -211,7 +253,7 @@ class Crowd:
             self.game = Game(scene, limits=limits, rules=rules, fast_path=False)
             attach(self.game)
             self.on_fast_path = self.served = 0
-            self.peers = [Peer(self, number) for number in range(PEERS)]
+            self.peers = [kind(self, number) for number in range(PEERS)]
             self.play(30 * PATIENCE_MAX // 4)
 
     def play(self, ticks: int) -> None:
@@ -257,16 +299,27 @@ def without(game: Game) -> None:
 
 @pytest.mark.parametrize("busy", [0.0, 0.01, 0.2])
 @pytest.mark.parametrize(("aim", "rate"), [(False, 30), (True, 30), (False, 240), (True, 8)])
-@pytest.mark.parametrize("form", kernels.FORMS)
-def test_every_byte_is_the_same(form: str, aim: bool, rate: int, busy: float) -> None:
+@pytest.mark.parametrize(
+    ("form", "kind"),
+    [
+        (kernels.PREBUILT, Peer),
+        (kernels.PREBUILT, FramedPeer),
+        (kernels.NUMBA, FramedPeer),
+        (kernels.PLAIN, Peer),
+        (kernels.PLAIN, FramedPeer),
+    ],
+)
+def test_every_byte_is_the_same(form: str, kind: type[Peer], aim: bool, rate: int, busy: float) -> None:
     if kernels.missing(form):
         pytest.skip(kernels.missing(form))
     kernel = kernels.get(False) if form == kernels.PLAIN else None
     scene, seed = crowd_scene(aim=aim, rate=rate), round(1000 * busy) + rate + aim
-    fast = Crowd(seed, scene, with_fast_path(kernel), busy=busy, rules=Busy())
+    fast = Crowd(seed, scene, with_fast_path(kernel), busy=busy, rules=Busy(), kind=kind)
     slow = Crowd(seed, scene, without, busy=busy, rules=Busy())
     for one, other in zip(fast.record(), slow.record(), strict=True):
         assert one == other
     least = {0.0: 0.6, 0.01: 0.2, 0.2: 0.02}[busy] if rate > 8 else 0.02  # at 8 Hz, a segment is crossed in 20 ticks
     assert fast.on_fast_path > least * fast.served, "the fast path was used"
     assert slow.on_fast_path == 0
+    if kind is FramedPeer:
+        assert sum(peer.in_frames for peer in fast.peers if isinstance(peer, FramedPeer)) > 0

@@ -16,7 +16,9 @@ import math
 import sys
 import time
 import tomllib
-from typing import Any
+from typing import Any, cast
+
+from websockets.speedups import apply_mask
 
 from scripts.benchmarks.busy_server import in_view
 from scripts.environment import ROOT
@@ -52,18 +54,26 @@ class Measured(Game):
         super().__init__(rules)
         self.follow = follow
         self.began: list[float] = []
-        self.arrived: dict[str, dict[int, float]] = {}
+        self.arrived: list[tuple[str, bytes, float]] = []
+        """Input messages: name of the player, message, time of arrival."""
         self.first = self.world.tick + 1
         self._at: dict[int, tuple[float, float]] = {}
         self.walked: dict[str, float] = {}
+        assert self.fast_path is not None
+        self._plain_post, arrivals = self.fast_path.arrivals.post_frame, cast("Any", self.fast_path.arrivals)
+        arrivals.post_frame, self._rows = self._post_frame, arrivals._rows
 
     def receive(self, session: Session, data: bytes, now: float) -> None:
         if data[:2] == INPUTS and session.player is not None:
-            message, arrived = decode_from_client(data), self.arrived.setdefault(session.player.name, {})
-            assert isinstance(message, Inputs)
-            for at in range(message.first, message.first + len(message.rows) // INPUT_ROW_BYTES):
-                arrived.setdefault(at, now)
+            self.arrived.append((session.player.name, data, now))
         super().receive(session, data, now)
+
+    def _post_frame(self, row: int, data: bytes, now: float) -> bool:
+        """Notes a message that comes in its frame."""
+        taken = self._plain_post(row, data, now)
+        if taken:
+            self.arrived.append((self._rows.sessions[row].player.name, data, now))
+        return taken
 
     def tick(self, deadline: float, now: float) -> None:
         self.began.append(time.monotonic())
@@ -85,9 +95,15 @@ class Measured(Game):
         }
 
     def input_log(self) -> dict[str, Any]:
+        logs: dict[str, dict[int, float]] = {}
+        for name, data, now in self.arrived:
+            message = decode_from_client(data if data[:2] == INPUTS else apply_mask(data[6:], data[2:6]))
+            assert isinstance(message, Inputs)
+            for at in range(message.first, message.first + len(message.rows) // INPUT_ROW_BYTES):
+                logs.setdefault(name, {}).setdefault(at, now)
         inputs = {
             name: [[at, arrived, at - self.first if self._used(at, arrived) else -1] for at, arrived in log.items()]
-            for name, log in self.arrived.items()
+            for name, log in logs.items()
         }
         return {"first": self.first, "ticks": self.began, "inputs": inputs}
 
