@@ -66,8 +66,7 @@ def write_snapshots(
     Args:
         numbers, floats: the rows. Those whose snapshot is left become `ODD`.
         views: [rows * SEGMENTS] numbers of the segments of each client view, in the order in which they are sent.
-        starts, lengths: the delta of each segment in `parts`, by number; length 0: there is none.
-        parts: the encoded deltas.
+        starts, lengths, parts: the delta of each segment in `parts`, by number; length 0: there is none.
         out: gets the messages. It has room for the longest one at least.
         spans: gets start and end of each row's message in `out`; start `UNUSED` or `UNWRITTEN`: there is none.
         rules: the first row, the tick, most bytes of a snapshot; gets the number of messages and their bytes.

@@ -173,14 +173,10 @@ def take_messages(
 ) -> None:
     """Takes the input messages of the time since the latest tick, as `Front.receive` would one by one.
 
-    Once a message of a row is left, so are all later ones of that row.
-
     Args:
-        numbers, floats, ring: the rows. Those with a message that is left become `ODD`.
+        numbers, floats, ring: the rows. Those with a message that is left become `ODD`; their later ones are left, too.
         data: the messages, one after the other; those in frames are unmasked.
-        rows: row of each message.
-        sizes: size of each message in bytes; if it is negative, that of the frame around the message.
-        times: time of arrival of each message, in seconds.
+        rows, sizes, times: row, size in bytes (if negative, of its frame) and time of arrival (s) of each message.
         fates: gets the fate of each message.
         rules: the latest tick, the most ticks ahead, bytes of an input, most inputs of a message, slots of a row.
         clock: deadline of the latest tick in seconds, ticks per second, most ticks to catch up on, a margin of one tick
