@@ -75,11 +75,11 @@ def free_place(world: WorldState, row: int, kind: int, position: object, push: b
     at = [to_position(part, f"position.{axis}") for axis, part in zip("xyz", parts, strict=True)]
     if not taken(world, row, kind, box_at(world, kind, at)):
         return at
-    pushed = [moved for axis, sign in PUSHES if (moved := _pushed(world, row, kind, at, axis, sign)) is not None]
-    if not push or not pushed:
-        near = " nor within a block of it" if push else ""
-        raise OverlapError(f"position = {parts}: no room for a {world.scene.templates[kind].name!r} there{near}")
-    return min(pushed, key=lambda moved: sum(abs(a - b) for a, b in zip(moved, at, strict=True)))
+    places = (_pushed(world, row, kind, at, axis, sign) for axis, sign in PUSHES) if push else ()
+    if pushed := [moved for moved in places if moved is not None]:
+        return min(pushed, key=lambda moved: sum(abs(a - b) for a, b in zip(moved, at, strict=True)))
+    near = " nor within a block of it" if push else ""
+    raise OverlapError(f"position = {parts}: no room for a {world.scene.templates[kind].name!r} there{near}")
 
 
 def _pushed(world: WorldState, row: int, kind: int, at: list[int], axis: int, sign: int) -> list[int] | None:

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Collection
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 from server.players.input_queue import InputQueue
 from server.players.player import SETTLED_MAX, Player
@@ -29,7 +29,7 @@ class Session:
 
     def __init__(self, link: Transport, now: float) -> None:
         self.link = link
-        self.framed = link if isinstance(link, Framed) else None
+        self.framed = cast("Framed", link) if hasattr(link, "inlet") else None
         """The connection, if it takes and gives whole frames."""
         self.row = -1
         """Number of its row on the fast path; -1: it is not on it."""

@@ -1,7 +1,7 @@
 """The sending side of one connection: what the client has been sent, what it has acknowledged, and what is due."""
 
 from collections.abc import Callable
-from typing import Protocol, runtime_checkable
+from typing import Protocol
 
 from server.replication.client_view import ClientView
 from server.replication.flow_control import FlowControl
@@ -22,9 +22,8 @@ class Transport(Protocol):
         """Closes the connection once everything that was sent has gone out."""
 
 
-@runtime_checkable
 class Framed(Protocol):
-    """A transport that also takes and gives whole WebSocket frames."""
+    """A transport that also takes and gives whole WebSocket frames. Only such a transport has an `inlet`."""
 
     inlet: Callable[[bytes, float], bool] | None
     """Is offered what arrives, before it is parsed, with the time in seconds. If it takes it, it returns True."""
