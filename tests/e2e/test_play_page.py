@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import trustme
 
 from scripts.browser_build.packages import FetchError, npm_package
 from scripts.live_page.chromium import Tab, chromium, installed
@@ -40,13 +41,15 @@ def stats(url: str) -> dict[str, Any]:
         return dict(json.load(answer))
 
 
-def played(url: str, play: Callable[[Tab], None], width: int, height: int, *, phone: bool = False) -> dict[str, Any]:
-    """Opens the page, plays, and returns what it then knows."""
+def played(
+    url: str, play: Callable[[Tab], None], width: int, height: int, *flags: str, phone: bool = False
+) -> dict[str, Any]:
+    """Opens the page in a browser with further flags, plays, and returns what it then knows."""
     assert BROWSER is not None
-    with chromium(BROWSER) as tab:
+    with chromium(BROWSER, *flags) as tab:
         if phone:
             tab.call("Emulation.setTouchEmulationEnabled", enabled=True, maxTouchPoints=5)
-        tab.open(f"{url.replace('ws:', 'http:')}/play", width, height, scale=2.0 if phone else 1.0, phone=phone)
+        tab.open(f"{url.replace('ws', 'http', 1)}/play", width, height, scale=2.0 if phone else 1.0, phone=phone)
         tab.until("document.readyState === 'complete' && location.pathname === '/play'")
         tab.run("document.getElementById('name').value = '<b>Ann'")
         tab.run("document.getElementById('go').click()")
@@ -83,12 +86,22 @@ def key(tab: Tab, code: str, *, down: bool) -> None:
     tab.call("Input.dispatchKeyEvent", type="keyDown" if down else "keyUp", code=code, key=code[-1].lower())
 
 
-async def test_tag_with_the_keyboard() -> None:
+GAMEPAD = (
+    """navigator.getGamepads = () => [null, {connected: true, axes: [-0.7, 0.6, 0, 0], buttons: [{pressed: true}]}]"""
+)
+
+
+async def test_tag_with_the_keyboard_and_a_gamepad() -> None:
     def play(tab: Tab) -> None:
         key(tab, "KeyD", down=True)
         key(tab, "Space", down=True)  # to get over a step of the ground
         walked(tab, 2)
         key(tab, "KeyD", down=False)
+        key(tab, "Space", down=False)
+        tab.run(GAMEPAD)
+        walked(tab, 1)
+        tab.until(f"{ME}.velocity[2] > 0", 60)
+        tab.run("navigator.getGamepads = () => [null]")
         tab.run("document.getElementById('lag').value = 80")
         tab.run("document.getElementById('lag').oninput()")
         tab.until("play.client.stats.rtt_s > 0.07", 60)
@@ -144,6 +157,24 @@ async def test_dodge_with_its_behaviours_on_a_phone() -> None:
     assert found["coloured"] > 100
     assert math.isfinite(found["stats"]["frame_s"])
     assert figures["internal_errors"] == 0
+
+
+async def test_over_tls(tmp_path: Path) -> None:
+    issued = trustme.CA().issue_cert("127.0.0.1")
+    issued.cert_chain_pems[0].write_to_path(tmp_path / "cert.pem")
+    issued.private_key_pem.write_to_path(tmp_path / "key.pem")
+    files = ("--tls-cert", str(tmp_path / "cert.pem"), "--tls-key", str(tmp_path / "key.pem"))
+
+    def play(tab: Tab) -> None:
+        key(tab, "KeyA", down=True)
+        walked(tab, 1)
+
+    async with asyncio.timeout(600):
+        with real_server("--scene", "flat", *files) as url:
+            assert url.startswith("wss://")
+            found = await asyncio.to_thread(played, url, play, 900, 700, "--ignore-certificate-errors")
+    assert found["said"] == []
+    assert found["stats"]["divergences"] == 0
 
 
 @pytest.fixture
