@@ -37,7 +37,7 @@ EXPORTS = {
     "traffic": {
         "unmask": "Bq",
         "take_messages": "QDQbqqdBqd",
-        "take_inputs": "QQQnnn",
+        "take_inputs": "QQQQnnn",
     },
     "delivery": {"write_snapshots": "QDiqqbBQQd"},
     "pacing": {

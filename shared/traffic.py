@@ -242,16 +242,22 @@ def matters(floats: Any, reals: int, now: float, window_s: float, span_s: float)
 
 
 @jit
-def take_inputs(numbers: Any, ring: Any, taken: Any, tick: int, repeats: int, slots: int) -> None:
+def take_inputs(numbers: Any, ring: Any, taken: Any, changed: Any, tick: int, repeats: int, slots: int) -> int:
     """Takes an input of every row for a tick, as `InputQueue.take` does.
 
     Args:
         numbers, ring: the rows.
-        taken: gets two numbers per row: the first three bytes of the input, and the six bytes of its aim.
+        taken: the inputs of the tick before, and gets those of this one. Two numbers per row: the first three bytes of
+            the input, and the six bytes of its aim.
+        changed: gets the rows whose input is not that of the tick before.
         tick: the tick.
         repeats: number of missing inputs up to which the latest one is repeated.
         slots: slots of a row.
+
+    Returns:
+        The number of rows in `changed`.
     """
+    n = 0
     for row in range(len(numbers) // WIDTH):
         base = row * WIDTH
         if numbers[base + STATE] == FREE:
@@ -270,5 +276,10 @@ def take_inputs(numbers: Any, ring: Any, taken: Any, tick: int, repeats: int, sl
         kept = numbers[base + N_STATUSES]
         numbers[base + STATUSES + kept] = status
         numbers[base + N_STATUSES] = kept + 1
-        taken[2 * row] = 0 if status == NEUTRAL_INPUT else numbers[base + HELD]
-        taken[2 * row + 1] = 0 if status == NEUTRAL_INPUT else numbers[base + HELD_AIM]
+        head = 0 if status == NEUTRAL_INPUT else numbers[base + HELD]
+        aim = 0 if status == NEUTRAL_INPUT else numbers[base + HELD_AIM]
+        if taken[2 * row] != head or taken[2 * row + 1] != aim:
+            taken[2 * row], taken[2 * row + 1] = head, aim
+            changed[n] = row
+            n += 1
+    return n

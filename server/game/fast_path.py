@@ -104,15 +104,29 @@ class FastPath:
 
     # -- the tick ------------------------------------------------------------------------------------------
 
-    def take(self, tick: int) -> list[Input]:
-        """Takes the input of each session for a tick. Returns them by row."""
+    def take(self, tick: int, *, everyone: bool) -> dict[int, Input]:
+        """Takes the input of each session for a tick.
+
+        Args:
+            tick: the tick.
+            everyone: whether to return the inputs of all sessions, and not only those that differ from the tick before.
+
+        Returns:
+            The inputs by entity.
+        """
         rows = self._rows
         if not self._n:
-            return []
-        self._kernel.take_inputs(
-            rows.numbers_lent, rows.ring_lent, rows.taken_lent, tick, self._bounds.repeats, rows.slots
+            return {}
+        n = self._kernel.take_inputs(
+            rows.numbers_lent,
+            rows.ring_lent,
+            rows.taken_lent,
+            rows.changed_lent,
+            tick,
+            self._bounds.repeats,
+            rows.slots,
         )
-        return rows.inputs()
+        return rows.taken_by(range(len(rows.sessions)) if everyone else rows.changed[:n].tolist())
 
     def coming(self, row: int, tick: int) -> Input:
         """Returns the input of a row that would be taken for a tick now, like `InputQueue.coming`."""

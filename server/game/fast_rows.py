@@ -2,7 +2,7 @@
 
 import math
 from array import array
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import numpy as np
@@ -135,6 +135,7 @@ class Rows:
             ("spans", 2, "q"),
             ("due", 1, "q"),
             ("told", 1, "q"),
+            ("changed", 1, "q"),
         ):
             grown = Arguments(self._kernel, kind, n * width, getattr(self, name) if old else None)
             setattr(self, name, grown.values)
@@ -148,6 +149,7 @@ class Rows:
     spans: Any
     due: Any
     told: Any
+    changed: Any
     """Arrays of all rows; each has a form for the kernel (`numbers_lent`)."""
     numbers_lent: Any
     floats_lent: Any
@@ -157,6 +159,7 @@ class Rows:
     spans_lent: Any
     due_lent: Any
     told_lent: Any
+    changed_lent: Any
 
     def write(self, session: Session, segments: list[int]) -> None:
         """Moves the state of a session to a free row.
@@ -200,6 +203,7 @@ class Rows:
         for tick, input_ in queue.waiting.items():
             slot = start + tick % self.slots * SLOT
             self.ring[slot : slot + SLOT] = array("q", (tick, *self._words(row(input_, aim=self._aim))))
+        self.taken[2 * at] = -1  # no input, so that the first one counts as changed
         assert session.player is not None
         session.row = session.player.row = at
         self.outlets[at] = session.link.send if session.framed is None else session.framed.outlet()
@@ -261,11 +265,14 @@ class Rows:
         queue.substituted += self.numbers[base + SUBSTITUTED]
         self.numbers[base + LATE] = self.numbers[base + USED] = self.numbers[base + SUBSTITUTED] = 0
 
-    def inputs(self) -> list[Input]:
-        """Returns the inputs that `traffic.take_inputs` has taken, by row."""
-        known, heads = self._inputs, self.taken.tolist()
-        pairs = zip(heads[::2], heads[1::2], strict=True)
-        return [known.get(pair) or self.input_of(*pair) for pair in pairs]
+    def taken_by(self, rows: Iterable[int]) -> dict[int, Input]:
+        """Returns the inputs that `traffic.take_inputs` has taken for these rows, by entity."""
+        taken, sessions = self.taken, self.sessions
+        return {
+            session.entity: self.input_of(taken[2 * row], taken[2 * row + 1])
+            for row in rows
+            if (session := sessions[row]) is not None
+        }
 
     def coming(self, at: int, tick: int, repeats: int) -> Input:
         """Returns the input of a row that would be taken for a tick now, like `InputQueue.coming`."""

@@ -87,13 +87,18 @@ class Sequencer:
         api.kicked.clear()
 
     def take_inputs(self) -> dict[int, Input]:
-        """Takes the input of each player for the coming step, and the inputs that the rules have set."""
-        tick, api = self._world.tick + 1, self._api
-        taken = [] if self.fast_path is None else self.fast_path.take(tick)
-        inputs = {
-            entity: player.inputs.take(tick) if player.row < 0 else taken[player.row]
-            for entity, player in api.players.items()
-        }
+        """Takes the input of each player for the coming step, and the inputs that the rules have set.
+
+        Those of the fast path that are the same as in the tick before are left out, if nobody writes them down.
+        """
+        world, api = self._world, self._api
+        tick, players = world.tick + 1, api.players
+        if self.fast_path is None:
+            inputs = {entity: player.inputs.take(tick) for entity, player in players.items()}
+        else:
+            inputs = self.fast_path.take(tick, everyone=world.recorded or world.extras.count > 0)
+            inputs |= {entity: player.inputs.take(tick) for entity, player in players.items() if player.row < 0}
+            inputs = {entity: inputs[entity] for entity in sorted(inputs)}  # players join with ascending numbers
         inputs.update(api.steered)
         api.steered.clear()
         return inputs

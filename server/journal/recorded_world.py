@@ -182,6 +182,11 @@ class RecordedWorld(World):
         super().__init__(scene, compiled=compiled)
         self.observer = self._pens = Pens()
 
+    @property
+    def recorded(self) -> bool:
+        """Whether there is a pen."""
+        return bool(self._pens.all)
+
     def attach(self, pen: Observer) -> None:
         """Adds a pen. It is notified of every change from now on."""
         self._pens.all = (*self._pens.all, pen)

@@ -5,6 +5,7 @@ twice, too early or with gaps, malformed messages, commands, pings and restarts;
 walks from segment to segment. The rules send events and values, and read inputs.
 """
 
+import io
 import random
 import secrets
 from collections.abc import Callable
@@ -67,6 +68,9 @@ class Busy(Rules):
     def on_tick(self) -> None:
         for player in list(self.game.players.values())[:2]:
             self.seen.append((self.game.tick, self.game.move(player), self.game.held(player, "jump")))
+        for player in self.game.players.values():
+            if (self.game.tick + 11 * player.entity) % 37 == 0:
+                self.game.throw(player.entity, (3.0, -1.0, 4.0))
 
     def on_command(self, player: Player, name: str, payload: Any) -> bool | str | None:
         game = self.game
@@ -246,6 +250,7 @@ class Crowd:
         kind: type[Peer] = Peer,
     ) -> None:
         self.seed, self.busy, self.rules, self.now = seed, busy, rules, 0.0
+        self.recording = io.BytesIO()
         tokens = random.Random(seed)
         limits = Limits(resume_s=1.0, silence_s=3.0, stalled_s=2.0, input_rows_max=4, edits_per_s=50.0)
         with pytest.MonkeyPatch.context() as patch:
@@ -272,12 +277,14 @@ class Crowd:
             self.on_fast_path += sum(session.row >= 0 for session in self.game.sessions)
             self.served += len(self.game.sessions)
             self.game.tick(deadline, late)
+            if number == ticks // 2 and self.seed % 2:
+                self.game.world.record(self.recording)
 
     def record(self) -> list[Any]:
         """Returns all that can be seen of the game from outside."""
         seen = self.rules.seen if isinstance(self.rules, Busy) else []
         sent = [(peer.sent, peer.closings) for peer in self.peers]
-        return [sent, seen, self.game.stats(), self.game.world.state_hash()]
+        return [sent, seen, self.game.stats(), self.game.world.state_hash(), self.recording.getvalue()]
 
 
 def with_fast_path(kernel: kernels.Kernel | None = None) -> Callable[[Game], None]:
