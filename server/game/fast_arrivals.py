@@ -52,9 +52,21 @@ class Arrivals:
         scene, rate = world.scene, world.scene.tick_rate
         self._world, self._rows, self._limits, self._clocks = world, rows, limits, clocks
         self._recall, self._receive, self._kernel = recall, receive, kernel
-        self._bounds, self._rate, self._catch_up = bounds(rate), rate, catch_up_ticks(rate)
-        self._row_bytes = scene.input_row_bytes
-        self._rules, self._clock = Arguments(kernel, "q", 5), Arguments(kernel, "d", 7)
+        ahead, most = min(bounds(rate).ahead, rows.slots), limits.input_rows_max
+        self._rules = Arguments(kernel, "q", values=(0, ahead, scene.input_row_bytes, most, rows.slots))
+        self._clock = Arguments(
+            kernel,
+            "d",
+            values=(
+                0.0,
+                rate,
+                catch_up_ticks(rate),
+                bounds(rate).margin_one,
+                clocks.burst,
+                flow_control.RATE_WINDOW_S,
+                flow_control.RTT_SPAN_S,
+            ),
+        )
         self._arrived: list[tuple[int, int, bytes, float]] = []
         """Row, size in bytes (negative: in a frame), bytes, time of arrival."""
         self._frame_max = FRAME_HEAD_BYTES + min(FRAMED_MAX, limits.message_bytes_max)
@@ -97,16 +109,8 @@ class Arrivals:
         numbers, sizes, data, times = zip(*self._arrived, strict=True)
         self._arrived = []
         rows, lend = self._rows, partial(lent, self._kernel)
-        fates, rules, clock = bytearray(len(data)), self._rules, self._clock
-        rules.values[0], rules.values[1], rules.values[2] = (
-            self._world.tick,
-            min(self._bounds.ahead, rows.slots),
-            self._row_bytes,
-        )
-        rules.values[3], rules.values[4] = self._limits.input_rows_max, rows.slots
-        clock.values[0], clock.values[1], clock.values[2] = self._clocks.deadline, self._rate, self._catch_up
-        clock.values[3], clock.values[4] = self._bounds.margin_one, self._clocks.burst
-        clock.values[5], clock.values[6] = flow_control.RATE_WINDOW_S, flow_control.RTT_SPAN_S
+        fates = bytearray(len(data))
+        self._rules.values[0], self._clock.values[0] = self._world.tick, self._clocks.deadline
         text, lengths = bytearray().join(data), lend(array("q", sizes), "q")
         self._kernel.unmask(lend(text, "B"), lengths)
         self._kernel.take_messages(
@@ -118,8 +122,8 @@ class Arrivals:
             lengths,
             lend(array("d", times), "d"),
             lend(fates, "B"),
-            rules.lent,
-            clock.lent,
+            self._rules.lent,
+            self._clock.lent,
         )
         if any(fates):
             self._handle(fates, numbers, sizes, text, times)

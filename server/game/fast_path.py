@@ -84,8 +84,7 @@ class FastPath:
         self._rows = Rows(scene, kernel)
         self.arrivals = Arrivals(world, self._rows, limits, clocks, self.recall, receive, kernel)
         """Messages that wait for the next tick."""
-        self._bounds, self._tick_s = bounds(rate), 1 / rate
-        self._decay = min(self._tick_s / flow_control.HELD_S, 1.0)
+        self._repeats = bounds(rate).repeats
         self._numbers: dict[Cell, int] = {}
         """Number of each segment that a session here sees."""
         self._seen: list[tuple[Cell, int]] = []
@@ -96,7 +95,12 @@ class FastPath:
         self._changed: list[int] = []
         """Numbers of the segments that have a length."""
         self._out = Arguments(kernel, "B", OUT_BYTES)
-        self._rules, self._clock = Arguments(kernel, "q", 5), Arguments(kernel, "d", 7)
+        decay, flow = min(1 / rate / flow_control.HELD_S, 1.0), flow_control
+        self._rules = Arguments(kernel, "q", 5)
+        self._writing = Arguments(kernel, "d", values=(0.0, clocks.burst, limits.messages_per_tick, decay))
+        self._asking = Arguments(kernel, "d", values=(0.0, limits.silence_s, flow.NARROW, flow.RTT_WINDOW_S))
+        spans = flow.SAMPLE_S, flow.RATE_SPAN_S, flow.RATE_WINDOW_S
+        self._measuring = Arguments(kernel, "d", values=(0.0, *spans, flow.STALL_RTTS, flow.HOLD_S_MAX, 1 / rate))
         self._shared = 0
         """Version of the shared values that all sessions here have been sent."""
         self._n = 0
@@ -123,7 +127,7 @@ class FastPath:
             rows.taken_lent,
             rows.changed_lent,
             tick,
-            self._bounds.repeats,
+            self._repeats,
             rows.slots,
         )
         return rows.taken_by(range(len(rows.sessions)) if everyone else rows.changed[:n].tolist())
@@ -131,7 +135,7 @@ class FastPath:
     def coming(self, row: int, tick: int) -> Input:
         """Returns the input of a row that would be taken for a tick now, like `InputQueue.coming`."""
         self.arrivals.flush()
-        return self._rows.coming(row, tick, self._bounds.repeats)
+        return self._rows.coming(row, tick, self._repeats)
 
     def send(self, shared: int, now: float) -> None:
         """Sends the newest snapshot to each session here. Recalls those for which it cannot be done here.
@@ -154,38 +158,40 @@ class FastPath:
 
     def _measure(self, now: float) -> None:
         """Measures the connections whose time has come, or looks at them, as `FlowControl.window` does."""
-        rows, clock = self._rows, self._clock.values
-        clock[0], clock[1] = now, self._limits.silence_s
-        clock[2], clock[3] = flow_control.NARROW, flow_control.RTT_WINDOW_S
-        n = self._kernel.due_rows(rows.numbers_lent, rows.floats_lent, rows.due_lent, self._clock.lent)
+        rows = self._rows
+        self._asking.values[0] = self._measuring.values[0] = now
+        n = self._kernel.due_rows(rows.numbers_lent, rows.floats_lent, rows.due_lent, self._asking.lent)
         if not n:
             return
-        sessions, told = rows.sessions, rows.told
         for i, row in enumerate(rows.due[:n].tolist()):
-            at = row if row >= 0 else -1 - row
-            session = sessions[at]
+            session = rows.sessions[row if row >= 0 else -1 - row]
             assert session is not None
-            outstanding = session.link.outstanding()
-            if outstanding is None:
-                session.flow.blind, rows.numbers[at * WIDTH + STATE] = True, ODD
-            told[i] = outstanding or 0
-        clock[1], clock[2], clock[3] = flow_control.SAMPLE_S, flow_control.RATE_SPAN_S, flow_control.RATE_WINDOW_S
-        clock[4], clock[5], clock[6] = flow_control.STALL_RTTS, flow_control.HOLD_S_MAX, self._tick_s
+            rows.told[i] = self._outstanding(session)
         self._kernel.measure_rows(
-            rows.numbers_lent, rows.floats_lent, rows.due_lent, rows.told_lent, n, self._clock.lent
+            rows.numbers_lent, rows.floats_lent, rows.due_lent, rows.told_lent, n, self._measuring.lent
         )
+
+    def _outstanding(self, session: Session) -> int:
+        """Returns the bytes on the way to a session. If they are not known, it is left to the specification."""
+        try:
+            told = session.link.outstanding()
+        except Exception:
+            self._connections.fail(session, "serving a client")
+            return 0
+        if told is None:
+            session.flow.blind, self._rows.numbers[session.row * WIDTH + STATE] = True, ODD
+        return told or 0
 
     def _write(self, now: float) -> list[Session]:
         """Writes the snapshots, and sends them. Returns the sessions for which it was not done."""
-        rows, n, rules, clock = self._rows, len(self._rows.sessions), self._rules, self._clock
+        rows, n, rules = self._rows, len(self._rows.sessions), self._rules
         parts = self._parts()
         if len(self._out.values) < HEADER_BYTES + len(parts):
             self._out = Arguments(self._kernel, "B", 2 * (HEADER_BYTES + len(parts)))
         at, left = 0, list[Session]()
         while at < n:
             rules.values[0], rules.values[1], rules.values[2] = at, self._world.tick, SNAPSHOT_BYTES
-            clock.values[0], clock.values[1] = now, self._clocks.burst
-            clock.values[2], clock.values[3] = self._limits.messages_per_tick, self._decay
+            self._writing.values[0] = now
             end = self._kernel.write_snapshots(
                 rows.numbers_lent,
                 rows.floats_lent,
@@ -196,7 +202,7 @@ class FastPath:
                 self._out.lent,
                 rows.spans_lent,
                 rules.lent,
-                clock.lent,
+                self._writing.lent,
             )
             left += self._pass_on(at, rows.spans[2 * at : 2 * end].tolist())
             self._counters.snapshots_sent += rules.values[3]

@@ -85,21 +85,20 @@ def lent(kernel: Kernel, values: Any, kind: str) -> Any:
 
 
 class Arguments:
-    """A flat array for a kernel, filled with zeros.
+    """A flat array for a kernel.
 
     Args:
         kernel: the kernel.
         kind: kind of its elements, as in `array`: "q", "d" or "B".
-        length: number of its elements.
-        old: values for its beginning; None: none.
+        length: number of its elements, at least.
+        values: values for its beginning; the others are 0.
     """
 
-    def __init__(self, kernel: Kernel, kind: str, length: int, old: memoryview | None = None) -> None:
-        made = array(kind, bytes(length * array(kind).itemsize))
+    def __init__(self, kernel: Kernel, kind: str, length: int = 0, values: Iterable[Any] = ()) -> None:
+        made = array(kind, values)
+        made.frombytes(bytes(max(length - len(made), 0) * made.itemsize))
         self.values: Any = memoryview(made)  # of whole numbers or floats
         self.lent = lent(kernel, made, kind)
-        if old is not None:
-            self.values[: len(old)] = old
 
 
 class Rows:
@@ -137,7 +136,7 @@ class Rows:
             ("told", 1, "q"),
             ("changed", 1, "q"),
         ):
-            grown = Arguments(self._kernel, kind, n * width, getattr(self, name) if old else None)
+            grown = Arguments(self._kernel, kind, n * width, getattr(self, name) if old else ())
             setattr(self, name, grown.values)
             setattr(self, f"{name}_lent", grown.lent)
 

@@ -238,7 +238,7 @@ class ChangeLog:
             assert since == KEYFRAME or newest - since <= self.history, "lost track"
             first = (newest if since == KEYFRAME else since) + 1  # a keyframe needs no changes
             ticks = [tick for at in range(first, newest + 1) if (tick := self._ticks.get(at)) is not None]
-            more = set().union(*(tick.more() for tick in ticks))
+            more = ticks[0].more() if len(ticks) == 1 else set().union(*(tick.more() for tick in ticks))
             changed = more.union(self._due, *(tick.changed for tick in ticks))
             parts = self._parts[since] = DeltaCache(self, since, ticks, changed, more)
         return parts

@@ -79,10 +79,10 @@ class Rewind:
         more = (len(w.entities) >> layout.WIDTH_SHIFT) - len(self._now)
         if more > 0:
             self._now = np.concatenate((self._now, np.zeros((more, len(KEPT)), np.int64)))
+            self._now_lent = world.kernel.lent(self._now)
         n = int(w.lengths[layout.N_CHANGED])
         rows = np.empty((n, 1 + len(KEPT)), np.int64)
-        now, before = world.kernel.lent(self._now), world.kernel.lent(rows)
-        self._alive += world.kernel.recall(w.entities, w.changed, now, before, n)
+        self._alive += world.kernel.recall(w.entities, w.changed, self._now_lent, world.kernel.lent(rows), n)
         if self._alive != len(world):  # some have been removed
             matrix = world.matrix
             gone = np.flatnonzero(self._now[: len(matrix), 0] != matrix[:, ID])
@@ -136,6 +136,7 @@ class Rewind:
         self._undo.clear()
         self._tick = self._world.tick
         self._now = np.ascontiguousarray(self._world.matrix[:, KEPT])
+        self._now_lent = self._world.kernel.lent(self._now)
         self._alive = len(self._world)
 
 
