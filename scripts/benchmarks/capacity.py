@@ -20,9 +20,9 @@ def run(args: argparse.Namespace, console: Console) -> tuple[dict[str, Any], int
     if args.crowd:
         return run_crowd(args, console, seconds)
 
-    without_picows = lacking("picows")
-    if without_picows:
-        console.print(f"no rows for picows: {without_picows}", highlight=False, soft_wrap=True)
+    if args.picows and (reason := lacking("picows")):
+        console.print(f"--picows: {reason}", highlight=False, soft_wrap=True)
+        return {}, 2
 
     def report(stage: dict[str, Any]) -> None:
         console.print(
@@ -50,7 +50,7 @@ def run(args: argparse.Namespace, console: Console) -> tuple[dict[str, Any], int
         with server.rig("echo", str(size), seed=number + 1) as running:
             first = most if args.quick else 1000  # more than the game holds
             echoed = server.search(running, first, seconds, resolution, 1 if args.quick else steps, report)
-        if not without_picows:
+        if args.picows:
             console.print("  the same on picows, without a game: the bound of another library")
             with server.rig(server.ECHO_PICOWS, str(size), seed=number + 1) as running:
                 first = most // 4 if args.quick else 1000
@@ -64,6 +64,7 @@ def run(args: argparse.Namespace, console: Console) -> tuple[dict[str, Any], int
                 "cpu_us_per_client_tick": cpu_us,
                 "clients_by_cpu": by_cpu,
                 **bound(echoed),
+                "times_the_echo": cpu_us / bound(echoed)["echo_cpu_us_per_client_tick"],
                 "parts": {name: share * cpu_us for name, share in shares.items()},
                 "entities_in_view": by["entities_in_view"],
                 "bytes_per_client_per_s": by["bytes_down_per_client_per_s"],
@@ -123,6 +124,7 @@ def capacity_table(runs: list[dict[str, Any]], bounds: list[dict[str, Any]]) -> 
         ("echo_bound_clients", "{:,}"),
         ("cpu_us_per_client_tick", "{:.1f}"),
         ("echo_cpu_us_per_client_tick", "{:.1f}"),
+        ("times_the_echo", "{:.2f}"),
         ("clients_by_cpu", "{:,}"),
         ("echo_clients_by_cpu", "{:,}"),
         ("entities_in_view", "{:.0f}"),
