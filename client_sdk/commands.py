@@ -15,6 +15,7 @@ class SentCommands:
     def __init__(self) -> None:
         self._number = 0
         self._unanswered: dict[int, bytes] = {}
+        self._ticks: dict[int, int] = {}
         self._reasons: dict[int, str] = {}
         """Reasons of refusals whose verdicts have not arrived yet."""
 
@@ -22,6 +23,17 @@ class SentCommands:
         """Allocates the next command number."""
         self._number += 1
         return self._number
+
+    def tick(self, due: int) -> int:
+        """Returns the tick of a new command: `due`, or that of the newest command without a result if it is later.
+
+        The server carries out the commands of a player in their order. If the client's time has gone back meanwhile,
+        a command for an earlier tick would wait there for those before it.
+
+        Args:
+            due: the next tick that has no input yet.
+        """
+        return max(due, next(reversed(self._ticks.values()), due))
 
     def command(self, tick: int, seen: float, name: str, data: Any) -> Command:
         """Returns a new command to the rules of the game.
@@ -45,6 +57,7 @@ class SentCommands:
 
     def file(self, command: Command) -> bytes:
         """Keeps a command until it is answered. Returns the message to send."""
+        self._ticks[command.number] = command.tick
         return self._unanswered.setdefault(command.number, encode(command))
 
     def answer(self, verdicts: bytes) -> list[Answered]:
@@ -55,6 +68,7 @@ class SentCommands:
         answers = []
         for number, verdict in VERDICT.iter_unpack(verdicts) if verdicts else ():
             if self._unanswered.pop(number, None) is not None:
+                del self._ticks[number]
                 text = messages.VERDICT_TEXTS[min(verdict, len(messages.VERDICT_TEXTS) - 1)]
                 text = self._reasons.pop(number, "") or text
                 answers.append(Answered(number, verdict == messages.DONE, text))
@@ -73,5 +87,6 @@ class SentCommands:
         """Forgets all commands, because the player is a new one to the server. Returns a failed result for each."""
         numbers = list(self._unanswered)
         self._unanswered.clear()
+        self._ticks.clear()
         self._reasons.clear()
         return [Answered(number, False, why) for number in numbers]

@@ -98,7 +98,8 @@ class ProgramSide:
                 data.
         """
         play = self._joined("command")
-        return self._order(self._commands.command(play.world.prediction.next_order, play.seen, name, data))
+        tick = self._commands.tick(play.world.prediction.next_order)
+        return self._order(self._commands.command(tick, play.seen, name, data))
 
     def edit(self, x: SupportsIndex, y: SupportsIndex, z: SupportsIndex, kind: SupportsIndex) -> int:
         """Places (kind 1 to 255) or removes (0) a block with the next tick. Returns the number of the edit.
@@ -111,7 +112,8 @@ class ProgramSide:
         play, edit = self._joined("edit"), edits.checked(x, y, z, kind)
         payload = edits.pack(edit)  # before the prediction: an edit that cannot be sent must not be predicted
         number = self._commands.number()
-        tick = play.world.prediction.edit(number, edit)
+        tick = self._commands.tick(play.world.prediction.next_order)
+        play.world.prediction.edit(number, tick, edit)
         return self._order(messages.Command(number, tick, play.seen, edits.NAME, payload))
 
     @property

@@ -183,10 +183,9 @@ class Prediction:
         """The next tick that has no input yet, at which a command or edit of now is carried out."""
         return self.predicted.tick + self.ahead + 1
 
-    def edit(self, number: int, edit: Edit) -> int:
-        """Files an edit for the next tick that has no input yet. Returns that tick."""
-        self._edits[number] = (self.next_order, edit)
-        return self.next_order
+    def edit(self, number: int, tick: int, edit: Edit) -> None:
+        """Files an edit for a tick that has no input yet."""
+        self._edits[number] = (tick, edit)
 
     def settle(self, number: int, done: bool) -> None:
         """Takes the server's verdict on an edit; one that was not `done` is undone by the next replay."""

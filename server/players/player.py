@@ -117,6 +117,7 @@ class Player:
         """
         self.verdicts.append((number, verdict))
         self.settled[number] = verdict
+        self.command = max(self.command, number)  # also of a player who was restored from notes, or of a replica
         if reason:
             self.reasons[number] = reason
         if len(self.settled) > SETTLED_MAX:

@@ -11,7 +11,7 @@ from server.players.player import Player
 from server.scale.wire import LEAVE, LOST
 from shared import messages
 from shared.bounds import Bounds
-from shared.inputs import Input
+from shared.inputs import NEUTRAL, Input
 from shared.messages import IDLE, NEUTRALISED, REPEATED, USED, Command
 
 
@@ -29,7 +29,8 @@ class EdgeInputs(InputQueue):
         self.held, self._idle = held, REPEATED if resumed else IDLE
         if resumed:
             self.statuses.append(REPEATED)  # for the tick of the seat
-        self._taken: dict[int, int] = {}
+        self._taken: dict[int, tuple[int, Input]] = {}
+        """Statuses and inputs of the ticks whose records have not come, by tick."""
         self.in_time = 0
         """Number of ticks in a row whose own inputs were in time, up to the newest tick."""
         self.switching = False
@@ -39,25 +40,39 @@ class EdgeInputs(InputQueue):
 
     def take(self, tick: int) -> Input:
         input_ = super().take(tick)
-        status = self._taken[tick] = self.statuses.pop()
+        status = self.statuses.pop()
+        self._taken[tick] = status, input_
         self.in_time = self.in_time + 1 if status == USED else 0
         return input_
+
+    def restart(self, at: int) -> None:
+        """Removes the inputs for tick `at` and later.
+
+        Those in batches whose records have not come yet are used all the same. To the client, their ticks are ticks
+        without its own input.
+        """
+        for tick in [tick for tick, (status, _) in self._taken.items() if tick >= at and status == USED]:
+            self._taken[tick] = REPEATED, self._taken[tick][1]
+            self.used -= 1
+            self.substituted += 1
+        super().restart(at)
 
     def skip(self, tick: int) -> None:
         """Drops the status of a tick for which another edge had the input."""
         self._taken.pop(tick, None)
 
-    def confirm(self, tick: int, missing: int) -> None:
+    def confirm(self, tick: int, missing: int, given: Input | None = None) -> None:
         """Files the status of a tick whose record has come.
 
         Args:
             tick: the tick.
             missing: ticks from the newest batch in the record to the tick; 0: the input was used.
+            given: the input that the sequencer used, if it may be another one; None: it is not.
         """
-        status = self._taken.pop(tick, IDLE)
+        status, input_ = self._taken.pop(tick, (IDLE, NEUTRAL))
         if status == IDLE:
             status = self._idle
-        if missing and status != IDLE:
+        if (missing or (given is not None and given != input_)) and status != IDLE:
             self.used -= status == USED
             self.substituted += status == USED
             status = REPEATED if self._bounds.stands_in(missing) else NEUTRALISED

@@ -4,7 +4,9 @@ Theory of operation. `collect` is called at the edge's own deadline of a tick, a
 takes one input per player, and makes the batch for the sequencer. `follow` is called with each record of the log: it
 advances the replica, and sends the clients what is due. What became of the inputs of a tick is decided by its record:
 if the edge's batch was not in it, they count as late. Batches that are in no record yet are sent again when an epoch
-begins. Clients steer by the edge's time: `collect` is the deadline that their arrival margins refer to.
+begins. A batch has the inputs that changed. A sequencer that begins knows the others from the world, where they may be
+neutral ones; so the edge states all inputs then, and compares until a record has that batch. Clients steer by the
+edge's time: `collect` is the deadline that their arrival margins refer to.
 """
 
 import secrets
@@ -25,7 +27,7 @@ from server.game.roster import Roster, digest_of
 from server.game.session import Session
 from server.game_api.input_api import held_input
 from server.game_api.shared_values import SharedValues
-from server.journal.records import input_record
+from server.journal.records import input_record, recorded_inputs
 from server.observability.counters import Counters
 from server.observability.errors import FaultReporter
 from server.players.persisted_state import PersistedState
@@ -36,6 +38,7 @@ from server.scale.replica import Replica
 from server.scale.wire import COMMAND, GONE, HERE, JOIN, KNOWS, SWITCH, Batch, Record, rows
 from shared import fields, messages
 from shared.bounds import bounds, in_ticks
+from shared.inputs import Input
 from shared.messages import Hello, Welcome, encode
 
 RESEND_TICKS, RESENT_MAX = 8, 64
@@ -104,6 +107,8 @@ class EdgeServer(Front):
         self.commands.newest = world.tick
         self._unrecorded: deque[Batch] = deque()
         self._resent = 0
+        self._stated = -1
+        """Number of the batch that states all inputs; the sequencer may use others before."""
         self._in_time = in_ticks(IN_TIME_S, self.scene.tick_rate, 8)
         self._next, self._before = 0, -1
         self._tokens: dict[int, bytes] = {}
@@ -221,11 +226,15 @@ class EdgeServer(Front):
         """
         replica = self.replica
         known = set(self.players) if record.seated else set()
+        given = self._given(record)
         if not replica.take(record):
             return False
         if record.journal is None:
+            self._state_all()
             return True
         newest = replica.batches.get(self.name, -1)
+        if not self._bounds.stands_in(record.tick - newest):
+            self._state_all()
         while self._unrecorded and self._unrecorded[0].number <= newest:
             self._unrecorded.popleft()
         seated = rows(record.seated, 4)
@@ -237,7 +246,7 @@ class EdgeServer(Front):
                 if session.beside:
                     inputs.skip(record.tick)
                 else:
-                    inputs.confirm(record.tick, record.tick - newest)
+                    inputs.confirm(record.tick, record.tick - newest, given.get(session.player.entity))
         self.commands.newest = max(self.commands.newest, self.world.tick)
         self._seat(record, known, now)
         self._half.follow(replica.outcome)
@@ -255,6 +264,23 @@ class EdgeServer(Front):
         self.moves.check(now, 1 / self.scene.tick_rate)
         self.clocks.check(now)
         return self._is_lost(record.tick)
+
+    def _state_all(self) -> None:
+        """Lets the next batch state the inputs of all clients."""
+        self._stated = self.newest + 1
+        for session in self._roster.clients:
+            if isinstance(session.inputs, EdgeInputs):
+                session.inputs.sent = None
+
+    def _given(self, record: Record) -> dict[int, Input]:
+        """Returns the inputs that a record gives to the players of this edge, before it is taken.
+
+        It returns none if they are those of the batches for sure.
+        """
+        if record.journal is None or self._stated <= self.replica.batches.get(self.name, -1):
+            return {}
+        held = {entity: held_input(self.world, entity) for entity in self._mine if entity in self.world}
+        return held | recorded_inputs(record.journal[0] or [], aim=self.scene.aim)
 
     def _is_lost(self, tick: int) -> bool:
         """Returns whether a batch seems to be lost, and is to be sent again."""

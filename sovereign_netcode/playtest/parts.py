@@ -1,25 +1,29 @@
-"""The parts of a world on many processes in simulated time: the bus with its log, sequencer, edges and standbys."""
+"""The parts of a world on many processes in simulated time: bus, sequencer, edges and standbys."""
 
 import random
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from functools import partial
+from types import MappingProxyType
 from typing import TYPE_CHECKING
 
+from server.cluster.bus import RefusedError
+from server.cluster.following import WAIT_S
+from server.cluster.sequencer import RETRY_S, SILENCE_S
 from server.config.limits import Limits
 from server.scale.clock import EdgeClock
 from server.scale.edge import EdgeServer
-from server.scale.replica import GapError, Replica
-from server.scale.sequencer import WorldSequencer
+from server.scale.replica import Replica
+from server.scale.sequencer import WorldSequencer, begin_record
 from server.scale.wire import Batch, Record, packed, record_of
+from server.scale.writer import DeposedError, Entry, LogWriter, id_of
+from sovereign_netcode.playtest.log import Answer
 
 if TYPE_CHECKING:
     from sovereign_netcode.playtest.scaled import ScaledMatch
 
-SILENCE_S = 0.25
-"""Seconds without a record after which a standby takes over."""
-
 
 class Bus:
-    """A simulated bus with one log.
+    """A simulated bus.
 
     Args:
         match: has the simulated time.
@@ -28,7 +32,8 @@ class Bus:
         jitter_s: largest additional time, in seconds.
         stop: about every `stop[0]` seconds, the messages of one pair of parts wait for up to `stop[1]` seconds.
         twice: share of the messages that come twice.
-        lost: share of the batches that do not come at all.
+        lost: share of the batches, and of the records on their way to a part, that do not come at all.
+        far: additional time of all messages from and to a part, in seconds, by its name.
     """
 
     def __init__(
@@ -41,24 +46,32 @@ class Bus:
         stop: tuple[float, float] | None = None,
         twice: float = 0.0,
         lost: float = 0.0,
+        far: Mapping[str, float] = MappingProxyType({}),
     ) -> None:
         self._match, self._rng = match, random.Random(seed)
         self._delay_s, self._jitter_s, self._stop, self._twice = delay_s, jitter_s, stop, twice
-        self._lost = lost
+        self._lost, self._far = lost, far
         self._free: dict[tuple[str, str], float] = {}
         self._cut: set[str] = set()
-        self.log: list[bytes] = []
-        """All records that the log has accepted."""
-        self.refused = 0
-        """Records that the log has refused, because their writer is deposed."""
-        self._last = (0, -1)
 
-    def send(self, source: str, target: str, deliver: Callable[[], None]) -> None:
-        """Delivers a message from one part to another, after the messages before it."""
+    def send(self, source: str, target: str, deliver: Callable[[], None], *, sure: bool = True) -> None:
+        """Delivers a message from one part to another, after the messages before it.
+
+        Args:
+            source, target: the parts; "log": the log; "sequencer": all sequencers.
+            deliver: function that is called when it arrives.
+            sure: whether it cannot be lost.
+        """
         rng, now = self._rng, self._match.now
-        if self._lost and target == "sequencer" and rng.random() < self._lost:
+        if self._lost and not sure and rng.random() < self._lost:
             return
-        due = now + self._delay_s + rng.random() * self._jitter_s
+        due = (
+            now
+            + self._delay_s
+            + self._far.get(source, 0.0)
+            + self._far.get(target, 0.0)
+            + rng.random() * self._jitter_s
+        )
         if self._stop is not None and rng.random() < 1 / (self._stop[0] * self._match.rate):
             due += rng.random() * self._stop[1]
         for _ in range(2 if rng.random() < self._twice else 1):
@@ -74,17 +87,6 @@ class Bus:
         """Makes all messages from one part to another wait for some time from now on."""
         self._free[source, target] = self._match.now + seconds
 
-    def append(self, data: bytes, last: tuple[int, int]) -> bool:
-        """Appends a record if `last`, its writer's newest record, is the newest of the log. Returns whether it was."""
-        if last != self._last:
-            self.refused += 1
-            return False
-        record = record_of(data)
-        self._last = (record.epoch, record.tick)
-        self.log.append(data)
-        self._match.publish(data)
-        return True
-
 
 class Part:
     """A process of the match: it can be killed."""
@@ -95,15 +97,17 @@ class Part:
 
 
 class SequencerPart(Part):
-    """The sequencer in one process."""
+    """The sequencer in one process, which runs the world since its record `begin` was stored."""
 
-    def __init__(
-        self, match: "ScaledMatch", name: str, core: WorldSequencer, begin: bytes, last: tuple[int, int]
-    ) -> None:
+    def __init__(self, match: "ScaledMatch", name: str, core: WorldSequencer, begin: Entry) -> None:
         super().__init__(name)
-        self._match, self.core, self._last = match, core, last
+        self._match, self.core = match, core
         self._began, self._ticks = match.now, 0
-        self._append(begin, None)
+        self._writer = LogWriter(name, begin.id)
+        self.still = 0
+        """Ticks at which time stood still, because too many records had no acknowledgement."""
+        self.hashes: dict[str, bytes] = {}
+        """Hashes of the world by records that are not stored yet."""
         self._schedule()
 
     def _schedule(self) -> None:
@@ -113,22 +117,37 @@ class SequencerPart(Part):
     def _tick(self) -> None:
         if not self.alive:
             return
-        data, world = self.core.tick(self._match.now), self.core.world
-        hashed = world.state_hash() if world.tick % self._match.hash_every == 0 else None
-        self._match.bus.send(self.name, "log", lambda: self._append(data, hashed))
         self._schedule()
+        if self._writer.full:
+            self.still += 1
+            return
+        data, world = self.core.tick(self._match.now), self.core.world
+        entry = self._writer.add(self.core.epoch, world.tick, data)
+        if world.tick % self._match.hash_every == 0:
+            self.hashes[entry.id] = world.state_hash()
+        self._send([entry])
 
-    def _append(self, data: bytes, hashed: bytes | None) -> None:
-        """Is called when a record arrives at the log, also after its writer was killed."""
-        record = record_of(data)
-        if (record.epoch, record.tick) <= self._last:
-            return  # it came twice
-        if self._match.bus.append(data, self._last):
-            self._last = (record.epoch, record.tick)
-            if hashed is not None:
-                self._match.seen(self.name, record.tick, hashed)
+    def _send(self, entries: list[Entry]) -> None:
+        for entry in entries:
+            self._match.log.append(self.name, entry, partial(self._answered, entry))
+
+    def _answered(self, entry: Entry, answer: Answer) -> None:
+        """Takes what became of a record."""
+        if not self.alive:
+            return
+        if isinstance(answer, str):
+            self._writer.accepted(entry)
+        elif isinstance(answer, RefusedError):
+            try:
+                self._send(self._writer.refused(entry, answer.last))
+            except DeposedError:
+                self.alive = False
         else:
-            self.alive = False  # another one has taken over
+            self._match.at(self._match.now + RETRY_S, lambda: self._again(entry))
+
+    def _again(self, entry: Entry) -> None:
+        if self.alive:
+            self._send(self._writer.unanswered(entry))
 
 
 class Reader(Part):
@@ -138,18 +157,23 @@ class Reader(Part):
         super().__init__(name)
         self.match, self.replica = match, replica
         self.heard_at = match.now
-        self.hashes: dict[int, bytes] = {}
+        self.seq = match.log.place(replica)
+        """Number of records that the replica has."""
 
-    def receive(self, data: bytes) -> None:
-        """Takes a record, and fetches the ones before it from the log if they are missing."""
-        if not self.alive:
+    def receive(self, seq: int, data: bytes) -> None:
+        """Takes a record by its number, and fetches the ones before it from the log if they are missing."""
+        if not self.alive or seq <= self.seq:
             return
-        self.heard_at = self.match.now
-        try:
-            self.follow(record_of(data))
-        except GapError:
-            for each in self.match.bus.log:
-                self.follow(record_of(each))
+        for number in range(self.seq, seq):
+            self.heard_at = self.match.now
+            self.seq = number + 1
+            self.follow(record_of(self.match.log.records[number]))
+
+    def look(self) -> None:
+        """Fetches what is missing up to the end of the log, because it may have been lost on its way."""
+        records = self.match.log.records
+        if records:
+            self.receive(len(records), records[-1])
 
     def follow(self, record: Record) -> None:
         """Takes a record."""
@@ -169,19 +193,49 @@ class StandbyPart(Reader):
 
     def __init__(self, match: "ScaledMatch", name: str, replica: Replica, rank: int) -> None:
         super().__init__(match, name, replica)
-        self._silence_s = SILENCE_S * (1 + rank)
+        self._silence_s = SILENCE_S * (1 + rank / 8)
+        self._asks = False
         self._watch()
+
+    def receive(self, seq: int, data: bytes) -> None:
+        if not self._asks:  # it reads on after the answer
+            super().receive(seq, data)
 
     def _watch(self) -> None:
         if not self.alive:
             return
-        if self.match.now - self.heard_at > self._silence_s:
-            for each in self.match.bus.log:  # the log's end may be newer than what was delivered
-                self.follow(record_of(each))
-            self.alive = False
-            self.match.take_over(self)
-            return
+        if not self._asks and self.match.now - self.heard_at > self._silence_s:
+            self._asks = True
+            self.match.log.end(self.name, self._ended)
         self.match.at(self.match.now + 1 / self.match.rate, self._watch)
+
+    def _ended(self, answer: Answer) -> None:
+        """Takes the end of the log. Begins the next epoch if the replica has all records."""
+        log, replica = self.match.log, self.replica
+        if not self.alive:
+            return
+        if answer != log.newest or self.seq < len(log.records):
+            self._read_on(answer)
+            return
+        epoch, data = begin_record(replica)
+        entry = Entry(id_of(epoch, replica.world.tick, self.name), log.newest, data)
+        log.append(self.name, entry, partial(self._begun, entry))
+
+    def _begun(self, entry: Entry, answer: Answer) -> None:
+        if not self.alive:
+            return
+        if answer == entry.id:
+            self.alive = False
+            self.match.take_over(self, entry)
+        else:
+            self._read_on(answer)
+
+    def _read_on(self, answer: Answer) -> None:
+        """Goes on following. After an error of the log, its silence says nothing about the sequencer."""
+        self._asks = False
+        if not isinstance(answer, str | RefusedError):
+            self.heard_at = self.match.now
+        self.look()
 
 
 class EdgePart(Reader):
@@ -193,6 +247,14 @@ class EdgePart(Reader):
         """Address of the edge for clients."""
         self.core = EdgeServer(name, replica, limits, address=self.address)
         self.clock = EdgeClock(match.rate)
+        self._watch()
+
+    def _watch(self) -> None:
+        """Looks at the end of the log after a silence."""
+        if self.alive:
+            if self.match.now - self.heard_at > WAIT_S:
+                self.look()
+            self.match.at(self.match.now + WAIT_S, self._watch)
 
     def take(self, record: Record) -> None:
         again = self.core.follow(record, self.match.now)
@@ -227,4 +289,4 @@ class EdgePart(Reader):
 
     def _send(self, batch: Batch) -> None:
         data = packed(batch)
-        self.match.bus.send(self.name, "sequencer", lambda: self.match.deliver(data))
+        self.match.bus.send(self.name, "sequencer", lambda: self.match.deliver(data), sure=False)

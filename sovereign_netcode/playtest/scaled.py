@@ -4,8 +4,8 @@
     player = match.join(wander)
     match.run(10)
 
-The bus is in order per pair of parts. Messages are late by chance, stop for a while, and come twice. Any part can be
-killed at any time. One seed reproduces a run.
+The bus is in order per pair of parts. Messages are late by chance, stop for a while, and come twice. The log can fail.
+Any part can be killed at any time. One seed reproduces a run.
 """
 
 import random
@@ -25,9 +25,11 @@ from server.rules import Rules, prepared
 from server.scale.edge import EdgeServer
 from server.scale.replica import Replica
 from server.scale.sequencer import WorldSequencer, begin_record
-from server.scale.wire import batch_of
+from server.scale.wire import batch_of, record_of
+from server.scale.writer import EMPTY, Entry, id_of
 from server.worlds.host import Way
 from shared.scene import Scene
+from sovereign_netcode.playtest.log import Log
 from sovereign_netcode.playtest.match import Player, Policy, Simulation
 from sovereign_netcode.playtest.parts import Bus, EdgePart, Part, SequencerPart, StandbyPart
 
@@ -160,6 +162,7 @@ class ScaledMatch(Simulation):
         limits: the limits.
         rules: makes the rules of the game, once per sequencer; None: players only walk and edit.
         bus: properties of the bus, as for `Bus`.
+        fails: how often and how long the log fails, as for `Log`; None: never.
         hash_every: all parts compare hashes of their worlds at every tick that this divides. The marks of the records
             compare what has changed at every tick.
     """
@@ -174,6 +177,7 @@ class ScaledMatch(Simulation):
         limits: Limits | None = None,
         rules: Callable[[], Rules] | None = None,
         bus: Mapping[str, Any] = MappingProxyType({}),
+        fails: tuple[float, float] | None = None,
         hash_every: int = 1,
     ) -> None:
         super().__init__(seed)
@@ -184,6 +188,8 @@ class ScaledMatch(Simulation):
         self.scene = scene if made is None else prepared(made, scene)
         self.rate = self.scene.tick_rate
         self.bus = Bus(self, seed + 17, **bus)
+        self.log = Log(self, seed + 41, fails)
+        self.log.on_stored = self._stored
         self.hashes: dict[int, bytes] = {}
         """Hash of the world at each tick, as the first part that reached it had it."""
         self.differ: list[tuple[int, str]] = []
@@ -194,9 +200,12 @@ class ScaledMatch(Simulation):
         self._number_of_parts = 0
         self.edges = [self._edge(first) for _ in range(edges)]
         self.standbys = [StandbyPart(self, self._name("standby"), first.copy(), i) for i in range(standbys)]
-        _, begin = begin_record(first)
         core = WorldSequencer(world, made, limits, seed=seed)
-        self.sequencer = SequencerPart(self, self._name("sequencer"), core, begin, (0, -1))
+        name, (epoch, data) = self._name("sequencer"), begin_record(first)
+        begin = Entry(id_of(epoch, 0, name), EMPTY, data)
+        self.sequencer = SequencerPart(self, name, core, begin)
+        self._sequencers = [self.sequencer]
+        self.log.store(begin)
 
     def join(self, policy: Policy, path: Link | None = None, core: Core | None = None) -> Seat:
         """Adds a player, as `Match.join`. Its client connects to an edge by chance."""
@@ -257,27 +266,32 @@ class ScaledMatch(Simulation):
 
     # -- called by the parts ----------------------------------------------------------------------------------
 
-    def publish(self, data: bytes) -> None:
-        """Delivers a record of the log to all edges and standbys."""
-        for part in (*self.edges, *self.standbys):
-            if part.alive:
-                self.bus.send("log", part.name, partial(part.receive, data))
-
     def deliver(self, data: bytes) -> None:
-        """Delivers a batch to the present sequencer."""
-        if self.sequencer.alive:
-            self.sequencer.core.receive(batch_of(data))
+        """Delivers a batch to all sequencers."""
+        self._sequencers = [each for each in self._sequencers if each.alive]
+        for sequencer in self._sequencers:
+            sequencer.core.receive(batch_of(data))
 
-    def take_over(self, standby: StandbyPart) -> None:
-        """Makes a standby the sequencer."""
+    def take_over(self, standby: StandbyPart, begin: Entry) -> None:
+        """Makes a standby the sequencer, whose record that begins an epoch was stored."""
         replica = standby.replica
         rules = None if self._rules is None else self._rules()
         if rules is not None:
             prepared(rules, self.scene)
-        _, begin = begin_record(replica)
         core = WorldSequencer(replica.world, rules, self._limits, seed=self.seed, replica=replica)
-        last = (replica.epoch, replica.world.tick)
-        self.sequencer = SequencerPart(self, standby.name, core, begin, last)
+        self.sequencer = SequencerPart(self, standby.name, core, begin)
+        self._sequencers.append(self.sequencer)
+
+    def _stored(self, entry: Entry) -> None:
+        """Delivers a record that the log has stored to all edges and standbys."""
+        seq = len(self.log.records)
+        for part in (*self.edges, *self.standbys):
+            if part.alive:
+                self.bus.send("log", part.name, partial(part.receive, seq, entry.data), sure=False)
+        for sequencer in self._sequencers:
+            hashed = sequencer.hashes.pop(entry.id, None)
+            if hashed is not None:
+                self.seen(sequencer.name, record_of(entry.data).tick, hashed)
 
     def seen(self, name: str, tick: int, hashed: bytes) -> None:
         """Compares the hash of a part's world with those of the others at the same tick."""

@@ -284,7 +284,7 @@ def test_a_copy_that_is_not_the_servers_is_noticed() -> None:
 
 def test_an_edit_is_there_at_once_and_again_after_a_replay() -> None:
     pair = Pair()
-    pair.client.edit(1, Edit(17, 16, 1, 4))
+    pair.client.edit(1, pair.client.next_order, Edit(17, 16, 1, 4))
     pair.ahead(*[EAST] * 12)
     assert pair.client.predicted.position(ME)[0] == 17 - 5 / 8
     pair.client.sync_test()
@@ -294,7 +294,7 @@ def test_an_edit_is_there_at_once_and_again_after_a_replay() -> None:
 
 def test_an_edit_that_was_refused_is_undone_with_all_it_did() -> None:
     pair = Pair()
-    pair.client.edit(1, Edit(17, 16, 1, 4))
+    pair.client.edit(1, pair.client.next_order, Edit(17, 16, 1, 4))
     pair.ahead(*[EAST] * 12)
     pair.act(EAST)
     pair.client.settle(1, done=False)

@@ -2,7 +2,6 @@
 
 import random
 from collections import Counter
-from typing import Any
 
 import msgpack
 import pytest
@@ -22,92 +21,13 @@ from client_sdk.events import (
 from client_sdk.netsim.links import PRESETS, Link
 from server.config.limits import Limits
 from server.journal.recorded_world import RecordedWorld
-from server.players.player import Player
-from server.rules import Rules
 from server.scale import checkpoint, moves
 from server.scale.wire import record_of
 from shared.inputs import Input, make_input
 from shared.scene import load_scene
-from sovereign_netcode.playtest.match import Policy, wander
+from sovereign_netcode.playtest.match import wander
 from sovereign_netcode.playtest.scaled import ScaledMatch, Seat
-
-ROUGH = {"jitter_s": 0.003, "stop": (3.0, 0.08), "twice": 0.02}
-"""A bus whose messages are late, stop for up to 80 ms about every 3 s, and come twice at times."""
-PATH = Link(delay_s=0.03, jitter_s=0.005)
-
-
-class Tally(Rules):
-    """Counts the commands of each player in shared values, and sends an event for each."""
-
-    def on_command(self, player: Player, name: str, data: Any) -> bool:
-        self.game.share(player.name, self.game.shared.get(player.name, 0) + 1)
-        self.game.set(player.entity, "latest", data)
-        self.game.send("did", data, to=player)
-        return True
-
-
-def causes(player: Seat) -> Counter[str]:
-    """Returns how many corrections of each cause a player had."""
-    return Counter(event.cause for event in player.events if isinstance(event, Corrected))
-
-
-def hashes_agree(match: ScaledMatch) -> None:
-    """Checks that all parts had the same world at every tick of the log."""
-    ticks = [record.tick for record in map(record_of, match.bus.log) if record.journal is not None]
-    assert match.differ == []
-    assert ticks == list(range(1, len(ticks) + 1))
-    assert set(match.hashes) == set(ticks)
-
-
-def asks(sent: Counter[str]) -> Policy:
-    """Returns a policy that wanders and sends a command in every fifth tick or so."""
-
-    def policy(core: Core, rng: random.Random) -> Input:
-        if rng.random() < 0.2:
-            sent[core.name] += 1
-            core.command("go", sent[core.name])
-        return wander(core, rng)
-
-    return policy
-
-
-def edits(core: Core, rng: random.Random) -> Input:
-    """Wanders, and places and removes blocks."""
-    if rng.random() < 0.1:
-        assert core.prediction is not None
-        x, y, z = core.prediction.predicted.position(core.entity)
-        core.edit(int(x) + rng.randint(-2, 2), int(y) + rng.randint(-2, 2), int(z) + 1, rng.randint(0, 1))
-    return wander(core, rng)
-
-
-def torment(match: ScaledMatch, seconds: float, seed: int) -> None:
-    """Runs a match and kills an edge or the sequencer every second or two. Replaces each part that was killed.
-
-    Half of them lose what they have sent last: batches that are on their way, and records ahead of the log.
-    """
-    rng, until = random.Random(seed), match.now + seconds
-
-    def kill() -> None:
-        if match.now > until:
-            return
-        living = [edge for edge in match.edges if edge.alive]
-        if rng.random() < 0.4 and len(living) > 1:
-            match.add_edge()
-            match.kill(rng.choice(living), lossy=rng.random() < 0.5)
-        elif match.sequencer.alive:
-            match.add_standby()
-            match.kill(match.sequencer, lossy=rng.random() < 0.5)
-        match.at(match.now + rng.uniform(0.8, 2.5), kill)
-
-    match.at(match.now + rng.random(), kill)
-    match.run(seconds)
-
-
-def calm(match: ScaledMatch, seconds: float = 6.0) -> None:
-    """Lets the players do nothing new until everything was answered."""
-    for player in match.players:
-        player.policy = lambda core, rng: core.input
-    match.run(seconds)
+from tests.scaling import PATH, ROUGH, Tally, asks, calm, causes, edits, hashes_agree, torment
 
 
 def test_a_player_who_is_alone_has_no_corrections() -> None:
@@ -193,7 +113,7 @@ def test_a_player_who_is_alone_is_corrected_for_late_inputs_only_when_parts_are_
 
 
 def test_an_edge_far_behind_the_sequencer_keeps_its_clients() -> None:
-    match = ScaledMatch(load_scene("flat"), 1, edges=1, standbys=0, bus={"delay_s": 0.7})
+    match = ScaledMatch(load_scene("flat"), 1, edges=1, standbys=0, bus={"far": {"edge 1": 0.7}})
     player = match.join(wander, PATH)
     match.run(12)
     assert player.core.state == "playing"
@@ -302,8 +222,8 @@ def test_a_deposed_sequencer_is_refused_and_ends() -> None:
     match.run(3)
     assert match.sequencer is not old
     assert not old.alive
-    assert match.bus.refused > 0
-    assert {record_of(data).epoch for data in match.bus.log} == {1, 2}
+    assert match.log.refused > 0
+    assert {record_of(data).epoch for data in match.log.records} == {1, 2}
     assert player.core.state == "playing"
     hashes_agree(match)
 
