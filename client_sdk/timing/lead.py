@@ -25,12 +25,10 @@ are lost as well. Cover rises at once and falls slowly.
 """
 
 import math
-from array import array
-from bisect import bisect_left, insort
-from collections import deque
 from typing import Protocol
 
 from client_sdk.timing.server_clock import ServerClock
+from shared.priced import FIRST_S, MEMORY_S, PRICE_S, Excesses
 
 FASTER, HURRY = 0.10, 0.50
 """Greatest deviation of the timeline from real time, as a share of it: `FASTER` in both directions, and `HURRY` forward
@@ -44,8 +42,6 @@ SLOWER_S = 2.0
 LATELY_S, LATELY_MIN = 0.09375, 3
 """The least need of the inputs of the last `LATELY_S` seconds, at least `LATELY_MIN` inputs, is the need of the path
 now. A stall does not raise it, because the last inputs of a stall arrive in its burst, and early."""
-PRICE_S = 6.25
-"""Price of all inputs being late, in seconds of lead: half a percent of late inputs costs 31 ms, a tick at 32 Hz."""
 SAFETY_S = 0.03 / 32
 """Reserve on top of base and cover, in seconds."""
 SURPRISE_S = 0.15 / 32
@@ -58,10 +54,6 @@ CALM_S = 5.0
 SHIFT_S = 0.5 / 32
 """Smallest change of the path, in seconds: if the least need within the length of a stall is higher than the base by
 more than this, it is the new base."""
-MEMORY_S = 120.0
-"""Time for which excesses are kept, in seconds."""
-FIRST_S = 20.0
-"""Shortest time that shares of late inputs refer to, in seconds. With fewer inputs than that, the reserve is larger."""
 FINE_RATE = 32.0
 """Tick rate, in ticks per second, below which `SAFETY_S`, `SURPRISE_S` and `SHIFT_S` no longer shrink in ticks: they
 stay the share of a tick that they are at this rate."""
@@ -126,6 +118,7 @@ class PricedLead:
         self._safety_s = safety_s
         self._stall_s = stall_s
         self._rtt_s = 0.0
+        self._excesses = Excesses(0.0, 0.0, 0.0)
         self._in_ticks(1.0)
         self._stall = 1  # number of inputs in the longest stall
         self._calm = 1  # number of inputs whose least need is the base
@@ -133,8 +126,6 @@ class PricedLead:
         self._least: list[float] = []  # for each need: the least of it and those of the stall before it
         self._calmest = math.inf  # the least of the newest `_calm` needs
         self._fresh = 0  # number of further inputs for which `_calmest` stays one of the newest `_calm` needs
-        self._excess: deque[float] = deque()  # excesses, oldest first
-        self._ordered = array("d")  # excesses, ascending
         self._base = 0.0
         self._level = 0.0
         self._review = 0
@@ -143,7 +134,9 @@ class PricedLead:
     def _in_ticks(self, rate: float) -> None:
         """Converts all times to ticks, or to numbers of inputs: one per tick."""
         self._rate = rate
-        self._price, self._jump = self._price_s * rate, jump_ticks(rate)
+        self._jump = jump_ticks(rate)
+        excesses = self._excesses
+        excesses.price, excesses.first, excesses.most = self._price_s * rate, FIRST_S * rate, MEMORY_S * rate
         fine = max(rate, FINE_RATE)
         self._safety, self._surprise, self._shift_up = self._safety_s * fine, SURPRISE_S * fine, SHIFT_S * fine
         self._lately = max(math.ceil(LATELY_S * rate), LATELY_MIN)
@@ -195,7 +188,7 @@ class PricedLead:
         """Returns the new phase: towards base, cover and reserve, at a bounded speed, or there at once if it jumps."""
         if clock.rtt_s != self._rtt_s:
             self._measure(clock.rtt_s)
-        inputs = len(self._excess)
+        inputs = len(self._excesses)
         if inputs < self._first or not self._needs:
             return phase
         base, level = self._base, self._level
@@ -229,28 +222,9 @@ class PricedLead:
         self._fresh = self._calm - 1 - newest.index(self._calmest)
 
     def _remember(self, excess: float) -> None:
-        excesses = self._excess
-        excesses.append(excess)
-        insort(self._ordered, excess)
-        if len(excesses) > MEMORY_S * self._rate:
-            del self._ordered[bisect_left(self._ordered, excesses.popleft())]
+        excesses = self._excesses
+        excesses.add(excess)
         self._review -= 1
         if self._review < 0:
             self._review = self._reviews if len(excesses) > self._first else 0
-            self._level = self._best()
-
-    def _best(self) -> float:
-        """Returns the best cover: the excess with the least sum of itself and the price of the excesses above it."""
-        ordered, known = self._ordered, len(self._ordered)
-        price, shown = self._price, max(known, FIRST_S * self._rate)
-        # Late inputs that cost more than any cover can save end the search: 10 of 3,840, for example.
-        save = ordered[-1] - ordered[0]
-        best, least = ordered[-1], ordered[-1]
-        for late in range(1, known):
-            cost = price * (late / shown)
-            cover = ordered[-1 - late]
-            if cover + cost < least:
-                best, least = cover, cover + cost
-            if cost > save:
-                break
-        return best
+            self._level = excesses.best()

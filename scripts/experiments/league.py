@@ -29,9 +29,10 @@ from rich.console import Console
 from rich.table import Table
 
 from client_sdk.netsim.links import PRESETS
-from client_sdk.timing.lead import PRICE_S, SAFETY_S, STALL_S
+from client_sdk.timing.lead import SAFETY_S, STALL_S
 from scripts.experiments.controllers import RIVALS
 from scripts.experiments.lead_trial import OURS, RATE, TICK_MS, Row, trial
+from shared.priced import PRICE_S
 
 TIE_MS = 0.1 * TICK_MS
 SHARE_MAX = 0.5

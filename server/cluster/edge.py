@@ -187,6 +187,9 @@ class EdgePart(Part):
             if (sent := self._sent.pop(record.tick, None)) is not None:
                 self.round_trip.record(now - sent)
             self.clock.arrived(record.tick, 0 if newest is None else record.tick - newest, now)
+            margin_s = record.margin_s(self.name)
+            if newest is not None and margin_s is not None:
+                self.clock.learn(newest, margin_s)
             self.lateness.record(max(now - self.clock.due(record.tick) - self.clock.lead_s, 0.0))
             self.ticks += 1
             self.latest = now
@@ -235,4 +238,5 @@ class EdgePart(Part):
             if len(self._sent) > AHEAD_MAX:  # their records came before them
                 self._sent.clear()
             self._sent[batch.number] = now
+            self.clock.sent(batch.number, now)
         self._schedule(core)

@@ -213,7 +213,7 @@ class SequencerPart(Part):
     def _receive(self, data: bytes) -> None:
         assert self.core is not None
         try:
-            self.core.receive(batch_of(data))
+            self.core.receive(batch_of(data), time.monotonic())
         except Exception:
             self.faults.report("receiving a batch")
 

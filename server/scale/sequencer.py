@@ -27,7 +27,7 @@ from server.scale.remote import BatchInputs, RemoteJoining, RemoteLink, RemoteRo
 from server.scale.replica import Replica
 from server.scale.wire import COMMAND, GONE, HERE, JOIN, KNOWS, LEAVE, LOST, SWITCH, Batch, Record, packed, rows
 from shared import messages
-from shared.bounds import in_ticks
+from shared.bounds import MARGINS_PER_S, in_ticks
 from shared.messages import Command, Hello
 from shared.world_state import WorldState
 
@@ -82,6 +82,10 @@ class WorldSequencer:
         self._ended: list[object] = []
         self._waiting: dict[str, dict[int, Batch]] = {}
         """Batches by edge and by the number of the batch before. Each waits for that one: none may be left out."""
+        self._came: dict[tuple[str, int], float] = {}
+        """Times at which the waiting batches came, in seconds, by edge and number."""
+        self._margins: dict[str, int] = {}
+        """Margins of the batches that the tick takes, by edge (`Record.margins`)."""
         self._newest: dict[str, int] = {} if replica is None else dict(replica.batches)
         self._taken = dict.fromkeys(self._newest, world.tick)
         """Tick that took the newest batch of each edge."""
@@ -109,14 +113,17 @@ class WorldSequencer:
         if replica is not None:
             self._take_over(replica)
 
-    def receive(self, batch: Batch) -> None:
-        """Keeps a batch for its tick. One that is in the log already is dropped."""
-        if batch.number > self._newest.get(batch.edge, -1):
-            self._waiting.setdefault(batch.edge, {})[batch.before] = batch
+    def receive(self, batch: Batch, now: float) -> None:
+        """Keeps a batch for its tick. One that is in the log already is dropped, and so is one that waits already."""
+        waiting = self._waiting.setdefault(batch.edge, {})
+        if batch.number > self._newest.get(batch.edge, -1) and batch.before not in waiting:
+            waiting[batch.before] = batch
+            self._came[batch.edge, batch.number] = now
 
     def tick(self, now: float) -> bytes:
         """Computes the next tick. Returns its record."""
         tick = self.world.tick + 1
+        self._margins.clear()
         for edge in sorted(self._waiting):
             waiting = self._waiting[edge]
             while (batch := waiting.get(self._newest.get(edge, -1))) is not None and batch.number <= tick:
@@ -135,7 +142,10 @@ class WorldSequencer:
         seated, self._joining.seated = self._joining.seated, []
         placed = sorted(self.world.placed)
         batches, edges = self._batches(), self._told_edges()
-        return packed(Record(self.epoch, tick, batches, journal, placed, acted, removed, events, seated, ended, edges))
+        margins = [self._margins.get(edge) for edge in sorted(self._newest)]
+        return packed(
+            Record(self.epoch, tick, batches, journal, placed, acted, removed, events, seated, ended, edges, margins)
+        )
 
     # -- batches -------------------------------------------------------------------------------------------
 
@@ -159,7 +169,10 @@ class WorldSequencer:
 
     def _take(self, batch: Batch, now: float) -> None:
         """Carries out the requests of a batch, and takes its inputs."""
-        self._newest[batch.edge], self._taken[batch.edge] = batch.number, self.world.tick + 1
+        tick = self.world.tick + 1
+        self._newest[batch.edge], self._taken[batch.edge] = batch.number, tick
+        early_s = now - self._came.pop((batch.edge, batch.number)) - (tick - batch.number) / self.world.scene.tick_rate
+        self._margins[batch.edge] = round(early_s * MARGINS_PER_S)
         for kind, client, *parts in batch.requests:
             key = (batch.edge, client)
             session = self._sessions.get(key)
@@ -210,6 +223,7 @@ class WorldSequencer:
         for edge in [edge for edge, taken in self._taken.items() if tick - taken > self._gone]:
             del self._newest[edge], self._taken[edge]
             self._waiting.pop(edge, None)
+            self._came = {key: came for key, came in self._came.items() if key[0] != edge}
         silent = {edge for edge, taken in self._taken.items() if tick - taken > self._silent}
         if silent:
             for edge in silent:

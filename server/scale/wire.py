@@ -10,12 +10,14 @@ request   [JOIN, client, name, subject, resume, token, beside, loaded]
           [HERE, 0, address]   the edge's address for clients; empty: it takes no more of them
           [KNOWS, client]   the client has the new token     [LOST, client]   [LEAVE, client]
           [COMMAND, client, number, tick, seen, name, payload, gaps]
-record    [epoch, tick, batches, journal, placed, acted, removed, events, seated, ended, edges]
+record    [epoch, tick, batches, journal, placed, acted, removed, events, seated, ended, edges, margins]
           batches: edge, newest batch in it, ...   journal: a tick of a recording; nil: the record begins an epoch
           placed, acted, removed: entities   events: [players or nil, message], ...
           seated: edge, client, player, beside, ...   ended: edge, client, code, reason, ...
           code: the close code; `GONE`: the edge knows
           edges: edge, address, ... of all edges that take clients; nil: as before
+          margins: for each edge in `batches`: time by which its newest batch was early, in 1/8192 s, negative if it was
+          late; nil if no batch of it was taken in this tick
 
 A client is a number that its edge gives to a connection. All of it is MessagePack.
 """
@@ -23,6 +25,8 @@ A client is a number that its edge gives to a connection. All of it is MessagePa
 from typing import Any, NamedTuple
 
 import msgpack
+
+from shared.bounds import MARGINS_PER_S
 
 GONE = 0
 """Close code in a record of a connection that its edge has lost."""
@@ -53,6 +57,14 @@ class Record(NamedTuple):
     seated: list[Any]
     ended: list[Any]
     edges: list[str] | None = None
+    margins: list[int | None] | None = None
+
+    def margin_s(self, edge: str) -> float | None:
+        """Returns the margin of an edge's newest batch in seconds; None: no batch of it was taken in this tick."""
+        if self.margins is None or edge not in self.batches[::2]:
+            return None
+        margin = self.margins[self.batches[::2].index(edge)]
+        return None if margin is None else margin / MARGINS_PER_S
 
 
 def packed(value: Batch | Record) -> bytes:

@@ -263,6 +263,9 @@ class EdgePart(Reader):
         else:
             missing = record.tick - self.replica.batches.get(self.name, record.tick)
             self.clock.arrived(record.tick, missing, self.match.now)
+            margin_s = record.margin_s(self.name)
+            if margin_s is not None:
+                self.clock.learn(record.tick - missing, margin_s)
             self._schedule()
         if again:
             for batch in self.core.unrecorded():
@@ -284,6 +287,7 @@ class EdgePart(Reader):
             if batch is None:  # the log is silent
                 self.match.at(self.match.now + 1 / self.match.rate, self._collect, key=self)
                 return
+            self.clock.sent(batch.number, self.match.now)
             self._send(batch)
         self._schedule()
 

@@ -270,7 +270,7 @@ class ScaledMatch(Simulation):
         """Delivers a batch to all sequencers."""
         self._sequencers = [each for each in self._sequencers if each.alive]
         for sequencer in self._sequencers:
-            sequencer.core.receive(batch_of(data))
+            sequencer.core.receive(batch_of(data), self.now)
 
     def take_over(self, standby: StandbyPart, begin: Entry) -> None:
         """Makes a standby the sequencer, whose record that begins an epoch was stored."""

@@ -10,17 +10,15 @@ from client_sdk.timing.lead import (
     CALM_S,
     FASTER,
     FIRST_INPUTS_S,
-    FIRST_S,
     HURRY,
     JUMP_S,
-    MEMORY_S,
-    PRICE_S,
     SAFETY_S,
     SHIFT_S,
     PricedLead,
 )
 from client_sdk.timing.server_clock import PING_FIRST_S, PING_LATER_S, PINGS, ServerClock
 from client_sdk.timing.timeline import Timeline
+from shared.priced import FIRST_S, MEMORY_S, PRICE_S, Excesses
 from tests.lengths import long
 
 RATE = 32.0
@@ -335,10 +333,11 @@ def test_the_base_is_that_of_its_definition_after_every_input(slope: float) -> N
 @pytest.mark.parametrize("top", [0.001, 0.4, 8.0, 1000.0])
 def test_the_cover_is_the_best_of_all_excesses_though_few_are_looked_at(top: float) -> None:
     rng = random.Random(6)
-    lead = PricedLead()
-    lead.start(clock_at(), 0.0)
+    excesses = Excesses(PRICE, FIRST_S * RATE, MEMORY_S * RATE)
+    known: list[float] = []
     for _ in range(600):
-        lead._remember(rng.choice((rng.uniform(-top, top), rng.uniform(0, top / 10), 0.0)))
-        falling = sorted(lead._excess, reverse=True)
+        known.append(rng.choice((rng.uniform(-top, top), rng.uniform(0, top / 10), 0.0)))
+        excesses.add(known[-1])
+        falling = sorted(known, reverse=True)
         costs = [excess + PRICE * (i / max(len(falling), FIRST_S * RATE)) for i, excess in enumerate(falling)]
-        assert lead._best() == falling[costs.index(min(costs))]
+        assert excesses.best() == falling[costs.index(min(costs))]
