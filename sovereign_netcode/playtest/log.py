@@ -44,7 +44,7 @@ class Log:
     def __init__(self, match: "ScaledMatch", seed: int, fails: tuple[float, float] | None = None) -> None:
         self._match, self._rng = match, random.Random(seed)
         self.fails = fails
-        """How often and how long the log fails, in seconds; None: not any more."""
+        """Time between two failures and their longest time, in seconds; None: it does not fail any more."""
         self.records: list[bytes] = []
         """All records that the log has accepted."""
         self.refused = 0

@@ -33,7 +33,7 @@ class TwoEdges:
             for edge in self.edges:
                 batch = edge.collect(self._due - LEAD_S, self._due)
                 if batch is not None:
-                    self.core.receive(batch)
+                    self.core.receive(batch, self._due)
             self._follow(record_of(self.core.tick(self._due)), self._due)
             self._due += 1 / self.world.scene.tick_rate
 
