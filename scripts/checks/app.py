@@ -33,7 +33,7 @@ def main(arguments: list[str]) -> int:
         run("browsers", "-m", "scripts.browser_build.app", "--tests")  # without it, tests in browsers are skipped
         os.environ["PATH"] = tools.path()
     if arguments == ["--long"]:
-        steps = [together(LONG, "long"), alone(LONG, "long")]
+        steps = [together(LONG, "long"), in_pairs("long"), alone(LONG, "long")]
     elif arguments == ["--all"]:
         steps = everything("", "long")
     elif arguments:
@@ -54,7 +54,8 @@ def everything(markers: str, profile: str) -> list[Step]:
         steps.append(together(markers, profile))
         step, output = types.result()
     print(f"\n== {step.title}\n{output}", end="", flush=True)
-    return [*steps, step, alone(markers, profile)]
+    pairs = [in_pairs(profile)] if profile == "long" else []
+    return [*steps, step, *pairs, alone(markers, profile)]
 
 
 def mypy() -> tuple[Step, str]:
@@ -67,13 +68,23 @@ def mypy() -> tuple[Step, str]:
 
 def together(markers: str, profile: str) -> Step:
     """Runs tests three at a time, because many of them wait: two cores are busy all the time then."""
-    return run("tests", *pytest(markers, "not alone", profile), "-n", "3", "--dist", "worksteal")
+    return run("tests", *pytest(markers, "not paired and not alone", profile), "-n", "3", "--dist", "worksteal")
+
+
+def in_pairs(profile: str) -> Step:
+    """Runs tests two at a time that a busy machine disturbs. All are long ones. Many wait, so two leave enough time."""
+    return run("tests in pairs", *pytest("", "paired", profile), "-n", "2", "--dist", "worksteal", *files("paired"))
 
 
 def alone(markers: str, profile: str) -> Step:
-    """Runs the tests that measure time, one by one. Only the files that have one are collected, which saves 10 s."""
-    files = (path for path in sorted((ROOT / "tests").rglob("test_*.py")) if "mark.alone" in path.read_text("utf-8"))
-    return run("tests alone", *pytest(markers, "alone", profile), *map(str, files))
+    """Runs the tests that measure time, one by one."""
+    return run("tests alone", *pytest(markers, "alone", profile), *files("alone"))
+
+
+def files(marker: str) -> list[str]:
+    """Returns the files that have a test with a marker. To collect only them saves 10 s."""
+    tests = sorted((ROOT / "tests").rglob("test_*.py"))
+    return [str(path) for path in tests if f"mark.{marker}" in path.read_text("utf-8")]
 
 
 def pytest(markers: str, more: str, profile: str) -> tuple[str, ...]:

@@ -26,7 +26,7 @@ pytestmark = [
     pytest.mark.e2e,
     pytest.mark.usefixtures("python_for_browsers"),
     pytest.mark.slow,
-    pytest.mark.alone,
+    pytest.mark.paired,
     pytest.mark.skipif(BROWSER is None, reason="there is no Chromium on this machine"),
 ]
 

@@ -97,7 +97,7 @@ def test_policies_of_bots(name: str | None, rules: Rules, made: type) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.alone
+@pytest.mark.paired
 def test_memory_of_the_server_is_flat_under_sixty_clients(tmp_path: Path) -> None:
     out = tmp_path / "out.json"
     done = loadtest("--clients", "60", "--seconds", "20", "--policy", "dig-and-place", "--json", str(out))
