@@ -287,7 +287,7 @@ def tour(match: ScaledMatch, player: Seat, seconds: float, every: float = 5.0) -
 
 
 @pytest.mark.parametrize(
-    ("seed", "seconds"), [(1, 60), pytest.param(2, 600, marks=pytest.mark.slow)], ids=["short", "long"]
+    ("seed", "seconds"), [(1, 60), pytest.param(2, 300, marks=pytest.mark.slow)], ids=["short", "long"]
 )
 def test_a_lone_player_who_is_moved_between_edges_has_no_corrections(seed: int, seconds: float) -> None:
     match = ScaledMatch(load_scene("hills"), seed, edges=4)
