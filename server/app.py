@@ -8,8 +8,6 @@ import signal
 import sys
 from collections.abc import Callable, Sequence
 
-import structlog
-
 from server import describe
 from server.auth.access import authenticator, operator_token
 from server.config.options import SettingsError, nearest
@@ -26,6 +24,7 @@ from server.runtime.event_loop import (
     signals,
 )
 from server.runtime.keeping import recorded, saved
+from server.runtime.structured import structlog
 from server.runtime.terrain import TerrainPool
 from server.runtime.warmup import warm_up
 from server.serving import Declared, Server

@@ -6,7 +6,6 @@ import secrets
 from collections.abc import Callable, Iterator
 from typing import Any
 
-import structlog
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
 
 from server.cluster.bus import BusError
@@ -27,6 +26,7 @@ from server.play.play import PlayPages, play_pages
 from server.rules import Rules
 from server.runtime.event_loop import freeze, loop_factory
 from server.runtime.keeping import recorded
+from server.runtime.structured import structlog
 from server.runtime.tasks import Tasks
 from server.serving import Serving
 from shared.scene import Scene

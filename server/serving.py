@@ -9,7 +9,6 @@ import time
 from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
-import structlog
 from prometheus_client.core import Metric
 
 from server.auth.access import tls_context
@@ -30,6 +29,7 @@ from server.play.play import PlayPages
 from server.players.persisted_state import PersistedState
 from server.players.player import Player
 from server.runtime.event_loop import freeze, on_signals, raise_descriptors, rss_mb
+from server.runtime.structured import structlog
 from server.runtime.tasks import Tasks
 from server.runtime.terrain import TerrainPool
 from server.runtime.ticker import Ticker, best_alarm

@@ -4,12 +4,11 @@ import contextlib
 from collections.abc import Iterator
 from pathlib import Path
 
-import structlog
-
 from server.config.options import SettingsError
 from server.config.settings import Settings
 from server.journal.recorded_world import RecordedWorld
 from server.persistence.store import Store
+from server.runtime.structured import structlog
 from shared.scene import Scene
 
 logger = structlog.stdlib.get_logger("server")

@@ -9,8 +9,7 @@ import re
 from contextvars import ContextVar
 from typing import TextIO
 
-import structlog
-from structlog.typing import EventDict, Processor, WrappedLogger
+from server.runtime.structured import structlog
 
 SECRETS = frozenset({"token", "resume", "key", "secret", "authorization", "cookie"})
 """Names of values that are hidden."""
@@ -30,7 +29,7 @@ def set_up(level: str, form: str, stream: TextIO) -> None:
         form: format of a line, one of `server.config.settings.LOG_FORMATS`.
         stream: the stream.
     """
-    first: list[Processor] = [
+    first: list[structlog.typing.Processor] = [
         structlog.stdlib.add_log_level,
         structlog.stdlib.add_logger_name,
         _with_world,
@@ -40,7 +39,7 @@ def set_up(level: str, form: str, stream: TextIO) -> None:
         _without_secrets,
     ]
     if form == "json":
-        last: Processor = structlog.processors.JSONRenderer()
+        last: structlog.typing.Processor = structlog.processors.JSONRenderer()
     else:
         last = structlog.dev.ConsoleRenderer(colors=stream.isatty())
     structlog.configure(
@@ -65,17 +64,21 @@ def set_up(level: str, form: str, stream: TextIO) -> None:
     logging.captureWarnings(capture=True)
 
 
-def _with_world(logger: WrappedLogger, method: str, event: EventDict) -> EventDict:
+def _with_world(
+    logger: structlog.typing.WrappedLogger, method: str, event: structlog.typing.EventDict
+) -> structlog.typing.EventDict:
     if name := WORLD.get():
         event.setdefault("world", name)
     return event
 
 
-def _without_secrets(logger: WrappedLogger, method: str, event: EventDict) -> EventDict:
+def _without_secrets(
+    logger: structlog.typing.WrappedLogger, method: str, event: structlog.typing.EventDict
+) -> structlog.typing.EventDict:
     for name in SECRETS & event.keys():
         event[name] = HIDDEN
     return event
 
 
-def _without_tokens(logger: WrappedLogger, method: str, line: EventDict | str) -> str:
+def _without_tokens(logger: structlog.typing.WrappedLogger, method: str, line: structlog.typing.EventDict | str) -> str:
     return JWT.sub(HIDDEN, str(line))

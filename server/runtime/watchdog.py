@@ -10,7 +10,7 @@ import threading
 import time
 import traceback
 
-import structlog
+from server.runtime.structured import structlog
 
 BEAT_S = 0.1
 """Seconds between two checks."""

@@ -3,7 +3,10 @@
 import io
 import json
 import logging
+import subprocess
+import sys
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 import structlog
@@ -12,6 +15,7 @@ from server.auth.tokens import issue
 from server.config.settings import LOG_FORMATS
 from server.runtime import log
 
+ROOT = Path(__file__).parents[2]
 TOKEN = issue(b"k" * 32, "ann", 3600, 1.8e9)
 
 
@@ -85,3 +89,9 @@ def test_no_token_is_in_any_line(form: str) -> None:
     assert "opaque" not in text
     assert text.count(log.HIDDEN) >= 7
     assert "name" in text
+
+
+def test_the_log_does_without_rich() -> None:
+    program = "import sys, server.app, server.runtime.log; print('rich' in sys.modules); import rich.console"
+    done = subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, check=False)
+    assert (done.stdout, done.stderr) == ("False\n", "")
