@@ -20,6 +20,7 @@ def env(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> ModuleType:
     for name, value in {"VENV": venv, "PYTHON": venv / "python", "STAMP": venv / "stamp"}.items():
         monkeypatch.setattr(environment, name, value)
     monkeypatch.setattr(environment, "_must", lambda *command: (venv / "python").touch())
+    monkeypatch.setattr(environment, "_compile", lambda: None)
     return environment
 
 
@@ -50,6 +51,32 @@ def test_an_interrupted_set_up_is_begun_anew(
     capsys.readouterr()
     env.ensure(env.DEV)
     assert "done in" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("requirements", [environment.RUNTIME, environment.DEV])
+def test_two_halves_have_all_pins_with_their_hashes(requirements: str) -> None:
+    text = (environment.ROOT / requirements).read_text("utf-8")
+    one, two = environment.halves(text)
+    assert sorted(one.splitlines() + two.splitlines()) == sorted(
+        line for line in text.splitlines() if not line.startswith("#")
+    )
+    for half in (one, two):
+        pins = [line for line in half.splitlines() if not line.startswith(" ")]
+        assert all("==" in pin and pin.endswith("\\") for pin in pins)
+        assert half.count("--hash=") >= len(pins) > 5
+    assert abs(one.count("==") - two.count("==")) < 10
+
+
+def test_a_half_that_cannot_be_installed_is_told(env: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fails(*command: str) -> None:
+        if command[-1].endswith("1.txt"):
+            raise SystemExit(2)
+        (env.VENV / "python").touch()
+
+    monkeypatch.setattr(env, "_must", fails)
+    with pytest.raises(SystemExit):
+        env.ensure(env.DEV)
+    assert not env.STAMP.exists()
 
 
 def command(folder: Path) -> Path:
