@@ -117,6 +117,14 @@ class Bus(Protocol):
         """Returns the value of a key; None: it has none."""
         ...
 
+    async def all(self, prefix: str) -> dict[str, Revised]:
+        """Returns the values of all keys with a prefix.
+
+        Raises:
+            BusError: there was no answer.
+        """
+        ...
+
     async def put(self, key: str, value: bytes, revision: int | None = None) -> int:
         """Sets the value of a key. Returns its new revision.
 
@@ -130,10 +138,18 @@ class Bus(Protocol):
         """
         ...
 
-    async def delete(self, key: str) -> None:
-        """Removes the value of a key."""
+    async def delete(self, key: str, revision: int | None = None) -> None:
+        """Removes the value of a key.
 
-    def watch(self, prefix: str) -> AsyncIterator[tuple[str, bytes | None]]:
+        Args:
+            key: the key.
+            revision: the revision that is removed; None: any.
+
+        Raises:
+            ConflictError: the key has another revision.
+        """
+
+    def watch(self, prefix: str) -> AsyncIterator[tuple[str, Revised | None]]:
         """Yields all keys with a prefix and their values, then each change; None: the value was removed."""
         ...
 

@@ -23,9 +23,22 @@ class LocalHub:
         self.revision = 0
         self.takers: list[Callable[[bytes], None]] = []
         self.readers: list[LocalReader] = []
-        self.watchers: list[tuple[str, asyncio.Queue[tuple[str, bytes | None]]]] = []
+        self.watchers: list[tuple[str, asyncio.Queue[tuple[str, Revised | None]]]] = []
 
-    def changed(self, key: str, value: bytes | None) -> None:
+    def put(self, key: str, value: bytes | None, revision: int | None) -> int:
+        """Sets the value of a key, or removes it. Returns the new revision. Arguments and errors as for `Bus.put`."""
+        known = self.values.get(key)
+        if revision is not None and revision != (0 if known is None else known.revision):
+            raise ConflictError(f"{key}: has another revision than {revision}")
+        self.revision += 1
+        if value is None:
+            self.values.pop(key, None)
+        else:
+            self.values[key] = Revised(value, self.revision)
+        self.changed(key, self.values.get(key))
+        return self.revision
+
+    def changed(self, key: str, value: Revised | None) -> None:
         """Reports the new value of a key to those who watch it."""
         for prefix, queue in self.watchers:
             if key.startswith(prefix):
@@ -116,24 +129,21 @@ class LocalBus:
     async def get(self, key: str) -> Revised | None:
         return self._hub.values.get(key)
 
+    async def all(self, prefix: str) -> dict[str, Revised]:
+        return {key: value for key, value in self._hub.values.items() if key.startswith(prefix)}
+
     async def put(self, key: str, value: bytes, revision: int | None = None) -> int:
-        hub, known = self._hub, self._hub.values.get(key)
-        if revision is not None and revision != (0 if known is None else known.revision):
-            raise ConflictError(f"{key}: has another revision than {revision}")
-        hub.revision += 1
-        hub.values[key] = Revised(value, hub.revision)
-        hub.changed(key, value)
-        return hub.revision
+        return self._hub.put(key, value, revision)
 
-    async def delete(self, key: str) -> None:
-        if self._hub.values.pop(key, None) is not None:
-            self._hub.changed(key, None)
+    async def delete(self, key: str, revision: int | None = None) -> None:
+        if key in self._hub.values or revision:
+            self._hub.put(key, None, revision)
 
-    async def watch(self, prefix: str) -> AsyncIterator[tuple[str, bytes | None]]:
-        queue: asyncio.Queue[tuple[str, bytes | None]] = asyncio.Queue()
+    async def watch(self, prefix: str) -> AsyncIterator[tuple[str, Revised | None]]:
+        queue: asyncio.Queue[tuple[str, Revised | None]] = asyncio.Queue()
         for key, value in self._hub.values.items():
             if key.startswith(prefix):
-                queue.put_nowait((key, value.value))
+                queue.put_nowait((key, value))
         watcher = (prefix, queue)
         self._hub.watchers.append(watcher)
         try:

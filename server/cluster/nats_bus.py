@@ -11,7 +11,6 @@ names the newest. Keys of all worlds are in the bucket `worlds`.
 import asyncio
 import contextlib
 import json
-import logging
 import re
 import secrets
 import time
@@ -29,12 +28,15 @@ from nats.js.kv import KeyValue
 
 from server.cluster.bus import BusError, ConflictError, PurgedError, RefusedError, Revised, Snapshot, Stored
 from server.cluster.log_reader import LogReader
+from server.cluster.watched import Watched, said
 from server.scale.writer import EMPTY, Entry
 
 ACK_S = 0.5
 """Seconds to wait for the acknowledgement of a record."""
 ANSWER_S = 2.0
 """Seconds to wait for other answers."""
+LIST_S = 10.0
+"""Seconds after which all watched keys are read again."""
 CONNECT_S = 5.0
 """Seconds to wait for a connection at the start."""
 RECONNECT_S = 0.1
@@ -43,20 +45,19 @@ ONE_BY_ONE = 16
 """Number of missing records from which they are fetched by a consumer."""
 ATTEMPTS = 20
 """Attempts to fetch a record that the stream has, and that did not come."""
-WRONG_LAST_ID, NAME_IN_USE = 10070, 10058
-"""Error codes of JetStream: the newest message has another id; a stream of that name has another configuration."""
+WRONG_LAST_ID, NAME_IN_USE, WRONG_LAST_SEQUENCE = 10070, 10058, 10071
+"""Error codes of JetStream: the newest message has another id; a stream of that name has another configuration; the
+newest message of the subject has another sequence number."""
 WORLD = re.compile("[A-Za-z0-9_-]{1,32}")
 """Pattern of the name of a world on the bus."""
 BUCKET = "worlds"
 """Name of the bucket of keys."""
 
-logger = logging.getLogger(__name__)
-
 
 class NatsBus:
     """One world's part of a NATS server. Create it with `NatsBus.connect`."""
 
-    def __init__(self, client: Client, connection: "_Connection", world: str) -> None:
+    def __init__(self, client: Client, connection: Watched, world: str) -> None:
         self._client, self._connection, self._world = client, connection, world
         self._js: JetStreamContext = client.jetstream(timeout=ANSWER_S)
         self._stream, self._subject = f"WORLD_{world}", f"world.{world}"
@@ -66,20 +67,21 @@ class NatsBus:
         self.bytes_out = self.bytes_in = 0
 
     @classmethod
-    async def connect(cls, url: str, world: str, *, replicas: int = 1) -> "NatsBus":
+    async def connect(cls, url: str, world: str, *, replicas: int = 1, log: bool = True) -> "NatsBus":
         """Connects to a NATS server, and makes the stream and the stores of a world if they do not exist.
 
         Args:
             url: address, nats://HOST:PORT; several are separated by commas.
             world: name of the world.
             replicas: number of servers that store the log, the checkpoints and the keys.
+            log: whether the world has a log and checkpoints; otherwise only the keys can be used.
 
         Raises:
             BusError: there is no connection, or the server has no JetStream.
         """
         if not WORLD.fullmatch(world):
             raise BusError(f"world = {world!r}: must be 1 to 32 letters, digits, - and _")
-        connection = _Connection()
+        connection = Watched()
         try:
             client = await asyncio.wait_for(
                 nats.connect(
@@ -96,16 +98,21 @@ class NatsBus:
                 CONNECT_S,
             )
         except (NatsError, OSError, TimeoutError) as error:
-            raise BusError(f"bus = {url!r}: no connection ({_said(error)})") from error
+            raise BusError(f"bus = {url!r}: no connection ({said(error)})") from error
         bus = cls(client, connection, world)
         try:
-            await bus._prepare(replicas)
+            await bus._prepare(replicas, log)
         except (NatsError, OSError, TimeoutError) as error:
             await client.close()
-            raise BusError(f"bus = {url!r}: cannot be used; is JetStream on (-js)? ({_said(error)})") from error
+            raise BusError(f"bus = {url!r}: cannot be used; is JetStream on (-js)? ({said(error)})") from error
         return bus
 
-    async def _prepare(self, replicas: int) -> None:
+    async def _prepare(self, replicas: int, log: bool) -> None:
+        with _unless(NAME_IN_USE):
+            await self._js.create_key_value(bucket=BUCKET, history=1, replicas=replicas)
+        self._kv = await self._js.key_value(BUCKET)
+        if not log:
+            return
         config = StreamConfig(
             name=self._stream,
             subjects=[f"{self._subject}.log"],
@@ -116,11 +123,8 @@ class NatsBus:
         with _unless(NAME_IN_USE):
             await self._js.add_stream(config)
         with _unless(NAME_IN_USE):
-            await self._js.create_key_value(bucket=BUCKET, history=1, replicas=replicas)
-        with _unless(NAME_IN_USE):
             name = f"CHECKPOINTS_{self._world}"
             await self._js.create_object_store(name, config=ObjectStoreConfig(bucket=name, replicas=replicas))
-        self._kv = await self._js.key_value(BUCKET)
         self._store = await self._js.object_store(f"CHECKPOINTS_{self._world}")
 
     # -- batches -----------------------------------------------------------------------------------------------
@@ -150,7 +154,7 @@ class NatsBus:
             answer = await self._client.request(f"{self._subject}.log", entry.data, timeout=ACK_S, headers=headers)
             told: dict[str, Any] = json.loads(answer.data)
         except (NatsError, OSError, ValueError) as error:
-            raise BusError(f"no acknowledgement ({_said(error)})") from error
+            raise BusError(f"no acknowledgement ({said(error)})") from error
         error_code = told.get("error", {}).get("err_code")
         if error_code is None:
             return int(told["seq"])
@@ -167,7 +171,7 @@ class NatsBus:
         except NotFoundError:
             return 0, EMPTY
         except (NatsError, OSError, TimeoutError) as error:
-            raise BusError(_said(error)) from error
+            raise BusError(said(error)) from error
         return message.seq or 0, _id_of(message.headers)
 
     async def follow(self, seq: int) -> LogReader:
@@ -199,7 +203,7 @@ class NatsBus:
                 raise PurgedError(f"record {first} is not in the log any more") from error
             raise BusError("a record is missing") from error
         except (NatsError, OSError, TimeoutError) as error:
-            raise BusError(_said(error)) from error
+            raise BusError(said(error)) from error
         return found
 
     async def _fetch_many(self, first: int, last: int) -> list[Stored]:
@@ -242,7 +246,7 @@ class NatsBus:
             except NotFoundError:  # a newer one has replaced it
                 await asyncio.sleep(RECONNECT_S)
             except (NatsError, OSError, TimeoutError) as error:
-                raise BusError(_said(error)) from error
+                raise BusError(said(error)) from error
         raise BusError("the newest checkpoint cannot be found")
 
     async def put_checkpoint(self, snapshot: Snapshot, keep: int) -> None:
@@ -273,8 +277,16 @@ class NatsBus:
         except KeyNotFoundError:
             return None
         except (NatsError, OSError, TimeoutError) as error:
-            raise BusError(_said(error)) from error
+            raise BusError(said(error)) from error
         return Revised(entry.value or b"", entry.revision or 0)
+
+    async def all(self, prefix: str) -> dict[str, Revised]:
+        values = {}
+        for key in await self._keys(prefix):
+            value = await self.get(key)
+            if value is not None:
+                values[key] = value
+        return values
 
     async def put(self, key: str, value: bytes, revision: int | None = None) -> int:
         assert self._kv is not None
@@ -287,42 +299,50 @@ class NatsBus:
         except KeyWrongLastSequenceError as error:
             raise ConflictError(f"{key}: has another revision than {revision}") from error
         except (NatsError, OSError, TimeoutError) as error:
-            raise BusError(_said(error)) from error
+            raise BusError(said(error)) from error
 
-    async def delete(self, key: str) -> None:
+    async def delete(self, key: str, revision: int | None = None) -> None:
         assert self._kv is not None
         try:
-            await self._kv.delete(key)
+            if revision is None:
+                await self._kv.delete(key)
+                return
+            headers = {"KV-Operation": "DEL", Header.EXPECTED_LAST_SUBJECT_SEQUENCE.value: str(revision)}
+            await self._js.publish(f"$KV.{BUCKET}.{key}", headers=headers)
+        except APIError as error:
+            if error.err_code == WRONG_LAST_SEQUENCE:
+                raise ConflictError(f"{key}: has another revision than {revision}") from error
+            raise BusError(said(error)) from error
         except (NatsError, OSError, TimeoutError) as error:
-            raise BusError(_said(error)) from error
+            raise BusError(said(error)) from error
 
-    async def watch(self, prefix: str) -> AsyncIterator[tuple[str, bytes | None]]:
+    async def watch(self, prefix: str) -> AsyncIterator[tuple[str, Revised | None]]:
         head, changed = f"$KV.{BUCKET}.", asyncio.Queue[str]()
-        known: dict[str, bytes] = {}
+        known: dict[str, Revised] = {}
 
         async def note(message: Msg) -> None:  # also of a change that was refused, so the value is read
             changed.put_nowait(message.subject.removeprefix(head))
 
-        subscription = await self._client.subscribe(f"{head}>", cb=note)
+        subscription = await self._client.subscribe(f"{head}{prefix}>" if prefix.endswith(".") else f"{head}>", cb=note)
         try:
-            listed_at = -ANSWER_S
+            listed_at, listed_after = -LIST_S, 0
             while True:
-                if time.monotonic() - listed_at > ANSWER_S:  # changes may have been missed during a reconnect
+                times = self._connection.times_back  # changes may have been missed during a reconnect
+                if time.monotonic() - listed_at > LIST_S or times != listed_after:
                     with contextlib.suppress(BusError):
                         for key in {*await self._keys(prefix), *known}:
                             changed.put_nowait(key)
-                        listed_at = time.monotonic()
+                        listed_at, listed_after = time.monotonic(), times
                 try:
                     key = await asyncio.wait_for(changed.get(), ANSWER_S)
                     found = await self.get(key) if key.startswith(prefix) else None
                 except (TimeoutError, BusError):
                     continue
-                value = None if found is None else found.value
-                if key.startswith(prefix) and known.get(key) != value:
+                if key.startswith(prefix) and known.get(key) != found:
                     known.pop(key, None)
-                    if value is not None:
-                        known[key] = value
-                    yield key, value
+                    if found is not None:
+                        known[key] = found
+                    yield key, found
         finally:
             with contextlib.suppress(NatsError):
                 await subscription.unsubscribe()
@@ -332,7 +352,7 @@ class NatsBus:
         try:
             info = await self._js.stream_info(f"KV_{BUCKET}", subjects_filter=f"{head}>")
         except (NatsError, OSError, TimeoutError) as error:
-            raise BusError(_said(error)) from error
+            raise BusError(said(error)) from error
         subjects = [subject.removeprefix(head) for subject in info.state.subjects or {}]
         return [key for key in subjects if key.startswith(prefix)]
 
@@ -353,26 +373,6 @@ class NatsBus:
         task.add_done_callback(self._tasks.discard)
 
 
-class _Connection:
-    """Logs what becomes of a connection."""
-
-    def __init__(self) -> None:
-        self.closing = False
-
-    async def failed(self, error: Exception) -> None:
-        """Logs an error. There is one for each attempt to reconnect."""
-        logger.debug("the bus: %s", _said(error))
-
-    async def lost(self) -> None:
-        """Logs that the connection is lost, unless it is closed here."""
-        if not self.closing:
-            logger.warning("the connection to the bus is lost")
-
-    async def back(self) -> None:
-        """Logs that there is a connection again."""
-        logger.info("the connection to the bus is back")
-
-
 class _unless(contextlib.AbstractContextManager[None]):  # noqa: N801 - reads as a word
     """Ignores an error of JetStream by its code."""
 
@@ -385,8 +385,3 @@ class _unless(contextlib.AbstractContextManager[None]):  # noqa: N801 - reads as
 
 def _id_of(headers: Any) -> str:
     return str((headers or {}).get(Header.MSG_ID.value, EMPTY))
-
-
-def _said(error: BaseException) -> str:
-    """Returns the text of an error, or its kind if it has none."""
-    return str(error) or type(error).__name__

@@ -9,7 +9,8 @@ import pytest
 
 from scripts.scale_lab.nats_server import NatsServer, binary
 from server.cluster import nats_bus
-from server.cluster.bus import BusError, ConflictError, PurgedError, RefusedError, Revised, Snapshot
+from server.cluster.bus import Bus, BusError, ConflictError, PurgedError, RefusedError, Revised, Snapshot
+from server.cluster.local_bus import LocalBus, LocalHub
 from server.cluster.nats_bus import NatsBus
 from server.scale.writer import EMPTY, Entry, LogWriter
 from tests.server.cluster.conftest import Cluster, until
@@ -118,7 +119,7 @@ async def test_a_checkpoint_replaces_the_one_before_and_the_log_up_to_it(server:
 
 async def test_keys(server: NatsServer) -> None:
     async with connected(server) as bus, connected(server, "other") as other:
-        seen: list[tuple[str, bytes | None]] = []
+        seen: list[tuple[str, Revised | None]] = []
 
         async def watch() -> None:
             async for change in other.watch("arena.edge."):
@@ -128,20 +129,57 @@ async def test_keys(server: NatsServer) -> None:
         with pytest.raises(ConflictError):
             await other.put("arena.edge.one", b"2", 0)
         watching = asyncio.create_task(watch())
-        await until(lambda: seen == [("arena.edge.one", b"1")])
+        await until(lambda: seen == [("arena.edge.one", Revised(b"1", revision))])
         revision = await other.put("arena.edge.one", b"2", revision)
         await bus.put("arena.identity", b"x")
-        await bus.put("arena.edge.two", b"3")
+        third = await bus.put("arena.edge.two", b"3")
         with pytest.raises(ConflictError):
             await bus.put("arena.edge.one", b"4", revision - 1)
         await until(lambda: len(seen) == 3)
         await bus.delete("arena.edge.two")
         await until(lambda: len(seen) == 4)
-        assert seen[1:] == [("arena.edge.one", b"2"), ("arena.edge.two", b"3"), ("arena.edge.two", None)]
+        assert seen[1:] == [
+            ("arena.edge.one", Revised(b"2", revision)),
+            ("arena.edge.two", Revised(b"3", third)),
+            ("arena.edge.two", None),
+        ]
         assert await bus.get("arena.edge.one") == Revised(b"2", revision)
         assert await bus.get("arena.edge.two") is None
         await bus.put("arena.edge.two", b"5", 0)
         watching.cancel()
+
+
+async def check_compare_and_set(bus: Bus, other: Bus) -> None:
+    """Checks what a lease needs of the keys of a bus."""
+    first = await bus.put("fleet.a.process.x", b"1", 0)
+    second = await bus.put("fleet.a.process.x", b"2", first)
+    with pytest.raises(ConflictError):
+        await other.delete("fleet.a.process.x", first)
+    assert await other.all("fleet.a.") == {"fleet.a.process.x": Revised(b"2", second)}
+    await other.delete("fleet.a.process.x", second)
+    with pytest.raises(ConflictError):
+        await bus.put("fleet.a.process.x", b"3", second)
+    with pytest.raises(ConflictError):
+        await bus.delete("fleet.a.process.x", second)
+    assert await bus.all("fleet.a.") == {}
+    again = await asyncio.gather(
+        *(one.put("fleet.a.world.arena", b"%d" % at, 0) for at, one in enumerate((bus, other) * 4)),
+        return_exceptions=True,
+    )
+    assert sum(isinstance(each, ConflictError) for each in again) == 7, "only one creates a key"
+    assert [*await bus.all("fleet.a.")] == ["fleet.a.world.arena"]
+
+
+async def test_the_keys_of_nats_are_compared_and_set(server: NatsServer) -> None:
+    buses = [await NatsBus.connect(server.url, name, log=False) for name in ("one", "two")]
+    await check_compare_and_set(*buses)
+    for bus in buses:
+        await bus.close()
+
+
+async def test_the_keys_of_a_local_bus_are_compared_and_set() -> None:
+    hub = LocalHub()
+    await check_compare_and_set(LocalBus(hub), LocalBus(hub))
 
 
 async def test_an_address_without_a_server_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
