@@ -214,11 +214,13 @@ class Core(Changing):
                 self._go(message, now)
             case messages.Edges():
                 self.travel.edges = message.addresses
-                self._game_events.apart = True
+                self._game_events.apart = self._game_events.apart or self._worlds.filled is not None
             case messages.HandOver():
                 self._begin_handover(message, now)
-            case messages.Waiting() if self.state == "joining" and not self._worlds.filled:
-                self._events.append(progress(message))
+            case messages.Waiting() if self.state in ("joining", "reconnecting") and not self._worlds.filled:
+                waiting = progress(message)
+                if self.state == "joining":
+                    self._events.append(waiting)
             case _:
                 raise ProtocolError(f"unexpected {type(message).__name__} message from a server")
 
@@ -279,12 +281,17 @@ class Core(Changing):
             self._end(left)
 
     def _go(self, go: messages.Go, now: float) -> None:
-        """Leaves for another world, as a new player there."""
+        """Leaves for another world, as a new player there; on the way back to a world, only for its present server."""
+        if self.state == "reconnecting" and not self._worlds.filled and self.travel.here(go):
+            self.travel.redirect(go)
+            self._depart()
+            return
         event = self.travel.go(go, now, lobby=self.state == "joining" and not self._worlds.filled)
         for answered in self._commands.give_up("the client went to another world"):
             self._events.append(answered)
         self._game_events.restart()
-        self._events.append(event)
+        if event is not None:
+            self._events.append(event)
         self.state, self._resume = "joining", b""
         self.shared, self.private = {}, {}
         if self.scene is not self._scene_asked:

@@ -2,11 +2,12 @@
 
 Theory of operation. A server names another path by `Go`. The client then ends its connection (`leaving`), and connects
 to that path as a new player as soon as the end of the old connection is known. The transport keeps host and port,
-unless the `Go` names another server. The servers that `Edges` names have the same world: after a lost connection, the
-client tries them in turn. A `Go` ahead of a welcome came from a lobby. If the world that a lobby named does not take
-the client, the client asks the lobby again. If a world has sent the client away and the connection breaks on the way,
-it tries the new path again, the last time without the seat. Both are bounded, and so is the number of worlds without
-play in between.
+unless the `Go` names another server. The servers that `Edges` names have the same world, or know the way to it: after a
+lost connection, the client tries them in turn. If one of these answers with a `Go`, the world is at another server by
+now: the client goes on there with its resume token (`redirect`). Any other `Go` ahead of a welcome came from a lobby.
+If the world that a lobby named does not take the client, the client asks the lobby again. If a world has sent the
+client away and the connection breaks on the way, it tries the new path again, the last time without the seat. All of
+these are bounded, and so is the number of worlds without play in between.
 """
 
 import math
@@ -23,8 +24,12 @@ ATTEMPTS_MAX = 3
 """Number of further attempts if the new path does not take the client."""
 AGAIN_S = 0.25
 """Wait before the first further attempt, in seconds; it doubles with each."""
+LOOP_S_MAX = 2.0
+"""Longest wait before a redirect is followed, in seconds."""
 WAIT_S_MAX = 10.0
 """Longest wait that a server may ask for before a further attempt, in seconds. Beyond it, the client leaves."""
+REDIRECTS_MAX = 64
+"""Limit of the redirects of a client that reconnects; all but the first two in a row wait."""
 WORLDS_MAX = 8
 """Limit of the worlds that a client is sent to without `PLAYED_S` seconds of play in between."""
 PLAYED_S = 1.0
@@ -41,7 +46,9 @@ class Travel:
         """Address of the server of the next connection; empty: that of the transport's address."""
         self.edges: list[str] = []
         """Addresses of other servers of the same world."""
-        self._tried = 0
+        self._sent_to = ""
+        """Address of the server that a `Go` has named latest; empty: that of the transport's address."""
+        self._tried = self._redirects = 0
         self.code = ""
         """The code of the world if it is a private one."""
         self.seats: tuple[str, ...] = ()
@@ -65,8 +72,8 @@ class Travel:
         name = self.path.partition("?")[0].strip("/")
         return "" if name in LOBBIES else name
 
-    def go(self, go: Go, now: float, *, lobby: bool) -> Matched | Moved:
-        """Takes the path of another world. Returns the event for the program.
+    def go(self, go: Go, now: float, *, lobby: bool) -> Matched | Moved | None:
+        """Takes the path of another world. Returns the event for the program; None: it leads to another lobby.
 
         Args:
             go: the server's message.
@@ -89,11 +96,34 @@ class Travel:
         else:
             self._lobby, self._failed = "", 0
         server, self.path = fields.split_place(go.path)
-        self.server, self.edges = server or self.server, []
+        self.server = self._sent_to = server or self.server
+        if not lobby:
+            self.edges = []
         self.code, self.seats = go.code, tuple(go.seats)
         self.sent = self.leaving = self._arriving = True
         self._wait_s = 0.0
+        if lobby and not self.world and self.path != "/" and not self.path.startswith("/?"):
+            return None
         return Matched(self.world, self.code, self.seats) if lobby else Moved(self.world, go.reason)
+
+    def here(self, go: Go) -> bool:
+        """Returns whether a message names the world that the client is in, maybe at another server."""
+        return fields.split_place(go.path)[1].partition("?")[0] == self.path.partition("?")[0]
+
+    def redirect(self, go: Go) -> None:
+        """Takes the present server of a world, on the way back to it after a lost connection.
+
+        Raises:
+            ProtocolError: the client was redirected too often.
+        """
+        self._redirects += 1
+        if self._redirects > REDIRECTS_MAX:
+            raise ProtocolError(f"Go.path = {go.path!r}: redirected {self._redirects} times without play")
+        server, self.path = fields.split_place(go.path)
+        self.path = without_seat(self.path)
+        self.server = self._sent_to = server or self.server
+        self.leaving = True
+        self._wait_s = 0.0 if self._redirects <= 2 else min(AGAIN_S * self._redirects, LOOP_S_MAX)
 
     def left(self) -> float:
         """Notes that the old connection has ended. Returns the wait before the next one, in seconds."""
@@ -130,17 +160,18 @@ class Travel:
 
     def plays(self, now: float) -> None:
         """Notes that play has begun."""
-        self._playing_since, self._tried = now, 0
+        self._playing_since, self._tried, self._redirects = now, 0, 0
 
     def elsewhere(self, spread: int) -> bool:
         """Chooses the server of the next connection after a lost one. Returns whether there is another one.
 
-        These are the other servers of the world in turn, and then the one that the program has named.
+        These are the other servers of the world in turn, or the one to which the client was sent, and then the one that
+        the program has named.
 
         Args:
             spread: any whole number. Clients with different numbers begin with different servers.
         """
-        edges = self.edges
+        edges = self.edges or ([self._sent_to] if self._sent_to else [])
         if not edges:
             return False
         at = self._tried % (len(edges) + 1)

@@ -68,10 +68,13 @@ function connect() { // to a path of the server, or to the address of another on
   socket.on("error", error => console.error(error.message)); // "close" follows
 }
 
+const name = place => place.split("?")[0].replace(/^\w+:\/\/[^/]*/, ""); // of a path, or of an address with a path
+
 function go(to, code, seats, reason) {
   console.error(`goes to ${to.split("?")[0]}: ${reason}`);
-  if (!joined) lobby = path; // it asks there again if the world does not take it
-  [path, resume, going] = [to, NOTHING, true];
+  const same = !joined && resume.length && name(to) === name(path); // its world is at another server by now
+  if (!joined && !same) lobby = path; // it asks there again if the world does not take it
+  [path, resume, going] = [to, same ? resume : NOTHING, true];
   socket.close(1000);
 }
 
@@ -82,6 +85,7 @@ function closed() {
   if (leaving) process.exit(0);
   if (going ? ++hops > HOPS : ++tries > TRIES || wait < 0 || (!resume.length && path === lobby)) process.exit(1);
   if (!going && !resume.length) path = lobby;
+  if (!going && resume.length) path = tries % 2 ? path : name(path); // its server may be gone: the first one knows
   setTimeout(connect, going ? 0 : 1000 * (wait + 0.25 * 2 ** tries));
 }
 

@@ -12,6 +12,7 @@ from server.worlds.api import RulesWorlds
 from server.worlds.host import Host
 from server.worlds.hosted import HostedWorld
 from server.worlds.kinds import Kind, WorldsError, checked_name, checked_properties
+from server.worlds.remote import RemoteWorld
 from server.worlds.seats import Seats
 from shared import messages
 from shared.messages import Go
@@ -79,7 +80,8 @@ class Directory:
         *,
         private: bool = False,
         name: str = "",
-    ) -> HostedWorld:
+        stays: bool = False,
+    ) -> HostedWorld | RemoteWorld:
         """Makes a world.
 
         Args:
@@ -87,6 +89,7 @@ class Directory:
             properties: its properties.
             private: whether only those with its code or a seat may join.
             name: its name; empty: the next one of the kind.
+            stays: whether it never ends because it is empty.
 
         Raises:
             WorldsError: the world cannot be made; the text says why.
@@ -99,10 +102,8 @@ class Directory:
             raise WorldsError(f"there are too many worlds now (limits: {most} of the kind {found.name})")
         if name and (checked_name(name, "name") in self.worlds or name in self.asleep):
             raise WorldsError(f"name = {name!r}: there is a world of that name")
-        while not name or name in self.worlds or name in self.asleep:
-            self._numbers[found.name] += 1
-            name = f"{found.name}-{self._numbers[found.name]}"
-        world = self.restore(name, found, checked, self._new_code() if private else "")
+        world = self.restore(name or self._new_name(found), found, checked, self._new_code() if private else "")
+        world.stays = stays
         self.counts["created"] += 1
         return world
 
@@ -186,7 +187,7 @@ class Directory:
             return world
         raise WorldsError(f"there is no world {name[:40]!r}")
 
-    def coded(self, code: str) -> HostedWorld:
+    def coded(self, code: str) -> HostedWorld | RemoteWorld:
         """Returns the private world of a code.
 
         Raises:
@@ -232,8 +233,9 @@ class Directory:
             if world.ticking or world.ending is not None or now - world.used_at >= world.kind.empty_s:
                 self._look_after(world, now)
 
-    def path(self, world: HostedWorld, subject: str, data: Any) -> str:
+    def path(self, world: HostedWorld | RemoteWorld, subject: str, data: Any) -> str:
         """Reserves a seat in a world. Returns the path at which a client takes it."""
+        assert isinstance(world, HostedWorld)
         world.used_at = self.now
         return f"/{world.name}?seat={self.seats.reserve(world.name, subject, data, self.now)}"
 
@@ -262,6 +264,14 @@ class Directory:
             self.rest(world)
         if now - world.used_at >= world.kind.empty_s and not world.stays:
             self.end(world.name, "the world was empty", keep=world.kind.keep)
+
+    def _new_name(self, kind: Kind) -> str:
+        """Returns the next name of a kind."""
+        while True:
+            self._numbers[kind.name] += 1
+            name = f"{kind.name}-{self._numbers[kind.name]}"
+            if name not in self.worlds and name not in self.asleep:
+                return name
 
     def _new_code(self) -> str:
         while True:

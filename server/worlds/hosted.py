@@ -28,6 +28,8 @@ class HostedWorld:
         now: time in seconds.
     """
 
+    url = ""
+    """Address of the world's server; empty: this one."""
     game: Game
     """The game. It is made by `server.worlds.worlds.Host.begin`."""
 

@@ -53,7 +53,9 @@ class Request:
         values = dict(given)
         if len(values) < len(given):
             raise WorldsError("the query has a field twice")
-        self.verb = verb
+        self.verb, self.query = verb, query
+        self.here = values.pop("here", "") != ""
+        """Whether another process of the fleet has sent the client here to be matched."""
         self.kind, self.code = values.pop("kind", ""), values.pop("code", "").upper()
         self.private = values.pop("private", "0") in ("1", "true")
         seats = values.pop("seats", "1")
@@ -176,10 +178,10 @@ class Lobby:
         session.link.send(encode(go))
         self._close(session, 1000, "")
 
-    def refuse(self, session: LobbySession, code: int, reason: str) -> None:
-        """Closes a connection with a code and a reason."""
+    def refuse(self, session: LobbySession, code: int, reason: str, wait: float = -1.0) -> None:
+        """Closes a connection with a code and a reason. The client may come back after `wait` seconds; -1: never."""
         reason = reason.encode(errors="replace").decode()[: fields.REASON_MAX]
-        session.link.send(encode(Bye(code, reason, -1.0)))
+        session.link.send(encode(Bye(code, reason, wait)))
         self._close(session, code, reason)
 
     def shut_down(self, reason: str, wait: float) -> None:

@@ -9,6 +9,7 @@ from server.worlds.hosted import HostedWorld
 from server.worlds.kinds import Kind, WorldsError, matches
 from server.worlds.lobby import Lobby, LobbySession, Request
 from server.worlds.queue import Queue
+from server.worlds.remote import RemoteWorld
 from shared import messages
 from shared.messages import Go
 
@@ -98,32 +99,38 @@ class Matchmaking:
                 queue.drop(session)
                 self._send_on(session, world, "matched")
 
-    def _room(self, kind: Kind, wanted: Mapping[str, Property], seats: int) -> HostedWorld | None:
+    def _rooms(self, kind: Kind) -> list[HostedWorld | RemoteWorld]:
+        """Returns all worlds of a kind."""
+        return [world for world in self._directory.worlds.values() if world.kind is kind]
+
+    def _room_for(self, kind: Kind) -> bool:
+        """Returns whether a world of a kind can be made now."""
+        return not self._directory.draining and self._directory.room_for(kind)
+
+    def _room(self, kind: Kind, wanted: Mapping[str, Property], seats: int) -> HostedWorld | RemoteWorld | None:
         """Returns the public world with the most players that has room and the properties; None: there is none."""
         found = [
             world
-            for world in self._directory.worlds.values()
-            if world.kind is kind
-            and not (world.code or world.locked)
+            for world in self._rooms(kind)
+            if not (world.code or world.locked)
             and world.ending is None
             and matches(world.properties, wanted)
             and world.free >= seats
         ]
         return min(found, key=lambda world: world.free, default=None)
 
-    def _new_room(self, kind: Kind, group: list[LobbySession], now: float) -> HostedWorld | None:
+    def _new_room(self, kind: Kind, group: list[LobbySession], now: float) -> HostedWorld | RemoteWorld | None:
         """Makes a world for a group; None: not now.
 
         Raises:
             WorldsError: it can never be made.
         """
         self._creatable(kind)
-        directory = self._directory
-        if directory.draining or not directory.room_for(kind) or not self._creations.take(now):
+        if not self._room_for(kind) or not self._creations.take(now):
             return None
         first, *others = (session.request.properties for session in group)
         common = {name: value for name, value in first.items() if all(each.get(name) == value for each in others)}
-        return directory.create(kind.name, common)
+        return self._directory.create(kind.name, common)
 
     def _fitting(self, request: Request) -> Kind:
         """Returns the kind that a client asks for. Raises `WorldsError`: there is none, or it has too few seats."""
@@ -138,10 +145,14 @@ class Matchmaking:
             raise WorldsError(f"clients may not make worlds of the kind {kind.name}")
         return kind
 
-    def _send_on(self, session: LobbySession, world: HostedWorld, reason: str) -> None:
+    def _send_on(self, session: LobbySession, world: HostedWorld | RemoteWorld, reason: str) -> None:
         """Reserves the seats of a client and its friends, and sends the client there."""
         assert session.ticket is not None
         own = self._directory.path(world, session.ticket.subject, None)
         friends = [self._directory.path(world, "", None) for _ in range(session.request.seats - 1)]
         self._directory.counts[session.request.verb] += 1
-        self.lobby.send_on(session, Go(own, world.code, friends, reason))
+        self._go(session, Go(world.url + own, world.code, friends, reason))
+
+    def _go(self, session: LobbySession, go: Go) -> None:
+        """Sends a client on."""
+        self.lobby.send_on(session, go)

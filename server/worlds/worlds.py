@@ -49,6 +49,8 @@ class Worlds(Directory):
         run: runs `Rules.load_player` for those who wait for a match.
     """
 
+    matchmaking_of: type[Matchmaking] = Matchmaking
+
     def __init__(
         self,
         kinds: Mapping[str, Kind],
@@ -63,7 +65,7 @@ class Worlds(Directory):
     ) -> None:
         super().__init__(kinds, limits, host, key=key, faults=faults)
         self.default = default
-        self.matchmaking = Matchmaking(self)
+        self.matchmaking = self.matchmaking_of(self)
         self.lobby = self.matchmaking.lobby = Lobby(self.matchmaking, limits, authenticate, self.faults, run)
         self._asked: dict[str, Bucket] = {}
         if default is not None:
@@ -89,7 +91,7 @@ class Worlds(Directory):
             return self.default or NO_DEFAULT
         try:
             if name in VERBS:
-                return _LobbyWay(self.lobby, Request(name, query))
+                return self.lobby_way(Request(name, query))
             world = self.get(name) if name else None
             game = self.default if world is None else world.game
             if game is None:
@@ -101,6 +103,10 @@ class Worlds(Directory):
             return Entrance(game, partial(self._opened, world, seat))
         except WorldsError as error:
             return str(error)
+
+    def lobby_way(self, request: Request) -> Way:
+        """Returns the way into the lobby for a request."""
+        return _LobbyWay(self.lobby, request)
 
     def seat(self, name: str, subject: str, data: Any, reason: str) -> Go:
         """Reserves a seat in a world, or in the default one. Returns the message that sends a client there.
