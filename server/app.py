@@ -126,7 +126,7 @@ def run(settings: Settings) -> int:
         return run_part(settings, scene, rules, world, authenticate)
     with asyncio.Runner(loop_factory=loop_factory()) as runner, contextlib.ExitStack() as stack:
         store = None
-        if settings.data is not None:
+        if settings.data is not None and settings.fleet is None:
             store = stack.enter_context(saved(scene, settings))
             world = store.world
         if settings.record is not None:
@@ -140,7 +140,11 @@ def run(settings: Settings) -> int:
             seed=settings.seed,
             authenticate=authenticate,
         )
-        more = Declared(kinds, terrain, token) if kinds else None
         others = [(kind.name, kind.scene, kind.rules()) for kind in kinds.values()] if settings.play else []
         play = play_pages(settings, [(settings.game or scene.name, scene, rules), *others])
+        more = Declared(kinds, terrain, token) if kinds else None
+        if settings.fleet is not None and more is not None:
+            from server.fleet import run_fleet  # a server alone does not need its libraries
+
+            return runner.run(run_fleet(settings, game, more, play))
         return runner.run(Server(settings, game, store, more, play).serve())

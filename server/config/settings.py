@@ -147,10 +147,13 @@ class Settings:
     bus: str | None = setting(
         None, Option(str, "address of the NATS servers that join the parts: nats://HOST:PORT,...", "URL")
     )
+    fleet: str | None = setting(
+        None, Option(str, "name of the processes on the bus that hold many worlds together", "NAME")
+    )
     world: str = setting("world", Option(str, "name of the world on the bus", "NAME"))
     bus_replicas: int = setting(1, Option(int, "NATS servers that each store the log of the world", "N", 1, 5))
     public_url: str | None = setting(
-        None, Option(str, "address of an edge for clients (default: ws://, its host and port)", "URL")
+        None, Option(str, "address of this server for clients (default: ws://, its host and port)", "URL")
     )
     limits: Limits = field(default_factory=Limits)
     options: Mapping[str, object] = field(default_factory=dict)
@@ -184,7 +187,7 @@ GROUPS = {
     "network": ("host", "port", "tls_cert", "tls_key", "allowed_origins", "allowed_hosts"),
     "access": ("auth", "auth_key_file"),
     "saving": ("data", "durability", "checkpoint_s", "record"),
-    "many processes": ("role", "bus", "world", "bus_replicas", "public_url"),
+    "many processes": ("role", "bus", "fleet", "world", "bus_replicas", "public_url"),
     "operation": ("log_level", "log_format", "figures", "page", "play", "restart_s", "drain_s", "operator_token_file"),
 }
 """Groups of settings as `--help` shows them, the ones for beginners first. Settings in no group are shown as limits."""

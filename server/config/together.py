@@ -1,5 +1,6 @@
 """Checks of settings that depend on each other."""
 
+import re
 from typing import TYPE_CHECKING
 
 from server.config.hosts import ANY, is_loopback
@@ -8,6 +9,11 @@ from shared import kernels
 
 if TYPE_CHECKING:
     from server.config.settings import Settings
+
+FLEET = re.compile("[A-Za-z0-9_-]{1,32}")
+"""Pattern of the name of a fleet."""
+KIND_MAX = 24
+"""Longest name of a kind in a fleet, because the names of its worlds name their process, too."""
 
 
 def check_together(settings: "Settings") -> None:
@@ -51,10 +57,15 @@ def _check_role(settings: "Settings") -> None:
     Raises:
         SettingsError: a combination cannot be used.
     """
+    if settings.role == "server" and settings.fleet is not None:
+        _check_fleet(settings)
+        return
+    if settings.fleet is not None:
+        raise SettingsError(f"fleet (from {settings.origins['fleet']}): is for role server only")
     if settings.role == "server":
         for name, given in (("bus", settings.bus), ("public_url", settings.public_url)):
             if given is not None:
-                raise SettingsError(f"{name} (from {settings.origins[name]}): needs role as well")
+                raise SettingsError(f"{name} (from {settings.origins[name]}): needs role or fleet as well")
         return
     role = f"role = {settings.role!r} (from {settings.origins['role']})"
     if settings.bus is None:
@@ -64,3 +75,23 @@ def _check_role(settings: "Settings") -> None:
     for name in ("data", "reload", "worlds"):
         if getattr(settings, name):
             raise SettingsError(f"{role}: excludes {name}; the world is saved on the bus")
+
+
+def _check_fleet(settings: "Settings") -> None:
+    """Checks the settings of a process of a fleet.
+
+    Raises:
+        SettingsError: a combination cannot be used.
+    """
+    fleet = f"fleet = {settings.fleet!r} (from {settings.origins['fleet']})"
+    if not FLEET.fullmatch(settings.fleet or ""):
+        raise SettingsError(f"{fleet}: must be 1 to 32 letters, digits, - and _")
+    if settings.bus is None:
+        raise SettingsError(f"{fleet}: needs bus as well")
+    if not settings.worlds:
+        raise SettingsError(f"{fleet}: needs kinds of worlds, such as [worlds.arena] in the file of settings")
+    if settings.reload:
+        raise SettingsError(f"{fleet}: excludes reload")
+    for name in settings.worlds:
+        if len(name) > KIND_MAX:
+            raise SettingsError(f"worlds.{name}: in a fleet, the name of a kind has at most {KIND_MAX} characters")

@@ -14,10 +14,13 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from server.players.ticket import Property
+from server.worlds.fleet_entries import FOLDER
 from server.worlds.kinds import WorldsError, checked_name, checked_properties
 
 FORMAT = 1
 """Version of the format of `world.json`."""
+COPIED = ("world.db", "world.db-wal", "world.mark", "world.json")
+"""Files of a world, in the order in which they are copied."""
 ENDED = ".ended-"
 """Beginning of the name of a directory whose world has ended."""
 
@@ -43,14 +46,19 @@ class WorldFiles:
     Args:
         data: the directory of the server's data.
         durable: whether `world.json` survives a power cut.
+        shared: whether other processes use the directory, too.
 
     Raises:
         OSError: the directory cannot be made.
     """
 
-    def __init__(self, data: Path, *, durable: bool) -> None:
+    def __init__(self, data: Path, *, durable: bool, shared: bool = False) -> None:
         self._folder, self._failed, self._durable = data / "worlds", data / "failed-worlds", durable
+        self.folders: dict[str, str] = {}
+        """Names of directories of worlds that are not called like their world."""
         self._folder.mkdir(parents=True, exist_ok=True)
+        if shared:
+            return
         for path in self._folder.iterdir():
             begun = path.is_dir() and not (path / "world.json").exists() and not (path / "world.db").exists()
             if begun or path.name.startswith(ENDED):  # no client has been promised anything of a world that only begun
@@ -58,7 +66,7 @@ class WorldFiles:
 
     def of(self, name: str) -> Path:
         """Returns the directory of a world."""
-        return self._folder / name
+        return self._folder / self.folders.get(name, name)
 
     def write(self, name: str, world: SavedWorld) -> None:
         """Writes `world.json` of a world.
@@ -86,12 +94,68 @@ class WorldFiles:
 
     def remove(self, name: str) -> None:
         """Removes the directory of a world that has ended, if there is one."""
-        ended = self._free(self._folder / f"{ENDED}{name}")
+        self._remove(self.of(name))
+
+    def _remove(self, path: Path) -> None:
+        ended = self._free(self._folder / f"{ENDED}{path.name}")
         try:
-            self.of(name).rename(ended)
+            path.rename(ended)
         except FileNotFoundError:
             return
         shutil.rmtree(ended, ignore_errors=True)
+
+    def read(self, name: str) -> SavedWorld | None:
+        """Returns what `world.json` of a world has; None: there is none.
+
+        Raises:
+            OSError, ValueError: it cannot be read, or is damaged.
+        """
+        path = self.of(name) / "world.json"
+        return _read(path) if path.exists() else None
+
+    def copy(self, folder: str, new: str) -> None:
+        """Copies the directory of a world that another process may have open and cannot change any more.
+
+        Args:
+            folder: name of the directory.
+            new: name of the copy.
+
+        Raises:
+            OSError: it cannot be copied.
+        """
+        target = self._folder / new
+        shutil.rmtree(target, ignore_errors=True)
+        target.mkdir()
+        for name in COPIED:  # the last one makes it a world
+            path = self._folder / folder / name
+            if path.exists() or name == COPIED[-1]:
+                shutil.copyfile(path, target / name)
+                if self._durable:
+                    with (target / name).open("rb") as file:
+                        os.fsync(file.fileno())
+
+    def newest(self) -> dict[str, tuple[str, SavedWorld]]:
+        """Returns the newest directory of each saved world, and what `world.json` has, by name."""
+        found: dict[str, tuple[int, str]] = {}
+        for path in self._folder.iterdir():
+            name, _, number = path.name.partition("@")
+            if FOLDER.fullmatch(path.name) and (path / "world.json").exists():
+                found[name] = max(found.get(name, (-1, "")), (int(number or 0), path.name))
+        worlds = {}
+        for name, (_, folder) in found.items():
+            try:
+                worlds[name] = folder, _read(self._folder / folder / "world.json")
+            except (OSError, ValueError, TypeError) as error:
+                logger.error("the saved world in %s cannot be used: %s", self._folder / folder, error)
+        return worlds
+
+    def remove_former(self, name: str, folder: str) -> None:
+        """Removes the directories of a world that are older than the one it has now."""
+        newest = int(folder.partition("@")[2] or 0)
+        for path in (self._folder / name, *self._folder.glob(f"{name}@*")):
+            number = path.name.partition("@")[2] or "0"
+            if path.name != folder and number.isdecimal() and int(number) < newest and path.exists():
+                self._remove(path)
 
     def set_aside(self, name: str) -> Path:
         """Moves the directory of a world that has failed out of the way. Returns its new place."""

@@ -14,6 +14,7 @@ import logging
 import threading
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
 from zlib import crc32
 
@@ -23,7 +24,7 @@ from server.game.game import SEED_MAX
 from server.game.loading import Runner
 from server.hosting.files import SavedWorld, WorldFiles
 from server.hosting.phases import Phases
-from server.hosting.running import NamedTick, RunningWorld, new_recording
+from server.hosting.running import NamedTick, OwnedTick, RunningWorld, new_recording
 from server.persistence.new_store import NewStore
 from server.persistence.store import Store
 from server.runtime.log import WORLD
@@ -72,7 +73,13 @@ class WorldHost:
         """Worlds by name."""
         self._phases = Phases()
         self._power = settings.durability == "power"
-        self._files = None if settings.data is None else WorldFiles(Path(settings.data), durable=self._power)
+        shared = settings.fleet is not None
+        self.files = (
+            None if settings.data is None else WorldFiles(Path(settings.data), durable=self._power, shared=shared)
+        )
+        """Directories of saved worlds; None: none are saved."""
+        self.owned: Callable[[str], bool] | None = None
+        """Whether this process has a world; None: no other process can take it."""
         self._saved: dict[str, SavedWorld] = {}  # what `world.json` is to have, by name
         self._writing = threading.Lock()  # held while a `world.json` is written or its directory is removed
         self._threads = ThreadPoolExecutor(THREADS, "files")
@@ -123,7 +130,7 @@ class WorldHost:
         failed = name in self._failed
         self._failed.discard(name)
         logger.info("world ended: %s (%s)", name, world.ending)
-        if running.store is None or self._files is None:
+        if running.store is None or self.files is None:
             return
         if keep:
             self._write(world, asleep=True)
@@ -136,7 +143,7 @@ class WorldHost:
 
     def restore(self, kinds: Mapping[str, Kind]) -> None:
         """Begins all saved worlds. Those that cannot be used are logged and left as they are."""
-        for name, saved in () if self._files is None else self._files.saved():
+        for name, saved in () if self.files is None else self.files.saved():
             kind = kinds.get(saved.kind)
             if kind is None:
                 logger.error("the saved world %s is of the kind %s, which is not declared", name, saved.kind)
@@ -159,9 +166,10 @@ class WorldHost:
                 logger.warning(OVERRUN, name, count, longest_ms)
         for name in [name for name, closing in self._closing.items() if closing.done()]:
             del self._closing[name]
-        if self._files is not None:
-            for running in self.running.values():
-                self._write(running.world)
+        if self.files is not None:
+            for name, running in self.running.items():
+                if self.owned is None or self.owned(name):
+                    self._write(running.world)
 
     def trouble(self) -> str:
         """Returns the reason why worlds cannot be saved; empty if they can."""
@@ -195,8 +203,8 @@ class WorldHost:
         settings, kind = self._settings, world.kind
         rules = kind.rules()
         store = None
-        if self._files is not None:
-            store = self._opened(world, self._files, undo)
+        if self.files is not None:
+            store = self._opened(world, self.files, undo)
         game = Game(
             kind.scene,
             limits=settings.limits,
@@ -209,7 +217,7 @@ class WorldHost:
         game.joining.run = self._run
         ticker = Ticker(
             kind.scene.tick_rate,
-            NamedTick(world.name, game),
+            NamedTick(world.name, game) if self.owned is None else OwnedTick(world.name, game, self.owned),
             lambda: self._broken(world),
             lambda ring: best_alarm(self._loop, ring),
             game.faults,
@@ -222,6 +230,8 @@ class WorldHost:
             running.recording = new_recording(Path(folder), world.name)
             game.world.record(running.recording, lambda error: logger.error("a recording has ended: %s", error))
         if store is not None:
+            if self.owned is not None:
+                store.owned = partial(self.owned, world.name)
             store.start(game.keep)
             running.store = store
         return running
@@ -272,28 +282,28 @@ class WorldHost:
 
     def _write_file(self, name: str) -> None:
         """Writes the newest state of a world into its `world.json`, unless it has ended meanwhile."""
-        assert self._files is not None
+        assert self.files is not None
         with self._writing:
             saved = self._saved.get(name)
             if saved is not None:
-                self._files.write(name, saved)
+                self.files.write(name, saved)
 
     def _discard(self, name: str) -> None:
         """Removes the files of a world that could not be made."""
-        assert self._files is not None
+        assert self.files is not None
         self._saved.pop(name, None)
-        self._files.remove(name)
+        self.files.remove(name)
 
     def _close(self, name: str, store: Store, keep: bool, failed: bool) -> None:
         """Closes the files of a world in a thread. Removes them or sets them aside, if they are not kept."""
-        assert self._files is not None
+        assert self.files is not None
         try:
             store.close()
             if failed:
-                logger.error("the data of the world %s are in %s now", name, self._files.set_aside(name))
+                logger.error("the data of the world %s are in %s now", name, self.files.set_aside(name))
             elif not keep:
                 with self._writing:
-                    self._files.remove(name)
+                    self.files.remove(name)
         except Exception:
             logger.exception("closing the files of the world %s", name)
 

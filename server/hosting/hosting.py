@@ -45,6 +45,7 @@ class Hosting:
         token: the token of operators; empty: there is none.
         faults: where exceptions in our own code are reported.
         stop: ends the server, with a reason.
+        host_of, worlds_of: classes of the host and of the worlds.
 
     Raises:
         SettingsError: the directory of the data cannot be used.
@@ -61,15 +62,17 @@ class Hosting:
         token: str,
         faults: FaultReporter,
         stop: Callable[[str], None],
+        host_of: type[WorldHost] = WorldHost,
+        worlds_of: type[Worlds] = Worlds,
     ) -> None:
         self._settings, self._stop, self._faults = settings, stop, faults
         self._loop = asyncio.get_running_loop()
         authenticate = default.joining.authenticate
         try:
-            self.host = WorldHost(settings, terrain, self._loop, tasks.run, authenticate)
+            self.host = host_of(settings, terrain, self._loop, tasks.run, authenticate)
         except OSError as error:
             raise SettingsError(f"data = {settings.data!r}: cannot be used ({error.strerror or error})") from error
-        self.worlds = self.host.worlds = Worlds(
+        self.worlds = self.host.worlds = worlds_of(
             kinds,
             settings.limits,
             self.host,
@@ -84,18 +87,30 @@ class Hosting:
         self._timer: asyncio.TimerHandle | None = None
         self._drained_at: float | None = None
         self._looks = 0
+        self.looked: Callable[[], None] = lambda: None
+        """Called after each look at the worlds."""
 
     def start(self) -> None:
         """Begins the saved worlds and those that the settings name, and looks after all worlds from now on."""
         self.host.restore(self.worlds.kinds)
+        self.begin_named()
+        self.look()
+
+    def begin_named(self) -> None:
+        """Begins the worlds that the settings name."""
         for kind, found in self._settings.worlds.items():
             for number in range(1, found.start + 1):
                 name = kind if number == 1 else f"{kind}-{number}"
                 try:
-                    world = self.worlds.get(name) if self._known(name) else self.worlds.create(kind, name=name)
-                    world.stays = True
+                    if self._known(name):
+                        self.worlds.get(name).stays = True
+                    else:
+                        self.worlds.create(kind, name=name, stays=True)
                 except WorldsError as error:
                     logger.error("%s", error)
+
+    def look(self) -> None:
+        """Looks after all worlds from now on."""
         self._look_after()
 
     def route(self, target: str, address: str) -> Way | Page:
@@ -106,7 +121,7 @@ class Hosting:
             address: address of the client.
         """
         limits = self._settings.limits
-        if self.worlds.draining and name_in(target) in ("match", "create"):
+        if self.worlds.alone and self.worlds.draining and name_in(target) in ("match", "create"):
             retry = str(max(1, round(self._settings.restart_s)))
             return line(HTTPStatus.SERVICE_UNAVAILABLE, STOPPING, retry_after=retry)
         exempt = limits.loopback_exempt and is_loopback(address)
@@ -150,6 +165,7 @@ class Hosting:
         self._timer = self._loop.call_later(LOOK_S, self._look_after)
         try:
             self.worlds.tick(time.monotonic())
+            self.looked()
             self._looks += 1
             if self._looks % FILES_LOOKS == 0:
                 self.host.look_after()

@@ -2,6 +2,7 @@
 
 import contextlib
 import itertools
+from collections.abc import Callable
 from pathlib import Path
 from typing import IO, Any
 
@@ -95,6 +96,24 @@ class NamedTick:
             self._tick(deadline, now)
         finally:
             WORLD.reset(token)
+
+
+class OwnedTick(NamedTick):
+    """The tick of a game that another process may take over. It stands still while this process does not own it.
+
+    Args:
+        name: name of the world.
+        game: the game.
+        owned: returns whether this process owns a world.
+    """
+
+    def __init__(self, name: str, game: Game, owned: Callable[[str], bool]) -> None:
+        super().__init__(name, game)
+        self._owned = owned
+
+    def __call__(self, deadline: float, now: float) -> None:
+        if self._owned(self._name):
+            super().__call__(deadline, now)
 
 
 def new_recording(folder: Path, name: str) -> IO[bytes]:

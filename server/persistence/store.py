@@ -45,6 +45,7 @@ from server.observability.errors import FaultReporter
 from server.observability.histogram import Histogram
 from server.persistence.checkpoint import Checkpoint, Copy, Saved
 from server.persistence.database import Database, Record, StoreError, chained, seal_of
+from server.persistence.owned import Owned
 from server.persistence.restore import Loaded, claimed, load
 from shared.checks import Cell, text
 from shared.inputs import Input
@@ -69,7 +70,7 @@ CLOSE_S = 2.5
 logger = logging.getLogger(__name__)
 
 
-class Store(Observer):
+class Store(Owned, Observer):
     """A directory with a saved world.
 
     Args:
@@ -327,7 +328,8 @@ class Store(Observer):
             there = chain if at <= tick else there
             rows.append(Record(at, record, chain))
         if rows:
-            file.append(rows)
+            with self._owning():
+                file.append(rows)
             self._chain, self._written = chain, rows[-1].tick
             now = time.monotonic()
             for _, record, began in records:
@@ -342,7 +344,8 @@ class Store(Observer):
         """Writes a checkpoint to disk. That ends a gap before it."""
         seal = seal_of(checkpoint, self._rules, chain)
         self._seals[seal] = copy.saved
-        file.save(checkpoint, self._rules, chain, self._game)
+        with self._owning():
+            file.save(checkpoint, self._rules, chain, self._game)
         self._saved, self._seals = copy.saved, {seal: copy.saved}
         self._written = max(self._written, copy.tick)
         self._log_bytes = 0

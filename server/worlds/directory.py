@@ -81,7 +81,7 @@ class Directory:
         private: bool = False,
         name: str = "",
         stays: bool = False,
-    ) -> HostedWorld | RemoteWorld:
+    ) -> HostedWorld:
         """Makes a world.
 
         Args:
@@ -187,7 +187,7 @@ class Directory:
             return world
         raise WorldsError(f"there is no world {name[:40]!r}")
 
-    def coded(self, code: str) -> HostedWorld | RemoteWorld:
+    def coded(self, code: str) -> HostedWorld:
         """Returns the private world of a code.
 
         Raises:

@@ -175,8 +175,8 @@ class Fleet:
                 yield process, seen.entry
 
     def address(self, process: str) -> str:
-        """Returns the address of another process."""
-        return self.processes[process].entry.url
+        """Returns the address of a process."""
+        return self.url if process == self.me else self.processes[process].entry.url
 
     def taken(self, name: str) -> bool:
         """Returns whether a name is in use, as far as this process knows."""
@@ -475,6 +475,8 @@ class Fleet:
         """Begins a world that was taken over, once its entry is written."""
         if mine.running or mine.ended or mine.desired is None or mine.desired != mine.written or not mine.desired.owner:
             return
+        if not self.holds(self.now):  # the process was suspended; `_sweep` begins it, if it is still its world
+            return
         mine.running = True
         if not self._local.begin(name, mine.desired):
             self.counts["worlds_failed"] += 1
@@ -518,6 +520,8 @@ class Fleet:
             for process, (since, revision) in self._spoiled.items():
                 if self.now - since >= LEASE_S:
                     self._ask("delete", self._process_key(process), revision=revision)
+        for name, mine in tuple(self.mine.items()):
+            self._begin(name, mine)
         for name, known in tuple(self.worlds.items()):
             owner = known.entry.owner
             if owner == self.me and name not in self.mine:

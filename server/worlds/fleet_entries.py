@@ -32,7 +32,7 @@ FOLDER = re.compile("[a-z][a-z0-9-]{0,47}(@[0-9]{1,19})?")
 CODE = re.compile("[A-Z0-9]{0,16}")
 """Pattern of the code of a private world."""
 SHORT = re.compile("[A-Za-z0-9_-]{1,32}")
-"""Pattern of the number of a seat."""
+"""Pattern of the number of a seat, and of the secret of a process."""
 
 
 class EntryError(ValueError):
@@ -103,7 +103,7 @@ def process_of(value: bytes) -> ProcessEntry:
     """
     table = _table(value, ProcessEntry._fields)
     entry = ProcessEntry(**table)
-    _check(isinstance(entry.nonce, str) and len(entry.nonce) <= 64, "nonce")
+    _check(_matches(SHORT, entry.nonce), "nonce")
     _check(_count(entry.beat) and _count(entry.load), "beat, load")
     _check(fields.address(entry.url), "url")
     _check(type(entry.draining) is bool, "draining")
@@ -130,7 +130,7 @@ def world_of(value: bytes) -> WorldEntry:
 def _figures(name: str, row: Any) -> Figures:
     _check(_matches(NAME, name) and isinstance(row, list) and len(row) == len(Figures._fields), "worlds")
     figures = Figures(*row)
-    _check(_count(figures.players) and type(figures.free) is int and abs(figures.free) <= COUNT_MAX, "players, free")
+    _check(_count(figures.players) and (_count(figures.free) or _count(-_number(figures.free))), "players, free")
     _check(type(figures.locked) is bool, "locked")
     _check(type(figures.age_s) in (int, float) and 0 <= figures.age_s <= COUNT_MAX, "age_s")
     taken = figures.taken
@@ -167,6 +167,10 @@ def _matches(pattern: re.Pattern[str], value: Any) -> bool:
 
 def _count(value: Any) -> bool:
     return type(value) is int and 0 <= value <= COUNT_MAX
+
+
+def _number(value: Any) -> int:
+    return value if type(value) is int else 1
 
 
 def _check(good: bool, what: str) -> None:

@@ -92,7 +92,7 @@ class FleetMatchmaking(Matchmaking):
         if owner and owner != fleet.me:
             self._go(session, Go(fleet.address(owner) + request.target, "", [], "found"))
             return
-        if not fleet.taken(name) and not fleet.asking(name) and fleet.holds(now):
+        if not fleet.taken(name) and not fleet.asking(name) and fleet.holds(fleet.now):
             coming = request.query.startswith("seat=") and worlds.seats.genuine(name, request.query[5:])
             if now - since >= (SEAT_S if coming else 0.0) and now > since:
                 self._refuse(session, messages.NOT_ADMITTED, f"there is no world {name[:40]!r}")

@@ -38,14 +38,14 @@ class FleetHost(Host, Protocol):
         """Returns the directory with the data of a world that has begun; empty: it is not saved."""
         ...
 
-    def take(self, name: str, folder: str, number: int, done: Callable[[str], None]) -> None:
+    def take(self, name: str, folder: str, number: int, done: Callable[[str | None], None]) -> None:
         """Copies the data of a world whose process is gone, so that nothing that it writes any more counts.
 
         Args:
             name: name of the world.
             folder: the directory; empty: the world is new.
             number: a number that no other copy has.
-            done: called with the name of the new directory; empty: worlds are not saved.
+            done: called with the name of the new directory; empty: worlds are not saved; None: it cannot be made.
         """
 
     def locate(self, name: str, folder: str) -> None:
@@ -65,21 +65,35 @@ class FleetWorlds(Worlds):
     matchmaking: FleetMatchmaking
     matchmaking_of = FleetMatchmaking
 
+    @property
+    def alone(self) -> bool:  # type: ignore[override]
+        """Whether no other process can take the clients of this one."""
+        return not any(not entry.draining for _, entry in self.fleet.others())
+
     def join(
-        self, name: str, url: str, *, key: bytes, wall: Callable[[], float], token: Callable[[], str], host: FleetHost
+        self,
+        name: str,
+        url: str,
+        host: FleetHost,
+        *,
+        key: bytes,
+        clock: Callable[[], float],
+        wall: Callable[[], float],
+        token: Callable[[], str],
     ) -> None:
         """Joins a fleet.
 
         Args:
             name: name of the fleet.
             url: address of this process for clients.
+            host: the host of the worlds.
             key: the key of the seats, which all processes share.
+            clock: returns the time in seconds, of a clock that goes on while the process is suspended.
             wall: returns the time of day in seconds.
             token: returns a new random text of small letters and digits.
-            host: the host of the worlds.
         """
         self.fleet = Fleet(name, url, self, token)
-        self._fleet_host = host
+        self._fleet_host, self._clock = host, clock
         self.seats.use(key)
         self.seats.wall = wall
         self._sent: dict[str, dict[str, float]] = {}
@@ -104,7 +118,13 @@ class FleetWorlds(Worlds):
 
     def take(self, name: str, entry: WorldEntry, revision: int) -> None:
         """Makes the data of a world ready that was given to this process (`Local.take`)."""
-        done = lambda folder: self.fleet.ready(name, folder, revision)  # noqa: E731
+
+        def done(folder: str | None) -> None:
+            if folder is None:
+                self.fleet.release(name, asleep=True)
+            else:
+                self.fleet.ready(name, folder, revision)
+
         if entry.folder and entry.clean:
             done(entry.folder)
         else:
@@ -140,6 +160,10 @@ class FleetWorlds(Worlds):
         self._codes.pop(world.code, None)
         self.seats.ended(name)
 
+    def owns(self, name: str) -> bool:
+        """Returns whether this process may change a world now. May be called from any thread."""
+        return self.fleet.owns(name, self._clock())
+
     def release(self) -> None:
         """Gives all worlds up whose data are saved and closed, because the process ends."""
         for name in tuple(self.fleet.mine):
@@ -147,7 +171,7 @@ class FleetWorlds(Worlds):
 
     # -- the directory -----------------------------------------------------------------------------------------
 
-    def create(
+    def create(  # type: ignore[override]
         self,
         kind: str,
         properties: Mapping[str, object] | None = None,
@@ -164,25 +188,25 @@ class FleetWorlds(Worlds):
         found, checked = self.kind(kind), checked_properties(properties or {})
         if name and self.fleet.taken(checked_name(name, "name")):
             raise WorldsError(f"name = {name!r}: there is a world of that name")
-        target = self.fleet.me if name else self.fleet.place(found.name)
+        target = self.fleet.place(found.name)
         if not target:
             raise WorldsError(
                 STOPPING if self.draining else f"there is no room for a world of the kind {found.name} now"
             )
-        if target != self.fleet.me:
-            return self._create_at(target, found, checked, self._new_code() if private else "")
-        world = super().create(kind, checked, private=private, name=name)
-        assert isinstance(world, HostedWorld)
-        world.stays = stays
+        if name or target != self.fleet.me:  # another process may be making one of this name at this moment
+            code = self._new_code() if private else ""
+            return self._create_at(target, name or self._new_name(found), found, checked, code, stays)
+        world = super().create(kind, checked, private=private, stays=stays)
         folder = self._fleet_host.folder(world.name)
         self.fleet.claim(world.name, WorldEntry("", found.name, checked, world.code, folder, stays=stays))
         return world
 
-    def _create_at(self, process: str, kind: Kind, properties: dict[str, Property], code: str) -> RemoteWorld:
-        world = RemoteWorld(self._new_name(kind), kind, properties, code, self.fleet.address(process), kind.players_max)
-        self.fleet.give(world.name, process, WorldEntry(process, kind.name, properties, code))
-        self.counts["created_elsewhere"] += 1
-        return world
+    def _create_at(
+        self, process: str, name: str, kind: Kind, properties: dict[str, Property], code: str, stays: bool
+    ) -> RemoteWorld:
+        self.fleet.give(name, process, WorldEntry(process, kind.name, properties, code, stays=stays))
+        self.counts["created_elsewhere"] += process != self.fleet.me
+        return RemoteWorld(name, kind, properties, code, self.fleet.address(process), kind.players_max)
 
     def _new_name(self, kind: Kind) -> str:
         while True:  # the identifier of the process makes it the only one
@@ -194,7 +218,7 @@ class FleetWorlds(Worlds):
     def end(self, name: str, reason: str, *, keep: bool = False) -> None:
         """Ends a world of this process. Arguments and errors as for `Directory.end`."""
         world = self.get(name)
-        if not self.fleet.owns(name, self.now):
+        if not self.owns(name):
             raise WorldsError(f"the world {name!r} cannot be ended now: the fleet cannot be reached")
         super().end(name, reason, keep=keep)
         self._codes.pop(world.code, None)
@@ -205,7 +229,7 @@ class FleetWorlds(Worlds):
         """Does nothing: the fleet has the worlds that come back."""
 
     def _look_after(self, world: HostedWorld, now: float) -> None:
-        if self.fleet.owns(world.name, now):
+        if self.owns(world.name):
             super()._look_after(world, now)
 
     def elsewhere(self, name: str) -> RemoteWorld | None:
@@ -233,7 +257,7 @@ class FleetWorlds(Worlds):
                 found.append(world)
         return found
 
-    def coded(self, code: str) -> HostedWorld | RemoteWorld:
+    def coded(self, code: str) -> HostedWorld | RemoteWorld:  # type: ignore[override]
         """Returns the private world of a code, of any process. Raises `WorldsError`: there is none."""
         if code in self._codes:
             return super().coded(code)
@@ -301,7 +325,7 @@ class FleetWorlds(Worlds):
 
     def tick(self, now: float) -> None:
         """Does what is due: call it about ten times per second."""
-        self.fleet.tick(now)
+        self.fleet.tick(self._clock())
         super().tick(now)
         for name in [name for name in self._sent if not self.fleet.taken(name)]:
             del self._sent[name]

@@ -50,6 +50,8 @@ class Worlds(Directory):
     """
 
     matchmaking_of: type[Matchmaking] = Matchmaking
+    alone = True
+    """Whether no other process can take the clients of this one."""
 
     def __init__(
         self,

@@ -166,10 +166,11 @@ class Process:
         self.worlds.join(
             "test",
             self.url,
+            self,
             key=KEY,
+            clock=lambda: sim.now,
             wall=lambda: sim.now,
             token=lambda: "".join(ids.choices("abcdefghijkmnpqrstuvwxyz23456789", k=16)),
-            host=self,
         )
         for key, value in tuple(sim.keys.items()):
             self.worlds.fleet.news(key, value, sim.now)
@@ -202,7 +203,7 @@ class Process:
             for name, folder in late:
                 self._edit(name, folder)
 
-        self.does(write_late) if not late else self.sim.at(self.stopped_until, lambda: self.alive and write_late())
+        self.sim.at(self.stopped_until, lambda: self.does(write_late))
 
     def _tick(self) -> None:
         self.does(self._ticks)
@@ -254,7 +255,7 @@ class Process:
     def folder(self, name: str) -> str:
         return self.folders.get(name, "")
 
-    def take(self, name: str, folder: str, number: int, done: Callable[[str], None]) -> None:
+    def take(self, name: str, folder: str, number: int, done: Callable[[str | None], None]) -> None:
         def copy() -> None:
             new = f"{name}@{number}" if self.sim.saved else ""
             if folder in self.sim.disk:

@@ -88,7 +88,7 @@ def test_a_world_with_data_comes_up_elsewhere_and_one_without_is_forgotten() -> 
     for saved in (False, True):
         sim = fleet(saved=saved)
         visitor = sim.visit("/match?kind=arena")
-        sim.until(lambda visitor=visitor: bool(visitor.world))
+        sim.until(lambda: all(client.world for client in sim.clients))
         name = visitor.world
         (owner,) = sim.owners(name)
         sim.run(2.0)
