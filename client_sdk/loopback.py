@@ -62,7 +62,12 @@ class Hosts(Protocol):
         ...
 
     def route(self, path: str, now: float) -> Any:
-        """Returns what takes a connection to a path, or the reason why nothing does."""
+        """Returns what takes a connection to a path, or the reason why nothing does.
+
+        Args:
+            path: the path; behind the address of a server if the client was sent to another one.
+            now: time in seconds.
+        """
 
     def advance(self, now: float) -> None:
         """Runs the ticks that are due."""
@@ -266,7 +271,7 @@ class _Seat:
         core = self._core
         core.reconnect.trying()
         self._wire = _Wire(core)
-        way = self._hosts.route(core.travel.path, now)
+        way = self._hosts.route(core.travel.server + core.travel.path, now)
         if isinstance(way, str):
             core.port.lost(GONE, way, now)
             return

@@ -73,7 +73,9 @@ class Travel:
         return "" if name in LOBBIES else name
 
     def go(self, go: Go, now: float, *, lobby: bool) -> Matched | Moved | None:
-        """Takes the path of another world. Returns the event for the program; None: it leads to another lobby.
+        """Takes the path of another world. Returns the event for the program.
+
+        The result is None if the path leads to another lobby, or to the server of the world that the client wants.
 
         Args:
             go: the server's message.
@@ -95,14 +97,16 @@ class Travel:
             self._lobby = self._lobby or self.server + self.path
         else:
             self._lobby, self._failed = "", 0
+        same = lobby and self.here(go)
         server, self.path = fields.split_place(go.path)
         self.server = self._sent_to = server or self.server
         if not lobby:
             self.edges = []
-        self.code, self.seats = go.code, tuple(go.seats)
+        if not same:
+            self.code, self.seats = go.code, tuple(go.seats)
         self.sent = self.leaving = self._arriving = True
         self._wait_s = 0.0
-        if lobby and not self.world and self.path != "/" and not self.path.startswith("/?"):
+        if same or (lobby and self.path.partition("?")[0].strip("/") in LOBBIES):
             return None
         return Matched(self.world, self.code, self.seats) if lobby else Moved(self.world, go.reason)
 

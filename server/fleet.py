@@ -19,8 +19,9 @@ from server.play.play import PlayPages
 from server.runtime.event_loop import raise_descriptors
 from server.runtime.tasks import Tasks
 from server.serving import Declared, Server
-from server.worlds.fleet import Failed, Fleet, Result, Value
+from server.worlds.fleet import Fleet
 from server.worlds.fleet_entries import WorldEntry
+from server.worlds.fleet_view import Failed, Result, Value
 from server.worlds.fleet_worlds import FleetWorlds
 from server.worlds.lease import Request
 

@@ -332,18 +332,15 @@ class Store(Owned, Observer):
                 file.append(rows)
             self._chain, self._written = chain, rows[-1].tick
             now = time.monotonic()
-            for _, record, began in records:
-                self._log_bytes += len(record)
-                if began:
-                    self.commit_s.record(now - began)
-        if self._log_bytes > LOG_BYTES_MAX:
-            self._copy_due = True
+            self._log_bytes += sum(len(record) for _, record, _ in records)
+            for began in (began for _, _, began in records if began):
+                self.commit_s.record(now - began)
+        self._copy_due = self._copy_due or self._log_bytes > LOG_BYTES_MAX
         return there
 
     def _save(self, file: Database, copy: Copy, checkpoint: Checkpoint, chain: int) -> None:
         """Writes a checkpoint to disk. That ends a gap before it."""
-        seal = seal_of(checkpoint, self._rules, chain)
-        self._seals[seal] = copy.saved
+        self._seals[seal := seal_of(checkpoint, self._rules, chain)] = copy.saved
         with self._owning():
             file.save(checkpoint, self._rules, chain, self._game)
         self._saved, self._seals = copy.saved, {seal: copy.saved}

@@ -51,8 +51,7 @@ class FleetMatchmaking(Matchmaking):
         """Answers a client, lets it wait, or sends it to the process that matches those of its kind."""
         request = session.request
         if isinstance(request, Wanted):
-            self._finding[session] = now, now
-            self._fleet_worlds.fleet.want(request.name)
+            self._finding[session] = now, -ASK_S
             self._find(session, request, now)
             return
         if request.here or request.verb == "join":
@@ -89,9 +88,12 @@ class FleetMatchmaking(Matchmaking):
             self._go(session, Go(request.target, "", [], "found"))
             return
         owner = fleet.owner(name)
-        if owner and owner != fleet.me:
+        if owner and owner != fleet.me and fleet.fresh(owner):
             self._go(session, Go(fleet.address(owner) + request.target, "", [], "found"))
             return
+        if now - asked >= ASK_S:
+            self._finding[session] = since, now
+            fleet.want(name)
         if not fleet.taken(name) and not fleet.asking(name) and fleet.holds(fleet.now):
             coming = request.query.startswith("seat=") and worlds.seats.genuine(name, request.query[5:])
             if now - since >= (SEAT_S if coming else 0.0) and now > since:
@@ -99,9 +101,6 @@ class FleetMatchmaking(Matchmaking):
                 return
         if now - since >= FIND_S:
             self._refuse(session, messages.GOING_AWAY, f"the world {name[:40]!r} does not come back", AGAIN_S)
-        elif now - asked >= ASK_S:
-            self._finding[session] = since, now
-            fleet.want(name)
 
     def _refuse(self, session: LobbySession, code: int, reason: str, wait: float = -1.0) -> None:
         self._finding.pop(session, None)

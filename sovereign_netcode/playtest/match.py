@@ -52,8 +52,8 @@ class Player:
 
     @property
     def place(self) -> str:
-        """The path of the next connection."""
-        return self.core.travel.path
+        """The path of the next connection, behind the address of its server if the client was sent to another one."""
+        return self.core.travel.server + self.core.travel.path
 
     @property
     def local(self) -> float:

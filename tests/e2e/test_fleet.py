@@ -13,7 +13,11 @@ from client_sdk.transports.listing import list_worlds
 from scripts.scale_lab.cluster import PartProcess
 from scripts.scale_lab.nats_server import NatsServer, binary
 
-pytestmark = [pytest.mark.e2e, pytest.mark.skipif(not binary(), reason="there is no nats-server here")]
+pytestmark = [
+    pytest.mark.e2e,
+    pytest.mark.slow,
+    pytest.mark.skipif(not binary(), reason="there is no nats-server here"),
+]
 PATIENCE_S = 60.0
 SETTINGS = """
 scene = "flat"

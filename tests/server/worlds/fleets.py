@@ -10,8 +10,7 @@ from typing import Any
 
 from server.config.limits import Limits
 from server.game import Game
-from server.players.ticket import Property
-from server.worlds.fleet import Failed, Result, Value
+from server.worlds.fleet_view import Failed, Result, Value
 from server.worlds.fleet_worlds import FleetWorlds
 from server.worlds.hosted import HostedWorld
 from server.worlds.kinds import Kind
@@ -61,7 +60,7 @@ class Sim:
         heappush(self._queue, (when, next(self._order), act))
 
     def run(self, seconds: float) -> None:
-        """Runs, and checks all the time that no world has two owners."""
+        """Runs for that many simulated seconds."""
         until = self.now + seconds
         while self._queue and self._queue[0][0] <= until:
             when, _, act = heappop(self._queue)
@@ -90,7 +89,9 @@ class Sim:
         return [process for process in self.processes if process.alive]
 
     def front(self) -> "Process":
-        return self.chance.choice([process for process in self.alive if not process.worlds.draining])
+        """Returns a process by chance, as a balancer with health checks would."""
+        ready = [process for process in self.alive if self.now >= process.stopped_until and not process.worlds.draining]
+        return self.chance.choice(ready or self.alive)
 
     def at_url(self, url: str) -> "Process | None":
         return next((process for process in self.alive if process.url == url), None)
@@ -412,6 +413,3 @@ class Visitor:
         if not self.resume:
             self.path = self.first
         self.sim.at(self.sim.now + min(0.25 * 2**self.tries, 2.0), self._connect)
-
-
-Properties = dict[str, Property]
