@@ -1,8 +1,8 @@
 """The check of a store whose world another process may take over (`server.worlds.lease`).
 
 Another process copies the files once this one has lost its lease. What was written before that is in the copy, and
-counts. It is checked after each write, too: if the lease is lost by then, the copy may lack it, so it does not count,
-and nobody is told that it is saved.
+counts. It is checked after each write, too: if the lease is lost by then, the copy may lack it, so it does not
+count, and no client gets an answer that promises it.
 """
 
 import contextlib
