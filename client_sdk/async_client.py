@@ -19,7 +19,7 @@ from client_sdk.base import BaseClient, set_link
 from client_sdk.events import Event
 from client_sdk.pending_events import PendingEvents
 from client_sdk.port import READ_BYTES
-from client_sdk.transports.common import CLOSE_S, TIMEOUT_S, UNSENT_MAX, ConnectError
+from client_sdk.transports.common import CLOSE_S, TIMEOUT_S, UNSENT_MAX, ConnectError, timeout_s
 from client_sdk.transports.listing import WorldEntry, list_worlds
 from client_sdk.view import View
 from shared.checks import duration
@@ -260,7 +260,7 @@ class AsyncClient(BaseClient):
         connection = self._connection = Connection(self._connection.address, self.core)
         self._answered, self._gone = self._loop.create_future(), self._loop.create_future()
         try:
-            await self._dial(TIMEOUT_S)
+            await self._dial(timeout_s(self.core.travel, TIMEOUT_S))
         except OSError as error:  # includes ConnectError, SSLError and TimeoutError
             if connection.refused is None:
                 connection.broke(f"no connection ({str(error) or 'no answer in time'})", time.monotonic())
@@ -350,9 +350,10 @@ class AsyncClient(BaseClient):
     def _pump(self, now: float) -> None:
         """Writes what waits, passes events on, and acts on a change of state."""
         connection, core = self._connection, self.core
-        data = connection.data_to_send(now)
-        if self._transport is not None and data:
-            self._transport.write(data)
+        if self._transport is not None:  # while it is dialled, the request of the handshake waits
+            data = connection.data_to_send(now)
+            if data:
+                self._transport.write(data)
         for event in core.events():
             self._events.append(event)
             self._arrived.set()

@@ -313,7 +313,7 @@ class Core(Changing):
         self._out.clear()
         self.travel.elsewhere(self.reconnect.spread)
         wait = max(left.wait_s, 0.0)
-        if not self._resume or not self.reconnect.lost(now, wait):
+        if not self._resume or not self.reconnect.lost(now, wait, elsewhere=self.travel.fresh):
             self._end(left)
             return
         self.state = "reconnecting"

@@ -4,6 +4,8 @@ import math
 
 FIRST_S = 0.25
 """Wait before the first attempt, in seconds, unless the server asked for a wait."""
+ELSEWHERE_S = 0.05
+"""Longest wait before an attempt at another server of the same world that was not tried yet, in seconds."""
 LONGEST_S = 4.0
 """Longest wait between two attempts, in seconds."""
 DOUBLINGS = 4
@@ -31,21 +33,25 @@ class Reconnect:
         self._until = math.inf
         self._failed = 0
 
-    def lost(self, now: float, wait_s: float = 0.0) -> bool:
+    def lost(self, now: float, wait_s: float = 0.0, *, elsewhere: bool = False) -> bool:
         """Takes the loss of the connection, or a failed attempt, and plans the next attempt.
 
         Args:
             now: local time in seconds.
             wait_s: time for which the server asked not to connect, in seconds.
+            elsewhere: whether the next attempt leads to a server that was not tried yet, so that it need not wait.
 
         Returns:
             Whether there will be another attempt.
         """
         self._lost_at = min(self._lost_at, now)
         delay = min(FIRST_S * 2 ** min(self._failed, DOUBLINGS), LONGEST_S) if self._failed or not wait_s else 0.0
-        self._failed += 1
+        if elsewhere:
+            wait_s = 0.0
+        else:
+            self._failed += 1
         share = (self.spread * GOLDEN + self._failed * GOLDEN**2) % 1.0
-        due = now + (wait_s + delay) * (1 + share / 4)
+        due = now + (ELSEWHERE_S * share if elsewhere else (wait_s + delay) * (1 + share / 4))
         # Waits that the server asked for do not use up the patience.
         self._until = min(self._until, now + self.patience_s) + wait_s * (1 + share / 4)
         if self.patience_s <= 0 or due > self._until:

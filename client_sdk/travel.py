@@ -49,6 +49,8 @@ class Travel:
         self._sent_to = ""
         """Address of the server that a `Go` has named latest; empty: that of the transport's address."""
         self._tried = self._redirects = 0
+        self.fresh = False
+        """Whether the next connection leads to one of `edges` that was not tried since the client played last."""
         self.code = ""
         """The code of the world if it is a private one."""
         self.seats: tuple[str, ...] = ()
@@ -164,7 +166,7 @@ class Travel:
 
     def plays(self, now: float) -> None:
         """Notes that play has begun."""
-        self._playing_since, self._tried, self._redirects = now, 0, 0
+        self._playing_since, self._tried, self._redirects, self.fresh = now, 0, 0, False
 
     def elsewhere(self, spread: int) -> bool:
         """Chooses the server of the next connection after a lost one. Returns whether there is another one.
@@ -175,6 +177,7 @@ class Travel:
         Args:
             spread: any whole number. Clients with different numbers begin with different servers.
         """
+        self.fresh = self._tried < len(self.edges)
         edges = self.edges or ([self._sent_to] if self._sent_to else [])
         if not edges:
             return False

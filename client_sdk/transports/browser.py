@@ -20,11 +20,12 @@ from client_sdk.port import Port
 from client_sdk.transports.common import (
     ADDRESS_HINT,
     BROKE_OFF,
-    SILENCE_S,
     UNSENT_MAX,
     ConnectError,
     Silence,
     sendable,
+    silence_s,
+    timeout_s,
 )
 from shared.checks import shown
 from shared.messages import TEXT, TOO_SLOW
@@ -133,7 +134,8 @@ class BrowserTransport:
     def _dial(self, now: float) -> None:
         if self._line is not None:
             self._dropped(self._line, CLOSED_BY_US, "")
-        line = _Line(self, self._core, self._clock, now + self._timeout)
+        until = now + timeout_s(self._core.travel, self._timeout)
+        line = _Line(self, self._core, self._clock, until)
         if self._open(line, self._core.travel.server, now):
             self._line = line
 
@@ -161,11 +163,12 @@ class BrowserTransport:
             self._ended(line, BROKE_OFF, f"{line.url}: no answer in time", now)
             return
         line.read(now)
-        silent = line.silence.look(now)
+        limit_s = silence_s(self._core.travel)
+        silent = line.silence.look(now, limit_s)
         if line.port.appetite == 0 or not line.open:
             line.silence.heard()
         elif silent:
-            self._ended(line, BROKE_OFF, f"nothing received for {SILENCE_S:g} s", now)
+            self._ended(line, BROKE_OFF, f"nothing received for {limit_s:g} s", now)
 
     def _change(self, now: float) -> None:
         """Opens a second connection, and makes it the first or closes it, as the core says."""

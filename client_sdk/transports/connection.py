@@ -23,7 +23,7 @@ from websockets.uri import WebSocketURI, parse_uri
 from client_sdk.advice import TLS_ALERT, untrusted
 from client_sdk.core import Core
 from client_sdk.port import Port
-from client_sdk.transports.common import ADDRESS_HINT, CLOSE_S, SILENCE_S, UNSENT_MAX, ConnectError, Silence, sendable
+from client_sdk.transports.common import ADDRESS_HINT, CLOSE_S, UNSENT_MAX, ConnectError, Silence, sendable, silence_s
 from shared.checks import shown
 from shared.fields import MESSAGE_MAX, REASON_MAX
 from shared.messages import TEXT, TOO_SLOW
@@ -117,15 +117,16 @@ class Connection:
         self._check(now)
 
     def look(self, now: float) -> None:
-        """Gives the connection up if the server was silent for more than `SILENCE_S` seconds.
+        """Gives the connection up if the server was silent for too long.
 
         Call it at least once per second, after all bytes that have arrived were passed to `receive`.
         """
-        silent = self._silence.look(now)
+        limit_s = silence_s(self.core.travel)
+        silent = self._silence.look(now, limit_s)
         if self.port.appetite == 0 or not self.opened or self._ending_since is not None:
             self._silence.heard()
         elif silent:
-            self.broke(f"nothing received for {SILENCE_S:g} s", now)
+            self.broke(f"nothing received for {limit_s:g} s", now)
 
     def receive_eof(self, now: float) -> None:
         """Takes the end of the stream: the server has closed it."""

@@ -7,6 +7,7 @@ import socket
 import ssl
 import time
 
+from client_sdk.transports.common import timeout_s
 from client_sdk.transports.connection import Connection, unreachable
 from client_sdk.transports.stream import Places, PollingStream, connected
 
@@ -69,7 +70,8 @@ class PollingTransport:
                 self._second.drop()
 
     def _stream(self, connection: Connection, sock: socket.socket | None, now: float) -> PollingStream:
-        return PollingStream(connection, self._timeout, self._tls, self._places, sock, now)
+        timeout = timeout_s(self._core.travel, self._timeout)
+        return PollingStream(connection, timeout, self._tls, self._places, sock, now)
 
     def _change(self, now: float) -> None:
         """Opens a second connection, and makes it the first or closes it, as the core says."""

@@ -13,9 +13,9 @@ import pytest
 from client_sdk.async_client import AsyncClient
 from client_sdk.bots import Bot, Wander
 from client_sdk.core import Core
-from client_sdk.events import Answered, Event, Joined, Left
-from client_sdk.transports import connection
-from client_sdk.transports.common import ConnectError
+from client_sdk.events import Answered, Event, Joined, Left, Resumed
+from client_sdk.transports import common
+from client_sdk.transports.common import TIMEOUT_S, ConnectError
 from shared import messages
 from tests.client_sdk.servers import accept, real_server, request, scripted_server, silent_server
 from tests.lengths import long
@@ -241,7 +241,7 @@ def test_two_waiting_tasks_both_get_the_end(url: str, run: Run) -> None:
 
 
 def test_a_way_that_has_become_silent_ends(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(connection, "SILENCE_S", 0.3)
+    monkeypatch.setattr(common, "SILENCE_S", 0.3)
 
     async def scene() -> None:
         client = await AsyncClient.connect(address)
@@ -251,3 +251,24 @@ def test_a_way_that_has_become_silent_ends(run: Run, monkeypatch: pytest.MonkeyP
 
     with silent_server() as address:
         run(scene())
+
+
+def test_a_client_whose_dial_takes_longer_than_a_tick_reconnects_at_once(run: Run) -> None:
+    async def scene(url: str) -> None:
+        client = await AsyncClient.connect(url)
+        await first(client, Joined)
+        connect = client._loop.create_connection
+
+        async def slowly(*arguments: Any, **options: Any) -> Any:
+            await asyncio.sleep(0.2)  # the client predicts on meanwhile
+            return await connect(*arguments, **options)
+
+        client._loop.create_connection = slowly  # type: ignore[method-assign]
+        assert client._transport is not None
+        client._transport.abort()
+        resumed = await first(client, Resumed)
+        assert resumed.away_s < TIMEOUT_S, "the first attempt has succeeded"
+        await client.close()
+
+    with real_server("--scene", "flat") as url:
+        run(scene(url))

@@ -10,7 +10,7 @@ import pytest
 from client_sdk.client import Client
 from client_sdk.core import Core
 from client_sdk.events import Answered, Event, Joined, Left
-from client_sdk.transports import connection
+from client_sdk.transports import common
 from client_sdk.transports.common import UNSENT_MAX, ConnectError
 from client_sdk.transports.connection import Connection
 from client_sdk.transports.polling import PollingTransport
@@ -224,7 +224,7 @@ def test_close_waits_no_longer_than_its_timeout() -> None:
 
 
 def test_a_way_that_has_become_silent_ends(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(connection, "SILENCE_S", 0.3)
+    monkeypatch.setattr(common, "SILENCE_S", 0.3)
     with silent_server() as address:
         client = Client.connect(address)
         (left,) = play(client, lambda: client.closed)

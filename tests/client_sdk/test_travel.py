@@ -10,7 +10,9 @@ import pytest
 
 from client_sdk.core import Core
 from client_sdk.events import Answered, Disconnected, Event, Joined, Left, Matched, Moved, SegmentLoaded, Waiting
+from client_sdk.reconnect import ELSEWHERE_S, FIRST_S, Reconnect
 from client_sdk.timing.server_clock import PINGS
+from client_sdk.transports.common import ELSEWHERE_SILENCE_S, ELSEWHERE_TIMEOUT_S, SILENCE_S, silence_s, timeout_s
 from client_sdk.travel import ATTEMPTS_MAX, PLAYED_S, WORLDS_MAX, Travel, without_seat
 from client_sdk.view import NOTHING
 from shared import messages
@@ -531,3 +533,31 @@ def test_a_client_tries_the_other_servers_of_its_world_in_turn_and_then_the_firs
     travel.plays(0.0)
     travel.elsewhere(4)
     assert travel.server == "ws://b"
+
+
+def test_other_servers_of_the_world_are_tried_at_once_and_each_of_them_once() -> None:
+    travel, reconnect = Travel(), Reconnect(30.0, 3)
+    travel.edges = ["ws://one:1", "ws://two:2"]
+    travel.plays(0.0)
+    assert (silence_s(travel), timeout_s(travel, 5.0)) == (ELSEWHERE_SILENCE_S, 5.0)
+    tried, now = [], 100.0
+    for _ in range(6):
+        travel.elsewhere(3)
+        assert reconnect.lost(now, elsewhere=travel.fresh)
+        tried.append((travel.server, reconnect.retry_at - now <= ELSEWHERE_S, timeout_s(travel, 5.0)))
+        now = reconnect.retry_at
+    fast = [("ws://two:2", True, ELSEWHERE_TIMEOUT_S), ("ws://one:1", True, ELSEWHERE_TIMEOUT_S)]
+    slow = [("", False, 5.0), ("ws://two:2", False, 5.0), ("ws://one:1", False, 5.0), ("", False, 5.0)]
+    assert tried == fast + slow
+    travel.plays(now)
+    reconnect.back()
+    travel.elsewhere(3)
+    assert travel.fresh
+
+
+def test_without_other_servers_a_client_is_as_patient_as_ever() -> None:
+    travel, reconnect = Travel(), Reconnect(30.0)
+    assert not travel.elsewhere(1)
+    assert reconnect.lost(0.0, elsewhere=travel.fresh)
+    assert reconnect.retry_at >= FIRST_S
+    assert (silence_s(travel), timeout_s(travel, 5.0)) == (SILENCE_S, 5.0)

@@ -5,7 +5,7 @@ from collections import Counter
 
 import pytest
 
-from client_sdk.events import Answered, Corrected
+from client_sdk.events import Answered, Corrected, Resumed
 from server.scale.clients import EdgeInputs
 from server.scale.wire import record_of
 from shared.bounds import bounds
@@ -184,4 +184,17 @@ def test_an_input_that_does_not_change_is_known_after_a_takeover(killed_s: float
     match.run(2)
     assert set(causes(player)) <= {"late input"}
     assert match.sequencer.core.world.state(player.core.entity)[MOVE_X] == 127
+    played_right(match)
+
+
+def test_the_clients_of_an_edge_that_is_killed_play_on_within_a_quarter_second() -> None:
+    match = ScaledMatch(load_scene("flat"), 1, edges=3)
+    players = [match.join(slow_walk, PATH) for _ in range(6)]
+    match.run(3)
+    for edge in match.edges[:2]:
+        match.kill(edge)
+        match.run(2)
+    resumed = [event.away_s for player in players for event in player.events if isinstance(event, Resumed)]
+    assert resumed
+    assert max(resumed) < 0.25  # most of it is the new terrain: three round trips of 0.06 s
     played_right(match)
