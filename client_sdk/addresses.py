@@ -8,7 +8,7 @@ from urllib.parse import urlencode, urlsplit
 from shared import fields
 from shared.checks import boolean, shown, text, whole
 
-OWN = ("kind", "seats", "private", "code", "seat")
+OWN = ("kind", "seats", "private", "code", "seat", "here")
 """Names of the query that are no properties."""
 TEXT_MAX, WHOLE_MAX = 64, (1 << 53) - 1
 """Longest name or text of a property, and largest whole number in one."""

@@ -213,7 +213,7 @@ class Core(Changing):
             case messages.Go():
                 self._go(message, now)
             case messages.Edges():
-                self.travel.edges = message.addresses
+                self.travel.edges, self.travel.fronts = message.addresses, self._worlds.filled is None
                 self._game_events.apart = self._game_events.apart or self._worlds.filled is not None
             case messages.HandOver():
                 self._begin_handover(message, now)

@@ -45,7 +45,9 @@ class Travel:
         self.server = ""
         """Address of the server of the next connection; empty: that of the transport's address."""
         self.edges: list[str] = []
-        """Addresses of other servers of the same world."""
+        """Addresses of other servers of the same world, or of servers that know the way to it."""
+        self.fronts = False
+        """Whether they only know the way to it; a lobby has named them."""
         self._sent_to = ""
         """Address of the server that a `Go` has named latest; empty: that of the transport's address."""
         self._tried = self._redirects = 0

@@ -62,7 +62,7 @@ class Silence:
 
 def silence_s(travel: "Travel") -> float:
     """Returns the time without any bytes after which a connection counts as lost, in seconds."""
-    return ELSEWHERE_SILENCE_S if travel.edges else SILENCE_S
+    return ELSEWHERE_SILENCE_S if travel.edges and not travel.fronts else SILENCE_S
 
 
 def timeout_s(travel: "Travel", longest_s: float) -> float:

@@ -27,11 +27,12 @@ class Wanted(Request):
     Args:
         name: name of the world.
         query: the query of its path.
+        code: its code, if the client has named that.
     """
 
-    def __init__(self, name: str, query: str) -> None:
+    def __init__(self, name: str, query: str, code: str = "") -> None:
         super().__init__("find", "")
-        self.name, self.query = name, query
+        self.name, self.query, self.code = name, query, code
 
     @property
     def target(self) -> str:
@@ -49,7 +50,7 @@ class FleetMatchmaking(Matchmaking):
 
     def ask(self, session: LobbySession, now: float) -> None:
         """Answers a client, lets it wait, or sends it to the process that matches those of its kind."""
-        request = session.request
+        request = self._by_name(session)
         if isinstance(request, Wanted):
             self._finding[session] = now, -ASK_S
             self._find(session, request, now)
@@ -69,6 +70,16 @@ class FleetMatchmaking(Matchmaking):
         query = f"{request.query}&here=1" if request.query else "here=1"
         self._go(session, Go(f"{fleet.address(there)}/{request.verb}?{query}", "", [], "matched at another server"))
 
+    def _by_name(self, session: LobbySession) -> Request:
+        """Returns the request of a client. One by the code of a world that has to come up first is one by its name."""
+        worlds, request = self._fleet_worlds, session.request
+        name = worlds.fleet.coded(request.code) if request.verb == "join" and request.seats == 1 else ""
+        if name and name not in worlds.worlds and worlds.elsewhere(name) is None:
+            assert session.ticket is not None
+            _, token = worlds.seats.reserve_elsewhere(name, session.ticket.subject, None)
+            session.request = Wanted(name, f"seat={token}", request.code)
+        return session.request
+
     def gone(self, session: LobbySession) -> None:
         """Takes a client that waits no longer out of its queue."""
         super().gone(session)
@@ -85,11 +96,11 @@ class FleetMatchmaking(Matchmaking):
         worlds, fleet, name = self._fleet_worlds, self._fleet_worlds.fleet, request.name
         since, asked = self._finding[session]
         if name in worlds.worlds:
-            self._go(session, Go(request.target, "", [], "found"))
+            self._go(session, Go(request.target, request.code, [], "found"))
             return
         owner = fleet.owner(name)
         if owner and owner != fleet.me and fleet.fresh(owner):
-            self._go(session, Go(fleet.address(owner) + request.target, "", [], "found"))
+            self._go(session, Go(fleet.address(owner) + request.target, request.code, [], "found"))
             return
         if now - asked >= ASK_S:
             self._finding[session] = since, now

@@ -215,6 +215,13 @@ class FleetWorlds(Worlds):
             if not self.fleet.taken(name):
                 return name
 
+    def get(self, name: str) -> HostedWorld:
+        """Returns a world of this process. Raises `WorldsError`: it has none of that name."""
+        other = None if name in self.worlds else self.elsewhere(name)
+        if other is not None:
+            raise WorldsError(f"the world {name!r} is at {other.url}; ask there")
+        return super().get(name)
+
     def end(self, name: str, reason: str, *, keep: bool = False) -> None:
         """Ends a world of this process. Arguments and errors as for `Directory.end`."""
         world = self.get(name)

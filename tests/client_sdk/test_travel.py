@@ -13,13 +13,26 @@ from client_sdk.events import Answered, Disconnected, Event, Joined, Left, Match
 from client_sdk.reconnect import ELSEWHERE_S, FIRST_S, Reconnect
 from client_sdk.timing.server_clock import PINGS
 from client_sdk.transports.common import ELSEWHERE_SILENCE_S, ELSEWHERE_TIMEOUT_S, SILENCE_S, silence_s, timeout_s
-from client_sdk.travel import ATTEMPTS_MAX, PLAYED_S, WORLDS_MAX, Travel, without_seat
+from client_sdk.travel import ATTEMPTS_MAX, PLAYED_S, REDIRECTS_MAX, WORLDS_MAX, Travel, without_seat
 from client_sdk.view import NOTHING
 from shared import messages
 from shared.aim import NO_AIM
 from shared.blocks import pack
 from shared.inputs import NEUTRAL, make_input
-from shared.messages import Bye, Go, Hello, Pong, Snapshot, Terrain, Welcome, decode_from_client, encode
+from shared.messages import (
+    Bye,
+    Edges,
+    Go,
+    Hello,
+    Pong,
+    ProtocolError,
+    Snapshot,
+    Terrain,
+    Welcome,
+    decode_from_client,
+    encode,
+)
+from shared.messages import Waiting as WaitingMessage
 from shared.scene import Scene
 from shared.snapshot import VERDICT, encode_part
 from shared.world import World
@@ -561,3 +574,64 @@ def test_without_other_servers_a_client_is_as_patient_as_ever() -> None:
     assert reconnect.lost(0.0, elsewhere=travel.fresh)
     assert reconnect.retry_at >= FIRST_S
     assert (silence_s(travel), timeout_s(travel, 5.0)) == (SILENCE_S, 5.0)
+
+
+FLEET = ["ws://10.0.0.1:8765", "ws://10.0.0.2:8765"]
+
+
+def test_a_lobby_sends_to_another_lobby_and_to_the_same_world_without_an_event() -> None:
+    server = Server()
+    server.send(Edges(FLEET), Go("ws://10.0.0.2:8765/match?kind=arena&here=1", "", [], "matched elsewhere"))
+    assert server.taken() == []
+    server.follow()
+    server.send(Edges(FLEET), GO._replace(path="ws://10.0.0.1:8765/arena-1?seat=abc"))
+    assert server.taken() == [Matched("arena-1", "K7F3QD", ("/arena-1?seat=friend",))]
+    server.follow()
+    server.send(Edges(FLEET), Go("ws://10.0.0.2:8765/arena-1?seat=abc", "", [], "found"))
+    assert server.taken() == [], "it is on its way there already"
+    server.follow()
+    server.welcome()
+    assert [type(event) for event in server.taken()] == [Joined]
+    travel = server.core.travel
+    assert (travel.code, travel.seats, travel.edges) == ("K7F3QD", ("/arena-1?seat=friend",), FLEET)
+    assert silence_s(travel) == SILENCE_S, "they do not have the world, so a change to them is no small thing"
+
+
+def test_a_client_that_reconnects_goes_on_at_the_present_server_of_its_world_with_its_token() -> None:
+    server = Server("/arena-1", patience_s=20.0)
+    server.welcome()
+    server.taken()
+    server.said.clear()
+    server.close(1006, "gone")
+    server.now = server.core.reconnect.retry_at
+    server.dial()
+    server.send(encode(WaitingMessage(msgpack.packb({}))), Go("ws://10.0.0.2:8765/arena-1", "", [], "found"))
+    assert [type(event) for event in server.taken()] == [Disconnected]
+    server.follow()
+    assert server.core.travel.server == "ws://10.0.0.2:8765"
+    assert [hello.resume for hello in server.said if isinstance(hello, Hello)] == [KEY, KEY]
+    server.send(Go("ws://10.0.0.3:8765/else", "", [], "you won"))
+    assert server.taken() == [Moved("else", "you won")], "another world is another world"
+
+
+def test_redirects_wait_and_end() -> None:
+    travel = Travel()
+    travel.path = "/arena-1"
+    waits, go = [], Go("ws://10.0.0.2:8765/arena-1?seat=x", "", [], "found")
+    for _ in range(REDIRECTS_MAX):
+        travel.redirect(go)
+        waits.append(travel.left())
+    with pytest.raises(ProtocolError, match="redirected 65 times"):
+        travel.redirect(go)
+    assert (waits[:3], waits[-1], travel.path) == ([0.0, 0.0, 0.75], 2.0, "/arena-1")
+
+
+def test_a_client_that_was_sent_to_another_server_tries_that_and_the_first_in_turn() -> None:
+    travel = Travel()
+    travel.path = "/arena-1"
+    travel.redirect(Go("ws://10.0.0.2:8765/arena-1", "", [], "found"))
+    tried = []
+    for _ in range(4):
+        assert travel.elsewhere(0)
+        tried.append(travel.server)
+    assert tried == ["ws://10.0.0.2:8765", ""] * 2

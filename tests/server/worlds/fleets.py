@@ -25,9 +25,9 @@ TICK_S = 0.1
 KEY = b"a key of all processes of a fleet"
 
 
-def slow_kind(name: str = "arena", **limits: Any) -> Kind:
+def slow_kind(name: str = "arena", **more: Any) -> Kind:
     """Returns a kind whose worlds tick ten times per second."""
-    return dataclasses.replace(kind(name, **limits), scene=SLOW)
+    return dataclasses.replace(kind(name, **more), scene=SLOW)
 
 
 class Sim:

@@ -1,11 +1,17 @@
 """Tests of many processes with many worlds, in simulated time."""
 
+import base64
+import contextlib
 import random
+from typing import Any
 
 import pytest
 
+from server import Player, Rules
 from server.worlds.fleet_entries import ProcessEntry, WorldEntry, packed
+from server.worlds.kinds import WorldsError
 from server.worlds.lease import HOLD_S, LEASE_S
+from server.worlds.seats import EXPIRED
 from tests.lengths import long
 from tests.server.worlds.fleets import Sim, slow_kind
 
@@ -269,3 +275,132 @@ def test_every_edit_that_was_acknowledged_is_there_once(seed: int) -> None:
             saved = sim.disk[owners[0].folders[name]]
             assert [edit for edit in saved if edit in set(edits)] == edits
             assert len(set(saved)) == len(saved)
+
+
+class Hall(Rules):
+    """A world whose players are sent to a new one each, with data."""
+
+    def on_join(self, player: Player) -> None:
+        self.game.soon(self.send, player)
+
+    def send(self, player: Player) -> None:
+        try:
+            name = self.game.worlds.create("arena")
+            self.game.send_away(player, name, {"gold": 7}, "go")
+        except WorldsError as error:
+            self.game.kick(player, str(error))
+
+
+def test_rules_send_players_to_worlds_of_other_processes_with_data() -> None:
+    sim = Sim(1, slow_kind(players_max=2), slow_kind("hall", rules=Hall))
+    for _ in range(3):
+        sim.start()
+    sim.run(1.0)
+    visitors = [sim.visit("/match?kind=hall") for _ in range(6)]
+    sim.until(lambda: all(visitor.world.startswith("arena") for visitor in visitors))
+    worlds = [world for process in sim.processes for world in process.worlds.worlds.values()]
+    handed = [player.handed for world in worlds for player in world.game.players.values()]
+    assert [data for data in handed if data] == [{"gold": 7}] * 6
+    at = [sum(name.startswith("arena") for name in process.worlds.worlds) for process in sim.processes]
+    assert sum(at) == 6
+    assert max(at) < 6, "not all of them are at one process"
+
+
+def test_data_that_cannot_go_to_another_process_are_an_error_of_the_rules() -> None:
+    sim = fleet()
+    visitor = sim.visit("/create?kind=arena")
+    sim.until(lambda: bool(visitor.world))
+    sim.run(1.0)
+    (owner,) = sim.owners(visitor.world)
+    (front, *_) = [process for process in sim.processes if process is not owner]
+    for data in ("x" * 900, object(), 1 << 70):
+        with pytest.raises(WorldsError, match="data"):
+            front.worlds.seat(visitor.world, "", data, "")
+    with pytest.raises(WorldsError, match=r"is at ws://10\.0\.0\.\d:8765; ask there"):
+        front.worlds.end(visitor.world, "x")
+
+
+def test_a_seat_of_another_process_counts_once_and_for_its_time() -> None:
+    sim = fleet()
+    visitor = sim.visit("/create?kind=arena")
+    sim.until(lambda: bool(visitor.world))
+    sim.run(1.0)
+    (owner,) = sim.owners(visitor.world)
+    (front, *_) = [process for process in sim.processes if process is not owner]
+    seats = owner.worlds.seats
+    go = front.worlds.seat(visitor.world, "ann", {"secret": 1}, "")
+    assert go.path.startswith(owner.url)
+    token = go.path.partition("seat=")[2]
+    assert b"secret" not in base64.urlsafe_b64decode(token.split(".")[1] + "==")
+    assert front.worlds.elsewhere(visitor.world).free == 2, "its own seat counts until it is known"  # type: ignore[union-attr]
+    seat = seats.take(visitor.world, token, sim.now)
+    assert not isinstance(seat, str)
+    assert (seat.subject, seat.data) == ("ann", {"secret": 1})
+    assert seats.take(visitor.world, token, sim.now) is seat
+    sim.run(1.5)
+    assert front.worlds.elsewhere(visitor.world).free == 2  # type: ignore[union-attr]
+    seat.settled = True
+    assert seats.take(visitor.world, token, sim.now) == EXPIRED
+    other = front.worlds.seat(visitor.world, "", None, "").path.partition("seat=")[2]
+    sim.run(40.0)
+    assert seats.take(visitor.world, token, sim.now) == EXPIRED
+    assert seats.take(visitor.world, other, sim.now) == EXPIRED
+    assert isinstance(seats.take(visitor.world, other[:-2] + "AA", sim.now), str)
+
+
+class Pairs(Rules):
+    """Two players who wait play together."""
+
+    @staticmethod
+    def pair(waiting: list[Any]) -> list[Any]:
+        return [waiting[at : at + 2] for at in range(0, len(waiting) - 1, 2)]
+
+
+def test_a_pair_meets_from_two_fronts() -> None:
+    sim = Sim(1, slow_kind("duel", rules=Pairs, players_max=2))
+    for _ in range(3):
+        sim.start()
+    sim.run(1.0)
+    visitors = [sim.visit("/match?kind=duel", front=sim.processes[at]) for at in (0, 2)]
+    sim.until(lambda: all(visitor.world for visitor in visitors))
+    assert len({visitor.world for visitor in visitors}) == 1
+
+
+@pytest.mark.parametrize("by", ["name", "code"])
+def test_a_world_that_sleeps_comes_back_with_its_data_at_any_process(by: str) -> None:
+    sim = Sim(1, slow_kind(empty_s=1.0, keep=True), saved=True)
+    for _ in range(2):
+        sim.start()
+    sim.run(1.0)
+    visitor = sim.visit(f"/create?kind=arena&private={by == 'code':d}")
+    sim.until(lambda: bool(visitor.world))
+    name = visitor.world
+    (owner,) = sim.owners(name)
+    code = owner.worlds.worlds[name].code
+    sim.run(2.0)
+    edits = list(sim.acknowledged[name])
+    visitor.leave()
+    sim.until(lambda: not sim.owners(name), 10.0)
+    owner.kill()
+    sim.run(3.0)
+    again = sim.visit(f"/join?code={code}" if by == "code" else f"/{name}")
+    sim.until(lambda: again.world == name, 5.0)
+    (other,) = sim.owners(name)
+    assert other is not owner
+    assert sim.disk[other.folders[name]][: len(edits)] == edits
+
+
+def test_named_worlds_begin_once_and_never_end() -> None:
+    sim = fleet()
+    for process in sim.processes:
+        with contextlib.suppress(WorldsError):
+            process.worlds.create("arena", name="hall", stays=True)
+    sim.run(2.0)
+    (owner,) = sim.owners("hall")
+    assert sum("hall" in process.worlds.worlds for process in sim.processes) == 1
+    sim.run(20.0)
+    owner.kill()
+    sim.until(lambda: bool(sim.owners("hall")), LEASE_S + 3.0)
+    sim.run(1.0)
+    (other,) = sim.owners("hall")
+    assert other.worlds.worlds["hall"].stays
