@@ -37,7 +37,8 @@ EXPORTS = {
     "traffic": {
         "unmask": "Bq",
         "take_messages": "QDQbqqdBqd",
-        "take_inputs": "QQQQnnn",
+        "take_inputs": "QQQQQnnnn",
+        "confirm_inputs": "Qqnn",
     },
     "delivery": {"write_snapshots": "QDiqqbBQQd"},
     "pacing": {

@@ -31,5 +31,7 @@ SEGMENTS = 64
 """Maximum number of segments of a client view."""
 SLOT = 3
 """Numbers of a slot: the tick of the input (-1: the slot is empty), its first three bytes, its aim's six bytes."""
+UNRECORDED = 3
+"""Numbers of a slot of a tick whose record has not come (at an edge): status and input, as in `SLOT`."""
 FREE, PLAIN, ODD = range(3)
 """States of a row. ODD: the session has something to do that is not done here."""

@@ -37,6 +37,7 @@ from shared.session_rows import (
     STATUSES,
     SUBSTITUTED,
     TICK,
+    UNRECORDED,
     USED,
     WIDTH,
 )
@@ -242,7 +243,17 @@ def matters(floats: Any, reals: int, now: float, window_s: float, span_s: float)
 
 
 @jit
-def take_inputs(numbers: Any, ring: Any, taken: Any, changed: Any, tick: int, repeats: int, slots: int) -> int:
+def take_inputs(
+    numbers: Any,
+    ring: Any,
+    taken: Any,
+    changed: Any,
+    unrecorded: Any,
+    tick: int,
+    repeats: int,
+    slots: int,
+    most: int,
+) -> int:
     """Takes an input of every row for a tick, as `InputQueue.take` does.
 
     Args:
@@ -250,9 +261,11 @@ def take_inputs(numbers: Any, ring: Any, taken: Any, changed: Any, tick: int, re
         taken: the inputs of the tick before, and gets those of this one. Two numbers per row: the first three bytes of
             the input, and the six bytes of its aim.
         changed: gets the rows whose input is not that of the tick before.
+        unrecorded: gets the status and the input at an edge, where a status is filed by `confirm_inputs`.
         tick: the tick.
         repeats: number of missing inputs up to which the latest one is repeated.
         slots: slots of a row.
+        most: slots of a row in `unrecorded`; 0: this is no edge.
 
     Returns:
         The number of rows in `changed`.
@@ -273,13 +286,39 @@ def take_inputs(numbers: Any, ring: Any, taken: Any, changed: Any, tick: int, re
             numbers[base + MISSING] += 1
             numbers[base + SUBSTITUTED] += 1
             status = REPEATED_INPUT if numbers[base + MISSING] <= repeats else NEUTRAL_INPUT
-        kept = numbers[base + N_STATUSES]
-        numbers[base + STATUSES + kept] = status
-        numbers[base + N_STATUSES] = kept + 1
         head = 0 if status == NEUTRAL_INPUT else numbers[base + HELD]
         aim = 0 if status == NEUTRAL_INPUT else numbers[base + HELD_AIM]
+        if most == 0:
+            file_status(numbers, base, status)
+        else:
+            slot = (row * most + tick % most) * UNRECORDED
+            unrecorded[slot], unrecorded[slot + 1], unrecorded[slot + 2] = status, head, aim
         if taken[2 * row] != head or taken[2 * row + 1] != aim:
             taken[2 * row], taken[2 * row + 1] = head, aim
             changed[n] = row
             n += 1
     return n
+
+
+@inlined
+def file_status(numbers: Any, base: int, status: int) -> None:
+    """Adds an input status to those for the next snapshot."""
+    kept = numbers[base + N_STATUSES]
+    if kept < KEPT:  # there are more only if ticks fail before their snapshots are sent
+        numbers[base + STATUSES + kept] = status
+        numbers[base + N_STATUSES] = kept + 1
+
+
+@jit
+def confirm_inputs(numbers: Any, unrecorded: Any, tick: int, most: int) -> None:
+    """Files the statuses of a tick at an edge, whose record has the inputs that `take_inputs` has taken.
+
+    Args:
+        numbers: the rows.
+        unrecorded: statuses and inputs of the ticks whose records have not come.
+        tick: the tick.
+        most: slots of a row in `unrecorded`.
+    """
+    for row in range(len(numbers) // WIDTH):
+        if numbers[row * WIDTH + STATE] != FREE:
+            file_status(numbers, row * WIDTH, unrecorded[(row * most + tick % most) * UNRECORDED])

@@ -12,9 +12,9 @@ from server.replication import flow_control
 from shared.bounds import bounds
 from shared.kernels import Kernel
 from shared.messages import Inputs, Ping, head_of
+from shared.scene import Scene
 from shared.session_rows import ALLOWANCE, FLOATS, PROBE_AT, PROBE_BYTES, RECEIVED_AT, WIDTH
 from shared.traffic import ANSWERED, FRAME_HEAD_BYTES, LEFT
-from shared.world import World
 
 WAITING_MAX = 4096
 """Maximum number of messages that wait for the next tick."""
@@ -30,7 +30,8 @@ class Arrivals:
     """The messages that wait.
 
     Args:
-        world: the world.
+        scene: the scene.
+        newest: returns the latest tick whose inputs were taken.
         rows: the rows of the sessions.
         limits: the limits.
         clocks: the time of the tick, and the allowances of messages.
@@ -41,7 +42,8 @@ class Arrivals:
 
     def __init__(
         self,
-        world: World,
+        scene: Scene,
+        newest: Callable[[], int],
         rows: Rows,
         limits: Limits,
         clocks: Clocks,
@@ -49,8 +51,8 @@ class Arrivals:
         receive: Callable[[Session, bytes, float], None],
         kernel: Kernel,
     ) -> None:
-        scene, rate = world.scene, world.scene.tick_rate
-        self._world, self._rows, self._limits, self._clocks = world, rows, limits, clocks
+        rate = scene.tick_rate
+        self._newest, self._rows, self._limits, self._clocks = newest, rows, limits, clocks
         self._recall, self._receive, self._kernel = recall, receive, kernel
         ahead, most = min(bounds(rate).ahead, rows.slots), limits.input_rows_max
         self._rules = Arguments(kernel, "q", values=(0, ahead, scene.input_row_bytes, most, rows.slots))
@@ -110,7 +112,7 @@ class Arrivals:
         self._arrived = []
         rows, lend = self._rows, partial(lent, self._kernel)
         fates = bytearray(len(data))
-        self._rules.values[0], self._clock.values[0] = self._world.tick, self._clocks.deadline
+        self._rules.values[0], self._clock.values[0] = self._newest(), self._clocks.deadline
         text, lengths = bytearray().join(data), lend(array("q", sizes), "q")
         self._kernel.unmask(lend(text, "B"), lengths)
         self._kernel.take_messages(

@@ -63,6 +63,8 @@ class FastPath:
         connections: ends a connection that fails.
         receive: takes a message of a session that is not on the fast path: session, message, time of arrival.
         kernel: the kernel to use.
+        newest: returns the latest tick whose inputs were taken; None: that of the world.
+        unrecorded: maximum number of ticks that this may be ahead of the world, at an edge; 0: this is none.
     """
 
     def __init__(
@@ -76,13 +78,16 @@ class FastPath:
         connections: Connections,
         receive: Callable[[Session, bytes, float], None],
         kernel: Kernel,
+        newest: Callable[[], int] | None = None,
+        unrecorded: int = 0,
     ) -> None:
         scene, rate = world.scene, world.scene.tick_rate
         self._world, self._log, self._limits, self._counters = world, log, limits, counters
         self._clocks, self._kernel = clocks, kernel
         self._players, self._connections = players, connections
-        self._rows = Rows(scene, kernel)
-        self.arrivals = Arrivals(world, self._rows, limits, clocks, self.recall, receive, kernel)
+        self._newest, self._confirmed = newest or (lambda: world.tick), -1
+        self._rows = Rows(scene, kernel, unrecorded)
+        self.arrivals = Arrivals(scene, self._newest, self._rows, limits, clocks, self.recall, receive, kernel)
         """Messages that wait for the next tick."""
         self._repeats = bounds(rate).repeats
         self._numbers: dict[Cell, int] = {}
@@ -126,11 +131,20 @@ class FastPath:
             rows.ring_lent,
             rows.taken_lent,
             rows.changed_lent,
+            rows.unrecorded_lent,
             tick,
             self._repeats,
             rows.slots,
+            rows.most,
         )
         return rows.taken_by(range(len(rows.sessions)) if everyone else rows.changed[:n].tolist())
+
+    def confirm(self, tick: int) -> None:
+        """Files the statuses of a tick at an edge, whose record has the inputs that were taken for it."""
+        self._confirmed = tick
+        if self._n:
+            rows = self._rows
+            self._kernel.confirm_inputs(rows.numbers_lent, rows.unrecorded_lent, tick, rows.most)
 
     def coming(self, row: int, tick: int) -> Input:
         """Returns the input of a row that would be taken for a tick now, like `InputQueue.coming`."""
@@ -256,7 +270,7 @@ class FastPath:
         if session.plain < max(session.patience, PATIENCE):
             return
         tick = self._world.tick
-        if not fits(session, tick, self._rows.slots):
+        if not fits(session, tick, self._newest(), self._rows.slots):
             session.plain = 0
             return
         if self._n == 0:
@@ -307,7 +321,7 @@ class FastPath:
             return
         if session.framed is not None:
             session.framed.inlet = None
-        for number in self._rows.restore(session, self._world.tick):
+        for number in self._rows.restore(session, self._newest(), self._confirmed):
             self._leave(number)
         soon = self._world.tick - session.enrolled < SOON
         session.patience = min(2 * max(session.patience, PATIENCE), PATIENCE_MAX) if soon else PATIENCE

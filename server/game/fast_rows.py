@@ -13,6 +13,7 @@ from server.replication.flow_control import FlowControl
 from shared.bounds import in_ticks
 from shared.inputs import ROW, Input, row
 from shared.kernels import NUMBA, Kernel
+from shared.messages import IDLE
 from shared.scene import Scene
 from shared.session_rows import (
     ACCEPTED,
@@ -61,6 +62,7 @@ from shared.session_rows import (
     SUBSTITUTED,
     TAKEN_BYTES,
     TICK,
+    UNRECORDED,
     USED,
     WIDTH,
 )
@@ -107,10 +109,11 @@ class Rows:
     Args:
         scene: the scene.
         kernel: the kernel that gets the arrays.
+        unrecorded: maximum number of ticks whose records have not come, at an edge; 0: this is none.
     """
 
-    def __init__(self, scene: Scene, kernel: Kernel) -> None:
-        self._kernel, self._aim = kernel, scene.aim
+    def __init__(self, scene: Scene, kernel: Kernel, unrecorded: int = 0) -> None:
+        self._kernel, self._aim, self.most = kernel, scene.aim, unrecorded
         self.slots = in_ticks(WAITING_S, scene.tick_rate, SLOTS_MIN)
         """Number of slots of a row's ring: for how many ticks ahead a row can have inputs."""
         self.sessions: list[Session | None] = []
@@ -135,6 +138,7 @@ class Rows:
             ("due", 1, "q"),
             ("told", 1, "q"),
             ("changed", 1, "q"),
+            ("unrecorded", self.most * UNRECORDED, "q"),
         ):
             grown = Arguments(self._kernel, kind, n * width, getattr(self, name) if old else ())
             setattr(self, name, grown.values)
@@ -149,6 +153,7 @@ class Rows:
     due: Any
     told: Any
     changed: Any
+    unrecorded: Any
     """Arrays of all rows; each has a form for the kernel (`numbers_lent`)."""
     numbers_lent: Any
     floats_lent: Any
@@ -159,6 +164,7 @@ class Rows:
     due_lent: Any
     told_lent: Any
     changed_lent: Any
+    unrecorded_lent: Any
 
     def write(self, session: Session, segments: list[int]) -> None:
         """Moves the state of a session to a free row.
@@ -202,7 +208,14 @@ class Rows:
         for tick, input_ in queue.waiting.items():
             slot = start + tick % self.slots * SLOT
             self.ring[slot : slot + SLOT] = array("q", (tick, *self._words(row(input_, aim=self._aim))))
-        self.taken[2 * at] = -1  # no input, so that the first one counts as changed
+        if queue.sent is None:
+            self.taken[2 * at] = -1  # no input, so that the first one counts as changed
+        else:
+            self.taken[2 * at], self.taken[2 * at + 1] = self._words(row(queue.sent, aim=self._aim))
+        for tick, (status, input_) in (queue.unrecorded or {}).items():
+            slot = (at * self.most + tick % self.most) * UNRECORDED
+            words = self._words(row(input_, aim=self._aim))
+            self.unrecorded[slot : slot + UNRECORDED] = array("q", (status, *words))
         assert session.player is not None
         session.row = session.player.row = at
         self.outlets[at] = session.link.send if session.framed is None else session.framed.outlet()
@@ -213,12 +226,13 @@ class Rows:
         self.floats[base + LEAST_RTT] = flow.least_rtt_s
         self.floats[base + RTT_AT], self.floats[base + RTT] = flow.rtts[-1] if flow.rtts else (-math.inf, math.inf)
 
-    def restore(self, session: Session, tick: int) -> list[int]:
+    def restore(self, session: Session, tick: int, confirmed: int) -> list[int]:
         """Moves the state of a session back, and frees its row. Returns the numbers of its segments.
 
         Args:
             session: the session.
             tick: the latest tick whose inputs were taken.
+            confirmed: the latest tick whose record has come, at an edge.
         """
         at, session.row = session.row, -1
         assert session.player is not None
@@ -239,6 +253,8 @@ class Rows:
             slot = (at * self.slots + due % self.slots) * SLOT
             if self.ring[slot] == due:
                 queue.waiting[due] = self.input_of(self.ring[slot + 1], self.ring[slot + 2])
+        if self.most:
+            self._restore_unrecorded(at, queue, range(confirmed + 1, tick + 1))
         stream.tick = stream.view.tick = values[TICK]
         stream.acked, stream.snapshot_bytes = values[ACKED], values[SNAPSHOT_BYTES]
         if values[PROBE_TICK] >= 0:
@@ -254,6 +270,22 @@ class Rows:
         flow.rates = list(zip(reals[RATE_AT : RATE_AT + n], reals[RATE : RATE + n], strict=True))
         segments: list[int] = self.views[at * SEGMENTS : at * SEGMENTS + values[N_SEGMENTS]].tolist()
         return segments
+
+    def _restore_unrecorded(self, at: int, queue: InputQueue, ticks: range) -> None:
+        """Moves back what an input queue has at an edge alone.
+
+        Args:
+            at: the row.
+            queue: the input queue.
+            ticks: the ticks whose inputs were taken and whose records have not come.
+        """
+        sent = self.taken[2 * at]
+        queue.sent = self.input_of(sent, self.taken[2 * at + 1]) if sent >= 0 else None
+        queue.unrecorded = {}
+        for tick in ticks:
+            slot = (at * self.most + tick % self.most) * UNRECORDED
+            status, head, aim = self.unrecorded[slot : slot + UNRECORDED].tolist()
+            queue.unrecorded[tick] = status, self.input_of(head, aim)
 
     def count(self, at: int, queue: InputQueue) -> None:
         """Adds the counts of a row since it was written, or since the latest call, to an input queue."""
@@ -302,24 +334,26 @@ def _refuse(message: bytes) -> None:
     raise AssertionError("a free row sends nothing")
 
 
-def fits(session: Session, tick: int, slots: int) -> bool:
+def fits(session: Session, tick: int, newest: int, slots: int) -> bool:
     """Returns whether a row can hold the state of a session that was just sent the snapshot of a tick.
 
     Args:
         session: the session.
         tick: the tick.
+        newest: the latest tick whose inputs were taken.
         slots: slots of a row.
     """
     queue, stream, player = session.inputs, session.stream, session.player
     view, segments = stream.view, stream.view.plain
     return (
         player is not None
-        and type(queue) is InputQueue
+        and player.session is session
+        and (type(queue) is InputQueue or _is_plain_at_edge(session, queue, range(tick + 1, newest + 1)))
         and queue.override is None
         and not session.closed
         and session.greeting is None
-        and 0 <= queue.first <= tick
-        and queue.accepted <= tick + slots
+        and 0 <= queue.first <= newest
+        and queue.accepted <= newest + slots
         and len(queue.margins) <= KEPT // 2
         and len(queue.statuses) <= 1
         and stream.acked >= 0
@@ -332,3 +366,17 @@ def fits(session: Session, tick: int, slots: int) -> bool:
         and not (stream.terrain_now or stream.terrain_due or stream.shared_due or stream.private_due)
         and not (player.verdicts or player.outbox.due)
     )
+
+
+def _is_plain_at_edge(session: Session, queue: InputQueue, ticks: range) -> bool:
+    """Returns whether a row can hold what the input queue of a session has at an edge.
+
+    Args:
+        session: the session.
+        queue: its input queue.
+        ticks: the ticks whose inputs were taken and whose records have not come.
+    """
+    waits = queue.unrecorded
+    if waits is None or session.beside or len(waits) != len(ticks):
+        return False
+    return all(tick in waits and waits[tick][0] != IDLE for tick in ticks)

@@ -37,6 +37,11 @@ class InputQueue:
         row_bytes: length of one input in a message, `Scene.input_row_bytes`.
     """
 
+    unrecorded: dict[int, tuple[int, Input]] | None = None
+    """At an edge: statuses and inputs of the ticks whose records have not come, by tick."""
+    sent: Input | None = None
+    """At an edge: the input in the latest batch that had one."""
+
     def __init__(self, bounds: Bounds = DEFAULT, row_bytes: int = INPUT_ROW_BYTES) -> None:
         self._bounds, self._row_bytes = bounds, row_bytes
         self._margin_one = bounds.margin_one

@@ -29,19 +29,16 @@ class EdgeInputs(InputQueue):
         self.held, self._idle = held, REPEATED if resumed else IDLE
         if resumed:
             self.statuses.append(REPEATED)  # for the tick of the seat
-        self._taken: dict[int, tuple[int, Input]] = {}
-        """Statuses and inputs of the ticks whose records have not come, by tick."""
+        self.unrecorded: dict[int, tuple[int, Input]] = {}
         self.in_time = 0
         """Number of ticks in a row whose own inputs were in time, up to the newest tick."""
         self.switching = False
         """Whether the change of the player to this edge was asked for."""
-        self.sent: Input | None = None
-        """The input in the latest batch that had one."""
 
     def take(self, tick: int) -> Input:
         input_ = super().take(tick)
         status = self.statuses.pop()
-        self._taken[tick] = status, input_
+        self.unrecorded[tick] = status, input_
         self.in_time = self.in_time + 1 if status == USED else 0
         return input_
 
@@ -51,15 +48,15 @@ class EdgeInputs(InputQueue):
         Those in batches whose records have not come yet are used all the same. To the client, their ticks are ticks
         without its own input.
         """
-        for tick in [tick for tick, (status, _) in self._taken.items() if tick >= at and status == USED]:
-            self._taken[tick] = REPEATED, self._taken[tick][1]
+        for tick in [tick for tick, (status, _) in self.unrecorded.items() if tick >= at and status == USED]:
+            self.unrecorded[tick] = REPEATED, self.unrecorded[tick][1]
             self.used -= 1
             self.substituted += 1
         super().restart(at)
 
     def skip(self, tick: int) -> None:
         """Drops the status of a tick for which another edge had the input."""
-        self._taken.pop(tick, None)
+        self.unrecorded.pop(tick, None)
 
     def confirm(self, tick: int, missing: int, given: Input | None = None) -> None:
         """Files the status of a tick whose record has come.
@@ -69,7 +66,7 @@ class EdgeInputs(InputQueue):
             missing: ticks from the newest batch in the record to the tick; 0: the input was used.
             given: the input that the sequencer used, if it may be another one; None: it is not.
         """
-        status, input_ = self._taken.pop(tick, (IDLE, NEUTRAL))
+        status, input_ = self.unrecorded.pop(tick, (IDLE, NEUTRAL))
         if status == IDLE:
             status = self._idle
         if (missing or (given is not None and given != input_)) and status != IDLE:

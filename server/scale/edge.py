@@ -21,6 +21,7 @@ from server.game.clocks import Clocks
 from server.game.commands import Commands
 from server.game.connections import Connections
 from server.game.edge import Edge
+from server.game.fast_path import FastPath
 from server.game.front import Front
 from server.game.joining import Joining
 from server.game.roster import Roster, digest_of
@@ -103,6 +104,20 @@ class EdgeServer(Front):
             authenticate,
             rules or Rules(),
         )
+        if world.compiled:
+            self.fast_path = FastPath(
+                world,
+                self.log,
+                self.limits,
+                self.counters,
+                self.clocks,
+                replica.kept.players,
+                self.connections,
+                self.receive,
+                world.kernel,
+                lambda: self.newest,
+                AHEAD_MAX,
+            )
         self._values = SharedValues(world, replica.kept.shared)
         self.commands.newest = world.tick
         self._unrecorded: deque[Batch] = deque()
@@ -147,9 +162,11 @@ class EdgeServer(Front):
         """Takes the inputs and requests for the next tick. Returns the batch; None: the log is too far behind."""
         if self.newest >= self.world.tick + AHEAD_MAX:
             return None
+        if self.fast_path is not None:
+            self.fast_path.arrivals.flush()
         self.clocks.begin(deadline, now)
-        tick = self.newest + 1
-        self.commands.newest = tick
+        self.commands.newest = tick = self.newest + 1
+        changed = {} if self.fast_path is None else self.fast_path.take(tick, everyone=False)
         self._ask_to_join(now)
         inputs: list[int] = []
         requests = self._roster.requests
@@ -160,17 +177,12 @@ class EdgeServer(Front):
             player = session.player
             if player is None or session.closed:
                 continue
-            queue = session.inputs
-            assert isinstance(queue, EdgeInputs)
-            input_ = queue.take(tick)
-            if session.beside and not queue.switching and queue.in_time >= self._in_time:
-                queue.switching = True
-                requests.append([SWITCH, client])
-            beside = session.beside and not queue.switching
-            if input_ != queue.sent and not beside:
-                queue.sent = input_
+            beside, input_ = False, changed.get(player.entity)
+            if session.row < 0:
+                beside, input_ = self._take(session, client, tick)
+            if input_ is not None:
                 inputs += input_record(player.entity, input_, aim=self.scene.aim)
-            if session.stream.acked >= 0 and session not in self._known:
+            if session not in self._known and session.acknowledged:
                 self._known.add(session)
                 requests.append([KNOWS, client])
             while beside and player.commands and player.commands[0].number in player.settled:
@@ -182,6 +194,25 @@ class EdgeServer(Front):
         requests.clear()
         self._unrecorded.append(batch)
         return batch
+
+    def _take(self, session: Session, client: int, tick: int) -> tuple[bool, Input | None]:
+        """Takes the input of a client that is not on the fast path for a tick.
+
+        Returns:
+            Whether another edge has its inputs; its input, if it is not the one that was sent last.
+        """
+        queue = session.inputs
+        assert isinstance(queue, EdgeInputs)
+        input_ = queue.take(tick)
+        if session.beside and not queue.switching and queue.in_time >= self._in_time:
+            queue.switching = True
+            self._roster.requests.append([SWITCH, client])
+        if session.beside and not queue.switching:
+            return True, None
+        if input_ == queue.sent:
+            return False, None
+        queue.sent = input_
+        return False, input_
 
     def unrecorded(self) -> list[Batch]:
         """Returns the oldest batches that are in no record yet, to be sent again."""
@@ -227,11 +258,18 @@ class EdgeServer(Front):
         replica = self.replica
         known = set(self.players) if record.seated else set()
         given = self._given(record)
+        fast_path = self.fast_path
+        if fast_path is not None:
+            fast_path.arrivals.flush()
+            if given or record.journal is None or dict(rows(record.batches, 2)).get(self.name) != record.tick:
+                fast_path.recall_all()  # some of its inputs were not used
         if not replica.take(record):
             return False
         if record.journal is None:
             self._state_all()
             return True
+        if fast_path is not None:
+            fast_path.confirm(record.tick)
         newest = replica.batches.get(self.name, -1)
         if not self._bounds.stands_in(record.tick - newest):
             self._state_all()
@@ -240,7 +278,7 @@ class EdgeServer(Front):
         seated = rows(record.seated, 4)
         switched = {client for edge, client, _, beside in seated if edge == self.name and not beside}
         for session in self._roster.clients:
-            inputs = session.inputs
+            inputs = session.inputs if session.row < 0 else None
             if isinstance(inputs, EdgeInputs) and session.player is not None:
                 session.beside = session.beside and self._roster.clients[session] not in switched
                 if session.beside:
@@ -307,6 +345,7 @@ class EdgeServer(Front):
             if player is None or (beside and edge != self.name):
                 continue
             if edge != self.name:
+                player.recall()
                 player.session = None
                 self._mine.discard(entity)
                 continue
