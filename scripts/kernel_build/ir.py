@@ -27,18 +27,23 @@ FLOATS_USED = "_fltused"
 
 @dataclass(frozen=True)
 class Machine:
-    """The machine that LLVM makes code for; the fields are those of `llvm::TargetMachine`."""
+    """The machine that LLVM makes code for; the fields are those of `llvm::TargetMachine`.
+
+    Attributes:
+        speed: the level of optimisation, from 0 to 3.
+    """
 
     triple: str
     cpu: str
     features: str = ""
     reloc: str = "pic"
+    speed: int = SPEED_LEVEL
 
     def target_machine(self) -> Any:
         """Returns a new target machine of LLVM."""
         target = llvm.Target.from_triple(self.triple)
         return target.create_target_machine(
-            cpu=self.cpu, features=self.features, opt=SPEED_LEVEL, reloc=self.reloc, codemodel="small"
+            cpu=self.cpu, features=self.features, opt=self.speed, reloc=self.reloc, codemodel="small"
         )
 
 
@@ -64,6 +69,7 @@ def numba_sources(root: Path, *, bounds: bool = False) -> list[Source]:
 
     from shared import exports, jit, layout
 
+    _without_machine_code()
     options: dict[str, Any] = {name: value for name, value in jit.OPTIONS.items() if name != "cache"}
     options["boundscheck"] = bounds
     jit.OPTIONS.clear()
@@ -81,6 +87,21 @@ def numba_sources(root: Path, *, bounds: bool = False) -> list[Source]:
             result = jitted.overloads[jitted.signatures[0]]
             made.append(Source(name, result.fndesc.llvm_func_name, result.library.get_llvm_str()))
     return made
+
+
+def _without_machine_code() -> None:
+    """Lets Numba end with the IR, in this process: it makes no machine code, and no functions for Python and C to call.
+
+    Options of Numba could leave out the functions, too, but they would change the symbols, and so the object files.
+    """
+    from numba.core import codegen, lowering
+
+    def nothing(*_: Any) -> None:
+        pass
+
+    codegen.JITCodeLibrary._finalize_specific = nothing  # type: ignore[method-assign]
+    lowering.Lower.create_cpython_wrapper = nothing  # type: ignore[method-assign]
+    lowering.Lower.create_cfunc_wrapper = nothing  # type: ignore[method-assign]
 
 
 def _wrapper(name: str, kinds: str, returns: bool) -> str:
@@ -209,7 +230,7 @@ def linked(
         if not value.is_declaration and value.name not in keep:
             value.linkage = "internal"
     whole.verify()
-    builder = llvm.create_pass_builder(target_machine, llvm.create_pipeline_tuning_options(speed_level=SPEED_LEVEL))
+    builder = llvm.create_pass_builder(target_machine, llvm.create_pipeline_tuning_options(speed_level=machine.speed))
     builder.getModulePassManager().run(whole, builder)
     return whole, target_machine
 
