@@ -131,6 +131,7 @@ def test_a_match_is_as_late_as_the_league_says(preset: str, most: float) -> None
 
 
 @pytest.mark.slow
+@pytest.mark.longest
 @pytest.mark.parametrize("preset", ["typical", "far"])
 def test_least_latency_at_equal_late_share(preset: str) -> None:
     """No rule adds less latency, by more than a tenth of a tick, at our late share, whatever safety it is given."""

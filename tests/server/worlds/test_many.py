@@ -52,7 +52,9 @@ class Visitor:
             assert not self.peer.refused
 
 
-@pytest.mark.parametrize(("clients", "seconds"), [(100, 6), *long((1000, 5))])
+@pytest.mark.parametrize(
+    ("clients", "seconds"), [(100, 6), pytest.param(1000, 5, marks=[pytest.mark.slow, pytest.mark.longest])]
+)
 def test_nobody_is_lost_and_no_seat_is_taken_twice(clients: int, seconds: int) -> None:
     chance = random.Random(7)
     server = Server(kind(players_max=4, empty_s=2), limits=Limits(creations_per_s=1000, joins_per_tick=100))
