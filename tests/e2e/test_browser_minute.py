@@ -27,6 +27,7 @@ pytestmark = [
     pytest.mark.usefixtures("python_for_browsers"),
     pytest.mark.slow,
     pytest.mark.paired,
+    pytest.mark.longest,
     pytest.mark.skipif(BROWSER is None, reason="there is no Chromium on this machine"),
 ]
 
