@@ -93,8 +93,10 @@ class WorldFiles:
                 logger.error("the saved world in %s cannot be used: %s", path, error)
 
     def remove(self, name: str) -> None:
-        """Removes the directory of a world that has ended, if there is one."""
+        """Removes the directory of a world that has ended, if there is one, and former ones."""
         self._remove(self.of(name))
+        if name in self.folders:
+            self.remove_former(name, self.folders.pop(name))
 
     def _remove(self, path: Path) -> None:
         ended = self._free(self._folder / f"{ENDED}{path.name}")

@@ -63,6 +63,15 @@ def test_the_newest_directory_counts_and_only_former_ones_are_removed(tmp_path: 
     assert left == {"arena-1@12", "arena-1@100", "arena-1@200", "arena-10", "else", "no name"}
 
 
+def test_nothing_is_left_of_a_world_that_has_ended(tmp_path: Path) -> None:
+    files = WorldFiles(tmp_path, durable=False, shared=True)
+    for folder in ("arena-1", "arena-1@7", "arena-1@12", "arena-12"):
+        files.write(folder, SAVED)
+    files.folders["arena-1"] = "arena-1@12"
+    files.remove("arena-1")
+    assert [*files.newest()] == ["arena-12"], "otherwise it would come back at the start of the next process"
+
+
 def test_another_process_that_starts_leaves_worlds_that_begin_alone(tmp_path: Path) -> None:
     (tmp_path / "worlds" / "arena-1").mkdir(parents=True)
     WorldFiles(tmp_path, durable=False, shared=True)
