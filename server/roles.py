@@ -188,6 +188,7 @@ async def _run(
                     seed=settings.seed,
                     begins=settings.role == "sequencer",
                     checkpoint_s=settings.checkpoint_s,
+                    takeover_s=settings.takeover_s,
                     **common,
                 )
                 if settings.durability == "power":

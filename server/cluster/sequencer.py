@@ -1,7 +1,7 @@
 """A sequencer or a standby as a part.
 
 Theory of operation. Both follow the log until it is silent. A sequencer may begin the log of a new world; a standby
-waits for one. After `SILENCE_S` without a record, a part asks for the end of the log, and appends the record that
+waits for one. After `takeover_s` without a record, a part asks for the end of the log, and appends the record that
 begins the next epoch. The log accepts it only behind the record that the part has as its newest, so one of several
 parts succeeds, and the others go on following. The part that has succeeded runs the world. If one of its records is
 refused because another sequencer has begun, it ends. While it follows, a part saves a checkpoint from time to time.
@@ -26,7 +26,9 @@ from server.scale.wire import batch_of
 from server.scale.writer import DeposedError, Entry, LogWriter, LostError, id_of
 
 SILENCE_S = 0.25
-"""Seconds without a record after which a part takes over."""
+"""Default of the seconds without a record after which a part takes over."""
+SILENCE_TICKS = 3
+"""Minimum number of ticks without a record after which a part takes over, for worlds with few ticks per second."""
 RETRY_S = 0.05
 """Seconds until records without an answer are sent again."""
 KEPT_S = 30.0
@@ -45,6 +47,7 @@ class SequencerPart(Part):
         seed: seed of the rules' random numbers.
         begins: whether the part begins a new world if the log is empty.
         checkpoint_s: seconds of the world's time between two checkpoints.
+        takeover_s: seconds without a record after which the part takes over; at least `SILENCE_TICKS` ticks.
 
     Attributes:
         core: the sequencer, as soon as the part runs the world; None: it follows.
@@ -63,6 +66,7 @@ class SequencerPart(Part):
         seed: int = 0,
         begins: bool = True,
         checkpoint_s: float = 60.0,
+        takeover_s: float = SILENCE_S,
     ) -> None:
         super().__init__(bus, fresh, name=name, world=world)
         self._rules, self._limits, self._seed, self._begins = rules, limits, seed, begins
@@ -74,6 +78,7 @@ class SequencerPart(Part):
         self.takeover_s = 0.0
         """Seconds from the newest record before this part to its first one."""
         self._checkpoint_ticks = max(1, round(checkpoint_s * self.scene.tick_rate))
+        self._silence_s = max(takeover_s, SILENCE_TICKS / self.scene.tick_rate)
         self._saved_tick = 0
         self._saving: asyncio.Task[None] | None = None
         self._writer: LogWriter | None = None
@@ -135,7 +140,7 @@ class SequencerPart(Part):
     async def _follow(self) -> Entry | None:
         """Takes one record, or takes over if there is none for too long. Returns the record that begins the epoch."""
         following = self.following
-        stored = await following.next(SILENCE_S)
+        stored = await following.next(self._silence_s)
         if stored is not None:
             self._take(stored)
             await asyncio.sleep(0)
@@ -173,7 +178,7 @@ class SequencerPart(Part):
         except BusError:
             self._heard = time.monotonic()  # the bus is silent, which says nothing about the sequencer
             return None
-        if (seq, last) != (following.seq, following.last) or time.monotonic() - self._heard < SILENCE_S:
+        if (seq, last) != (following.seq, following.last) or time.monotonic() - self._heard < self._silence_s:
             return None
         epoch, data = begin_record(following.replica)
         entry = Entry(id_of(epoch, self.world.tick, self.name), last, data)

@@ -152,6 +152,9 @@ class Settings:
     )
     world: str = setting("world", Option(str, "name of the world on the bus", "NAME"))
     bus_replicas: int = setting(1, Option(int, "NATS servers that each store the log of the world", "N", 1, 5))
+    takeover_s: float = setting(
+        0.25, Option(float, "seconds without a record after which a standby takes over", "S", 0.05, 60)
+    )
     public_url: str | None = setting(
         None, Option(str, "address of this server for clients (default: ws://, its host and port)", "URL")
     )
@@ -187,7 +190,7 @@ GROUPS = {
     "network": ("host", "port", "tls_cert", "tls_key", "allowed_origins", "allowed_hosts"),
     "access": ("auth", "auth_key_file"),
     "saving": ("data", "durability", "checkpoint_s", "record"),
-    "many processes": ("role", "bus", "fleet", "world", "bus_replicas", "public_url"),
+    "many processes": ("role", "bus", "fleet", "world", "bus_replicas", "takeover_s", "public_url"),
     "operation": ("log_level", "log_format", "figures", "page", "play", "restart_s", "drain_s", "operator_token_file"),
 }
 """Groups of settings as `--help` shows them, the ones for beginners first. Settings in no group are shown as limits."""

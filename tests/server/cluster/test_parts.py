@@ -12,6 +12,8 @@ from server.cluster.edge import BEHIND
 from server.cluster.identity import IdentityError, identity_of, join_world
 from server.cluster.local_bus import LocalBus, LocalHub
 from server.cluster.part import PartError
+from server.cluster.sequencer import SequencerPart
+from server.journal.recorded_world import RecordedWorld
 from server.scale.wire import record_of
 from server.scale.writer import UNACKNOWLEDGED_MAX, Entry
 from shared.scene import load_scene
@@ -155,3 +157,19 @@ async def _so_far(client: Any) -> Any:
             yield await asyncio.wait_for(anext(client), 0.05)
         except (TimeoutError, StopAsyncIteration):
             return
+
+
+@pytest.mark.parametrize(("scene", "given", "waits"), [("flat", 1.5, 1.5), ("flat", 0.01, 3 / 32)])
+async def test_a_standby_waits_as_long_as_it_is_told_and_for_some_ticks(scene: str, given: float, waits: float) -> None:
+    world = RecordedWorld(load_scene(scene))
+    part = SequencerPart(LocalBus(LocalHub()), world, name="a", takeover_s=given)
+    waited: list[float] = []
+
+    async def silent(wait_s: float) -> None:
+        waited.append(wait_s)
+        raise asyncio.CancelledError
+
+    part.following.next = silent  # type: ignore[method-assign]
+    with pytest.raises(asyncio.CancelledError):
+        await part.run()
+    assert waited == [pytest.approx(waits)]
