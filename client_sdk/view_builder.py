@@ -4,8 +4,10 @@ Other entities are drawn as predicted, too, if their template is shown so (`show
 """
 
 import math
+from bisect import bisect_left, bisect_right
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from operator import itemgetter
+from typing import Any, NamedTuple, cast
 
 from client_sdk.interpolation import Interpolation
 from client_sdk.interpolation.smoothing import Smoothing
@@ -23,8 +25,9 @@ FACINGS_MIN = 64
 
 
 class _Still(NamedTuple):
-    """The part of an entity view that depends on the entity's state alone: the same in all frames of a snapshot."""
+    """The part of an entity view that depends on the entity's state alone, but not on its position."""
 
+    entity: int
     template: str
     velocity: Vec
     fields: Mapping[str, int]
@@ -42,9 +45,12 @@ class ViewBuilder:
         self._smoothing: dict[int, Smoothing] = {}
         self._extras = scene.extras
         self._facings: dict[int, tuple[float, float]] = {}
-        self._states: Any = None  # the states of which `_still` has parts
+        self._states: Any = None  # the latest drawn ones, and what was made of them
         self._rows: list[list[int]] = []
-        self._still: dict[int, _Still] = {}
+        self._own = slice(0)  # the rows of the own entities
+        self._parts: list[_Still | None] = []  # of all other rows; None: it may be drawn as predicted
+        self._seldom: dict[int, _Still] = {}  # parts by row of those that were not drawn as predicted after all
+        self._still: dict[int, tuple[list[int], _Still]] = {}  # the state of each entity of which the part was made
         self._delay = 0.0  # the input delay of the latest view, in ticks
         self._viewed = -math.inf  # the timeline's tick of the latest view
 
@@ -74,32 +80,62 @@ class ViewBuilder:
         # for as many ticks, and is never drawn further back than before.
         self._delay = min(prediction.ahead, self._delay + max(tick - self._viewed, 0.0))
         self._viewed = tick
-        states, places = self.interpolation.sample(server_tick)
-        if len(self._facings) > 2 * len(states) + FACINGS_MIN:
-            there = set(states[:, ID].tolist())
-            self._facings = {entity: facing for entity, facing in self._facings.items() if entity in there}
+        states, places = self.interpolation.drawn(server_tick)
         if states is not self._states:
-            self._states, self._rows, self._still = states, states.tolist(), {}
-        still, attributes, others = self._still, prediction.attributes, []
-        first_own, last_own, predicted = prediction.entity, prediction.last_own, self._predicted
-        new = tuple.__new__  # half the time of a call of the class
-        for state, (x, y, z) in zip(self._rows, places.tolist(), strict=True):
-            entity = state[ID]
-            if first_own <= entity <= last_own:
-                continue
-            if predicted and state[TEMPLATE] in predicted and (ahead := self._ahead(entity, tick, now)) is not None:
-                others.append(ahead)
-                continue
-            part = still.get(entity)
-            if part is None:
-                part = still[entity] = self._part(state)
-            template, velocity, fields, facing = part
-            values = (entity, template, (x, y, z), velocity, attributes.get(entity, NO_VALUES), fields, facing)
-            others.append(new(EntityView, values))
+            self._take(states)
+        del places[self._own]
+        if None in self._parts:
+            others = [self._other(i, place, tick, now) for i, place in enumerate(places)]
+        else:
+            attributes, new = prediction.attributes.get, tuple.__new__  # half the time of a call of the class
+            others = [
+                new(EntityView, (entity, template, (x, y, z), velocity, attributes(entity, NO_VALUES), fields, facing))
+                for (entity, template, velocity, fields, facing), (x, y, z) in zip(
+                    cast("list[_Still]", self._parts), places, strict=True
+                )
+            ]
         if prediction.last_own > prediction.entity:  # what the own entity has spawned: predicted, like itself
             own = (self._ahead(entity, tick, now) for entity in prediction.spawned())
             others = sorted([*others, *(each for each in own if each is not None)], key=lambda each: each.entity)
         return View(tick, self._ahead(prediction.entity, tick, now), others, self.interpolation.shown(server_tick))
+
+    def _take(self, states: Any) -> None:
+        """Takes the states of another snapshot.
+
+        An entity whose state differs in its position only has the same part as before. Of one that may be drawn as
+        predicted, a part is made only if it is not, because that changes its facing.
+        """
+        rows, still, predicted = states.tolist(), self._still, self._predicted
+        first = bisect_left(rows, self._prediction.entity, key=itemgetter(ID))
+        own = slice(first, bisect_right(rows, self._prediction.last_own, key=itemgetter(ID)))
+        del rows[own]
+        if len(self._facings) > 2 * len(states) + FACINGS_MIN:
+            there = set(states[:, ID].tolist())
+            self._facings = {entity: facing for entity, facing in self._facings.items() if entity in there}
+            self._still = still = {entity: kept for entity, kept in still.items() if entity in there}
+        parts: list[_Still | None] = []
+        for state in rows:
+            if state[TEMPLATE] in predicted:
+                still.pop(state[ID], None)
+                parts.append(None)
+                continue
+            kept = still.get(state[ID])
+            if kept is None or kept[0][VX:] != state[VX:] or kept[0][TEMPLATE] != state[TEMPLATE]:
+                kept = still[state[ID]] = state, self._part(state)
+            parts.append(kept[1])
+        self._states, self._rows, self._own, self._parts, self._seldom = states, rows, own, parts, {}
+
+    def _other(self, row: int, place: list[float], tick: float, now: float) -> EntityView:
+        """Returns the view of the entity of a row, as predicted or at `place` (in blocks)."""
+        state, part = self._rows[row], self._parts[row]
+        if part is None:
+            ahead = self._ahead(state[ID], tick, now)
+            if ahead is not None:
+                return ahead
+            part = self._seldom.get(row)
+            if part is None:
+                part = self._seldom[row] = self._part(state)
+        return self._figure_of(part, place)
 
     def _ahead(self, entity: int, tick: float, now: float) -> EntityView | None:
         """Returns a predicted entity to draw, one tick before `tick` and with smoothing; None if it is not predicted.
@@ -120,10 +156,13 @@ class ViewBuilder:
 
     def _figure(self, state: Sequence[int], place: list[float]) -> EntityView:
         """Returns the entity view of a state, drawn at `place` (in blocks)."""
+        return self._figure_of(self._part(state), place)
+
+    def _figure_of(self, part: _Still, place: list[float]) -> EntityView:
+        entity, template, velocity, fields, facing = part
         x, y, z = place
-        template, velocity, fields, facing = self._part(state)
-        attributes = self._prediction.attributes.get(state[ID], NO_VALUES)
-        return EntityView(state[ID], template, (x, y, z), velocity, attributes, fields, facing)
+        attributes = self._prediction.attributes.get(entity, NO_VALUES)
+        return EntityView(entity, template, (x, y, z), velocity, attributes, fields, facing)
 
     def _part(self, state: Sequence[int]) -> _Still:
         """Returns the part of an entity view that depends on the state alone."""
@@ -132,7 +171,7 @@ class ViewBuilder:
         fields: Mapping[str, int] = NO_VALUES
         if self._extras.count:
             fields = self._prediction.predicted.fields_of(state[TEMPLATE], list(state[CELL:]))
-        return _Still(template, velocity, fields, self._facing(state))
+        return _Still(state[ID], template, velocity, fields, self._facing(state))
 
     def _facing(self, state: Sequence[int]) -> tuple[float, float]:
         """Returns the direction in which an entity looks, and keeps it for when it stands still."""

@@ -14,7 +14,6 @@ import math
 from collections import deque
 
 from shared.arrays import PLAIN, Float64s, np
-from shared.between import between
 from shared.layout import ID, VX, Int64s, X
 from shared.units import BLOCK, SPEED
 
@@ -47,6 +46,7 @@ class Interpolation:
         self._states: deque[Entry] = deque(maxlen=max(math.ceil(KEPT_S * rate), KEPT_MIN))
         self.delay_ticks = 2.0
         self._calm_since = self._at = -math.inf
+        self._way: _Way | None = None
 
     def push(self, tick: int, states: Int64s, placed: frozenset[int] = frozenset()) -> None:
         """Adds a snapshot to the history.
@@ -100,8 +100,13 @@ class Interpolation:
 
     def sample(self, server_tick: float) -> tuple[Int64s, Positions]:
         """Returns states ([n, 12]) and positions (blocks, [n, 3]) of all entities at the tick `shown(server_tick)`."""
+        states, places = self.drawn(server_tick)
+        return states, np.array(places, np.float64).reshape(-1, 3)
+
+    def drawn(self, server_tick: float) -> tuple[Int64s, list[list[float]]]:
+        """Returns states and positions like `sample`, the latter as lists."""
         if not self._states:
-            return np.zeros((0, 12), np.int64), np.zeros((0, 3), np.float64)
+            return np.zeros((0, 12), np.int64), []
         at = self.shown(server_tick)
         before = after = self._states[-1]
         for entry in reversed(self._states):
@@ -111,37 +116,53 @@ class Interpolation:
             after = entry
         tick, states, _ = before
         if at > tick and after is not before:
-            return _between(before, after, at)
-        return states, states[:, X : X + 3] / BLOCK + states[:, VX : VX + 3] / SPEED * ((at - tick) / self._rate)
+            if self._way is None or self._way.before is not before or self._way.after is not after:
+                self._way = _Way(before, after)
+            return states, self._way.at((at - tick) / (after[0] - tick))
+        places = states[:, X : X + 3] / BLOCK + states[:, VX : VX + 3] / SPEED * ((at - tick) / self._rate)
+        return states, places.tolist()
 
 
-def _between(before: Entry, after: Entry, at: float) -> tuple[Int64s, Positions]:
-    """Returns states and positions at the tick `at` between two snapshots, of the entities in the earlier one.
+class _Way:
+    """The ways of the entities between two snapshots. Two or more frames are drawn of each.
 
-    An entity that the rules placed or removed meanwhile stays at its earlier position.
+    An entity that the rules placed or removed meanwhile stays at its earlier position. The positions have the floats of
+    `shared.between`.
     """
-    share = (at - before[0]) / (after[0] - before[0])
-    states, new = before[1], after[1]
-    ids, places = states[:, ID], states[:, X : X + 3]
-    if not len(new):
-        return states, places / BLOCK
-    if PLAIN:
-        return states, np.array(_between_lists(states.tolist(), new.tolist(), after[2], share), np.float64)
-    row = np.searchsorted(new[:, ID], ids)
-    row[row == len(new)] = 0
-    return states, between(ids, places, new[row, X : X + 3], new[row, ID] == ids, after[2], share)
+
+    def __init__(self, before: Entry, after: Entry) -> None:
+        self.before, self.after = before, after
+        (_, states, _), (_, new, placed) = before, after
+        if PLAIN:
+            self._lists = _ways(states.tolist(), new.tolist(), placed)
+            return
+        self._start = states[:, X : X + 3] / BLOCK
+        self._span = np.zeros_like(self._start)
+        if len(new):
+            ids = states[:, ID]
+            row = np.searchsorted(new[:, ID], ids)
+            row[row == len(new)] = 0
+            moves = new[row, ID] == ids
+            if placed:
+                moves &= ~np.isin(ids, list(placed))
+            self._span[moves] = new[row[moves], X : X + 3] / BLOCK - self._start[moves]
+
+    def at(self, share: float) -> list[list[float]]:
+        """Returns the positions at a moment, from 0 (the first snapshot) to 1 (the second)."""
+        if PLAIN:
+            return [[x + u * share, y + v * share, z + w * share] for x, y, z, u, v, w in self._lists]
+        places: list[list[float]] = (self._start + self._span * share).tolist()
+        return places
 
 
-def _between_lists(
-    states: list[list[int]], new: list[list[int]], placed: frozenset[int], share: float
-) -> list[list[float]]:
-    """Returns the same as `between`, in plain Python."""
+def _ways(
+    states: list[list[int]], new: list[list[int]], placed: frozenset[int]
+) -> list[tuple[float, float, float, float, float, float]]:
+    """Returns the position and the way of each entity in `states` to its state in `new`, in plain Python."""
     newer = {state[ID]: state for state in new if state[ID] not in placed}
-    places = []
+    ways = []
     for state in states:
-        place = [part / BLOCK for part in state[X : X + 3]]
-        then = newer.get(state[ID])
-        if then is not None:
-            place = [was + (part / BLOCK - was) * share for was, part in zip(place, then[X : X + 3], strict=True)]
-        places.append(place)
-    return places
+        then = newer.get(state[ID], state)
+        x, y, z = state[X] / BLOCK, state[X + 1] / BLOCK, state[X + 2] / BLOCK
+        ways.append((x, y, z, then[X] / BLOCK - x, then[X + 1] / BLOCK - y, then[X + 2] / BLOCK - z))
+    return ways
