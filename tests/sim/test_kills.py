@@ -93,5 +93,5 @@ def test_a_kill_loses_and_doubles_nothing(who: str) -> None:
 @pytest.mark.parametrize("lossy", [False, True], ids=["sent", "lost"])
 @pytest.mark.parametrize("who", PARTS)
 def test_a_kill_at_any_instant_loses_and_doubles_nothing(who: str, lossy: bool) -> None:
-    for tick, offset_ms in instants(who)[lossy::7]:
+    for tick, offset_ms in instants(who)[lossy::12]:
         play(who, tick, offset_ms, lossy=lossy)
