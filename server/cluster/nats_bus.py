@@ -5,7 +5,7 @@ accepts a record only behind the one that its header names (`Nats-Expected-Last-
 accepted to `world.name.told`, which a part subscribes to: a subscription of the stream's own subject would also show
 what was refused. A part finds missing records by their sequence numbers, and fetches them. Batches go over
 `world.name.in` without the stream. Checkpoints are in the object store `CHECKPOINTS_name`; the key `name.checkpoint`
-names the newest. Keys of all worlds are in the bucket `worlds`.
+names the newest, `name.checkpoints` all that were begun since. Keys of all worlds are in the bucket `worlds`.
 """
 
 import asyncio
@@ -255,17 +255,22 @@ class NatsBus:
         former = {"seq": 0} if known is None else json.loads(known.value)
         if former["seq"] >= snapshot.seq:
             return
-        name = f"{snapshot.seq}-{secrets.token_hex(8)}"
+        name, begun = f"{snapshot.seq}-{secrets.token_hex(8)}", f"{self._world}.checkpoints"
+        listed = await self.get(begun)
+        others = [] if listed is None else json.loads(listed.value)  # with those of parts that were killed meanwhile
+        await self.put(begun, json.dumps([*others, name]).encode())
         await self._store.put(name, snapshot.data)
         value = json.dumps({"object": name, "seq": snapshot.seq}).encode()
         try:
             await self.put(key, value, 0 if known is None else known.revision)
         except ConflictError:
-            await self._store.delete(name)
-            return
-        if "object" in former:
+            others = [name]
+        for other in others:
             with contextlib.suppress(NotFoundError):
-                await self._store.delete(former["object"])
+                await self._store.delete(other)
+        if name in others:
+            return
+        await self.put(begun, json.dumps([name]).encode())
         await self._js.purge_stream(self._stream, seq=max(snapshot.seq - keep, 1))
 
     # -- keys --------------------------------------------------------------------------------------------------

@@ -117,6 +117,50 @@ async def test_a_checkpoint_replaces_the_one_before_and_the_log_up_to_it(server:
             await (await bus.follow(9)).take(2.0)
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("step", ["put a key", "put an object", "delete", "purge"])
+@pytest.mark.parametrize("done", [False, True])
+async def test_a_part_that_is_killed_while_it_saves_a_checkpoint(
+    server: NatsServer, monkeypatch: pytest.MonkeyPatch, step: str, done: bool
+) -> None:
+    """A checkpoint and the records after it are there at every time. The next checkpoint removes what is left over."""
+    async with connected(server) as bus, connected(server) as other:
+        writer = LogWriter("a", EMPTY)
+        for tick in range(30):
+            await bus.append(writer.add(1, tick, b""))
+        old, new = Snapshot(8, bytes(300_000)), Snapshot(15, bytes(range(256)) * 2000)
+        await bus.put_checkpoint(old, 2)
+        at, name = {
+            "put an object": (bus._store, "put"),
+            "put a key": (bus, "put"),
+            "delete": (bus._store, "delete"),
+            "purge": (bus._js, "purge_stream"),
+        }[step]
+        plain = getattr(at, name)
+
+        async def killed(*arguments: object, **named: object) -> None:
+            inside = step == "purge" and arguments[0] != bus._stream  # of the removal of an object
+            if done or inside:
+                await plain(*arguments, **named)
+            if not inside:
+                raise asyncio.CancelledError
+
+        with monkeypatch.context() as patch:
+            patch.setattr(at, name, killed)
+            with pytest.raises(asyncio.CancelledError):
+                await bus.put_checkpoint(new, 2)
+        found = await other.checkpoint()
+        assert found == (new if step in ("delete", "purge") else old)
+        reader = await other.follow(found.seq + 1)
+        rest = range(found.seq + 1, 31)
+        assert [each.seq for _ in rest if (each := await reader.take(5.0))] == [*rest]
+        await other.put_checkpoint(Snapshot(25, b"newest"), 2)
+        assert await other.checkpoint() == Snapshot(25, b"newest")
+        state = (await other._js.stream_info(f"OBJ_{other._store._name}", subjects_filter="$O.>")).state
+        chunks = [subject for subject in state.subjects or () if ".C." in subject]
+        assert len(chunks) == 1, "no other checkpoint is left"
+
+
 async def test_keys(server: NatsServer) -> None:
     async with connected(server) as bus, connected(server, "other") as other:
         seen: list[tuple[str, Revised | None]] = []
