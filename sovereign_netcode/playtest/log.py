@@ -122,6 +122,7 @@ class Log:
             if how == "deaf" or lost:
                 return
             error = stores and (how == "full" or (how == "leaky" and self._rng.random() < LEAK))
+            self.failures += error
             said: Answer = BusError("not stored") if error else act()
             if how != "mute" and not (how == "leaky" and self._rng.random() < LEAK):
                 match.bus.send("log", source, lambda: answer(said))
