@@ -7,6 +7,7 @@ import secrets
 import time
 from collections.abc import Mapping
 
+from server.auth.tokens import time_of_day
 from server.cluster.bus import Bus, BusError, ConflictError
 from server.config.options import SettingsError
 from server.config.settings import Settings
@@ -84,7 +85,7 @@ class FleetServer(Server):
         assert settings.fleet is not None
         secure = "" if settings.tls_cert is None else "s"
         url = settings.public_url or f"ws{secure}://{bracketed(reachable(settings.host))}:{self._port}"
-        worlds.join(settings.fleet, url, host, key=self._key, clock=clock, wall=time.time, token=token)
+        worlds.join(settings.fleet, url, host, key=self._key, clock=clock, wall=time_of_day, token=token)
         host.owned = worlds.owns
         self._fleet_worlds = worlds
         for name, value in self._keys.items():

@@ -76,6 +76,11 @@ class Tokens:
         return claims
 
 
+def time_of_day() -> float:
+    """Returns the time of day in seconds, for the expiry of tokens that several processes check."""
+    return time.time()
+
+
 def _time(claims: Mapping[str, Any], name: str) -> float | None:
     """Returns a claim in seconds since 1970; None if the token does not have it.
 
