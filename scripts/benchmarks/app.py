@@ -5,8 +5,8 @@ A figure is the median of repeated runs, with its range. Two busy cores scatter 
 
 `server` searches for the most clients that one server process holds at 30 Hz, all wandering over hills with about 50
 entities in view, and for the most that the same gateway holds without a game. It needs an idle machine, because other
-processes make ticks late. It also prints the CPU time per client and tick, how many times the echo's that is, and the
-number of clients that it allows. A search takes about three minutes.
+processes make ticks late. It also prints the CPU time per client and tick, how many times the echo's with as many
+clients that is, and the number of clients that it allows. A search takes about three minutes.
 `server --crowd` puts 300 players (or N) into one segment instead, where each sees all others. Its fairness is the share
 of snapshots of the worst served player over that of the best served one.
 

@@ -48,6 +48,7 @@ def run(args: argparse.Namespace, console: Console) -> tuple[dict[str, Any], int
         size = int(by["bytes_down_per_client_per_s"] / server.RATE)
         console.print(f"  the same gateway without a game, {size} bytes a tick")
         with server.rig("echo", str(size), seed=number + 1) as running:
+            same = running.hold(by["clients"], seconds)  # many connections cost less each than few
             first = most if args.quick else 1000  # more than the game holds
             echoed = server.search(running, first, seconds, resolution, 1 if args.quick else steps, report)
         if args.picows:
@@ -64,7 +65,7 @@ def run(args: argparse.Namespace, console: Console) -> tuple[dict[str, Any], int
                 "cpu_us_per_client_tick": cpu_us,
                 "clients_by_cpu": by_cpu,
                 **bound(echoed),
-                "times_the_echo": cpu_us / bound(echoed)["echo_cpu_us_per_client_tick"],
+                "times_the_echo": by["cpu_us_per_client_tick"] / same["cpu_us_per_client_tick"],
                 "parts": {name: share * cpu_us for name, share in shares.items()},
                 "entities_in_view": by["entities_in_view"],
                 "bytes_per_client_per_s": by["bytes_down_per_client_per_s"],
