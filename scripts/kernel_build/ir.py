@@ -16,7 +16,7 @@ from typing import Any
 
 import llvmlite.binding as llvm
 
-from shared import kernels
+from shared import exports, kernels
 
 FAILED = -(1 << 31)
 """Result of a function that found an index out of bounds, in a build that checks indices."""
@@ -67,7 +67,7 @@ def numba_sources(root: Path, *, bounds: bool = False) -> list[Source]:
     import numba
     from numba import types
 
-    from shared import exports, jit, layout
+    from shared import jit, layout
 
     _without_machine_code()
     options: dict[str, Any] = {name: value for name, value in jit.OPTIONS.items() if name != "cache"}
@@ -106,7 +106,6 @@ def _without_machine_code() -> None:
 
 def _wrapper(name: str, kinds: str, returns: bool) -> str:
     """Returns the Python source of a function that takes its arguments from a block of words and returns an int32."""
-    from shared import exports
 
     arguments: list[str] = []
     word = 0
@@ -229,6 +228,9 @@ def linked(
     for value in (*whole.functions, *whole.global_variables):
         if not value.is_declaration and value.name not in keep:
             value.linkage = "internal"
+    for function in whole.functions:  # those for servers are not the physics: they may be small
+        if not function.is_declaration and any(source in function.name for source in exports.SERVER_SOURCES):
+            function.add_function_attribute("optsize")
     whole.verify()
     builder = llvm.create_pass_builder(target_machine, llvm.create_pipeline_tuning_options(speed_level=machine.speed))
     builder.getModulePassManager().run(whole, builder)
