@@ -13,7 +13,7 @@ from server.scale.wire import record_of
 from shared.inputs import Input, make_input
 from sovereign_netcode.playtest.match import Player as Participant
 from sovereign_netcode.playtest.match import Policy, wander
-from sovereign_netcode.playtest.scaled import ScaledMatch
+from sovereign_netcode.playtest.scaled import ScaledMatch, Seat
 
 ROUGH = {"jitter_s": 0.003, "stop": (3.0, 0.08), "twice": 0.02}
 """A bus whose messages are late, stop for up to 80 ms about every 3 s, and come twice at times."""
@@ -85,6 +85,18 @@ def torment(match: ScaledMatch, seconds: float, seed: int) -> None:
 
     match.at(match.now + rng.random(), kill)
     match.run(seconds)
+
+
+def roam(match: ScaledMatch, rng: random.Random, seconds: float) -> None:
+    """Moves a player to an edge, both by chance, now and again after each time of this length."""
+
+    def move() -> None:
+        player = rng.choice(match.players)
+        assert isinstance(player, Seat)
+        player.move(match.some_edge())
+        match.at(match.now + seconds, move)
+
+    match.at(match.now, move)
 
 
 def calm(match: ScaledMatch, seconds: float = 6.0) -> None:

@@ -89,7 +89,7 @@ class Sequencer:
     def take_inputs(self) -> dict[int, Input]:
         """Takes the input of each player for the coming step, and the inputs that the rules have set.
 
-        Those of the fast path that are the same as in the tick before are left out, if nobody writes them down.
+        An input of the fast path is left out if it is the same as in the tick before, and no pen is attached.
         """
         world, api = self._world, self._api
         tick, players = world.tick + 1, api.players

@@ -45,8 +45,8 @@ class EdgeInputs(InputQueue):
     def restart(self, at: int) -> None:
         """Removes the inputs for tick `at` and later.
 
-        Those in batches whose records have not come yet are used all the same. To the client, their ticks are ticks
-        without its own input.
+        The sequencer still uses an input that is in a batch already. The statuses report
+        to the client that its own input was missing in that tick.
         """
         for tick in [tick for tick, (status, _) in self.unrecorded.items() if tick >= at and status == USED]:
             self.unrecorded[tick] = REPEATED, self.unrecorded[tick][1]

@@ -16,7 +16,7 @@ from shared.messages import REPEATED, USED, Inputs
 from shared.scene import load_scene
 from sovereign_netcode.playtest.log import FAILURES, Failure
 from sovereign_netcode.playtest.scaled import ScaledMatch, Seat
-from tests.scaling import PATH, ROUGH, Tally, asks, calm, causes, hashes_agree, played_right, slow_walk, torment
+from tests.scaling import PATH, ROUGH, Tally, asks, calm, causes, hashes_agree, played_right, roam, slow_walk, torment
 
 FAILS = (2.5, 2.0)
 """A log that fails about every 2.5 s, for up to 2 s."""
@@ -83,13 +83,7 @@ def test_nothing_is_lost_or_doubled_while_the_log_fails_and_parts_are_killed(see
         match.join(asks(sent), PATH)
     match.run(3)
 
-    def move() -> None:
-        player = rng.choice(match.players)
-        assert isinstance(player, Seat)
-        player.move(match.some_edge())
-        match.at(match.now + 0.7, move)
-
-    match.at(match.now, move)
+    roam(match, rng, 0.7)
     torment(match, seconds, seed)
     heal(match)
     calm(match, 10 if seconds > 4 else 5)

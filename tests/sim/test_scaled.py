@@ -27,7 +27,7 @@ from shared.inputs import Input, make_input
 from shared.scene import load_scene
 from sovereign_netcode.playtest.match import wander
 from sovereign_netcode.playtest.scaled import ScaledMatch, Seat
-from tests.scaling import PATH, ROUGH, Tally, asks, calm, causes, edits, hashes_agree, torment
+from tests.scaling import PATH, ROUGH, Tally, asks, calm, causes, edits, hashes_agree, roam, torment
 
 
 def test_a_player_who_is_alone_has_no_corrections() -> None:
@@ -474,13 +474,7 @@ def test_kills_while_players_move_between_edges(seed: int) -> None:
         match.join(asks(sent), PATH)
     match.run(3)
 
-    def move() -> None:
-        player = rng.choice(match.players)
-        assert isinstance(player, Seat)
-        player.move(match.some_edge())
-        match.at(match.now + 0.4, move)
-
-    match.at(match.now, move)
+    roam(match, rng, 0.4)
     torment(match, 12, seed)
     calm(match)
     for player in match.players:
