@@ -14,10 +14,8 @@ from server.config.settings import Settings
 from server.extras import install
 from server.game import Game
 from server.hosting.fleet_host import FleetWorldHost
-from server.hosting.hosting import Hosting
 from server.net.addresses import bracketed, reachable
 from server.play.play import PlayPages
-from server.runtime.event_loop import raise_descriptors
 from server.runtime.tasks import Tasks
 from server.serving import Declared, Server
 from server.worlds.fleet import Fleet
@@ -66,19 +64,7 @@ class FleetServer(Server):
 
     def _host(self, declared: Declared, tasks: Tasks) -> None:
         settings = self.settings
-        raise_descriptors()
-        hosting = self.hosting = Hosting(
-            settings,
-            declared.kinds,
-            declared.terrain,
-            self.game,
-            tasks,
-            token=declared.token,
-            faults=self.faults,
-            stop=lambda reason: self._end(reason, 0),
-            host_of=FleetWorldHost,
-            worlds_of=FleetWorlds,
-        )
+        hosting = self._new_hosting(declared, tasks, host_of=FleetWorldHost, worlds_of=FleetWorlds)
         worlds, host = hosting.worlds, hosting.host
         assert isinstance(worlds, FleetWorlds)
         assert isinstance(host, FleetWorldHost)

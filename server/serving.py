@@ -294,6 +294,10 @@ class Server(Serving):
 
     def _host(self, declared: Declared, tasks: Tasks) -> None:
         """Begins the worlds besides the default one."""
+        self._new_hosting(declared, tasks).start()
+
+    def _new_hosting(self, declared: Declared, tasks: Tasks, **classes: Any) -> "Hosting":
+        """Makes `hosting`, with other classes for its parts if they are given, and returns it."""
         from server.hosting.hosting import Hosting
 
         raise_descriptors()
@@ -306,8 +310,9 @@ class Server(Serving):
             token=declared.token,
             faults=self.faults,
             stop=lambda reason: self._end(reason, 0),
+            **classes,
         )
-        self.hosting.start()
+        return self.hosting
 
     def _end_work(self) -> None:
         if self.ticker is not None:
