@@ -6,7 +6,6 @@ Other entities are drawn as predicted, too, if their template is shown so (`show
 import math
 from bisect import bisect_left, bisect_right
 from collections.abc import Mapping, Sequence
-from operator import itemgetter
 from typing import Any, NamedTuple, cast
 
 from client_sdk.interpolation import Interpolation
@@ -15,6 +14,7 @@ from client_sdk.prediction.prediction import Prediction, Reconciled
 from client_sdk.timing.server_clock import ServerClock
 from client_sdk.timing.timeline import Timeline
 from client_sdk.view import NO_VALUES, EntityView, View
+from shared.arrays import PLAIN, np
 from shared.checks import Vec
 from shared.layout import CELL, ID, MOVE_X, TEMPLATE, VX, X
 from shared.scene import Scene
@@ -46,11 +46,11 @@ class ViewBuilder:
         self._extras = scene.extras
         self._facings: dict[int, tuple[float, float]] = {}
         self._states: Any = None  # the latest drawn ones, and what was made of them
-        self._rows: list[list[int]] = []
         self._own = slice(0)  # the rows of the own entities
-        self._parts: list[_Still | None] = []  # of all other rows; None: it may be drawn as predicted
+        self._parts: list[_Still | None] = []  # of all rows; None: an own one, or it may be drawn as predicted
+        self._others: list[_Still | None] = []  # of all rows but the own ones
+        self._rows: list[list[int]] = []  # the states of these, if one may be drawn as predicted
         self._seldom: dict[int, _Still] = {}  # parts by row of those that were not drawn as predicted after all
-        self._still: dict[int, tuple[list[int], _Still]] = {}  # the state of each entity of which the part was made
         self._delay = 0.0  # the input delay of the latest view, in ticks
         self._viewed = -math.inf  # the timeline's tick of the latest view
 
@@ -84,14 +84,14 @@ class ViewBuilder:
         if states is not self._states:
             self._take(states)
         del places[self._own]
-        if None in self._parts:
+        if self._rows:
             others = [self._other(i, place, tick, now) for i, place in enumerate(places)]
         else:
             attributes, new = prediction.attributes.get, tuple.__new__  # half the time of a call of the class
             others = [
                 new(EntityView, (entity, template, (x, y, z), velocity, attributes(entity, NO_VALUES), fields, facing))
                 for (entity, template, velocity, fields, facing), (x, y, z) in zip(
-                    cast("list[_Still]", self._parts), places, strict=True
+                    cast("list[_Still]", self._others), places, strict=True
                 )
             ]
         if prediction.last_own > prediction.entity:  # what the own entity has spawned: predicted, like itself
@@ -102,32 +102,32 @@ class ViewBuilder:
     def _take(self, states: Any) -> None:
         """Takes the states of another snapshot.
 
-        An entity whose state differs in its position only has the same part as before. Of one that may be drawn as
-        predicted, a part is made only if it is not, because that changes its facing.
+        An entity whose state differs in its position only has the same part as before. Of an own one, and of one that
+        may be drawn as predicted, a part is made only if it is not, because that changes its facing.
         """
-        rows, still, predicted = states.tolist(), self._still, self._predicted
-        first = bisect_left(rows, self._prediction.entity, key=itemgetter(ID))
-        own = slice(first, bisect_right(rows, self._prediction.last_own, key=itemgetter(ID)))
-        del rows[own]
-        if len(self._facings) > 2 * len(states) + FACINGS_MIN:
-            there = set(states[:, ID].tolist())
+        ids, templates = states[:, ID].tolist(), states[:, TEMPLATE].tolist()
+        if len(self._facings) > 2 * len(ids) + FACINGS_MIN:
+            there = set(ids)
             self._facings = {entity: facing for entity, facing in self._facings.items() if entity in there}
-            self._still = still = {entity: kept for entity, kept in still.items() if entity in there}
-        parts: list[_Still | None] = []
-        for state in rows:
-            if state[TEMPLATE] in predicted:
-                still.pop(state[ID], None)
-                parts.append(None)
-                continue
-            kept = still.get(state[ID])
-            if kept is None or kept[0][VX:] != state[VX:] or kept[0][TEMPLATE] != state[TEMPLATE]:
-                kept = still[state[ID]] = state, self._part(state)
-            parts.append(kept[1])
-        self._states, self._rows, self._own, self._parts, self._seldom = states, rows, own, parts, {}
+        first, end = bisect_left(ids, self._prediction.entity), bisect_right(ids, self._prediction.last_own)
+        own, former, parts = slice(first, end), self._parts, list[_Still | None]()
+        for row, same in enumerate(_unchanged(self._states, states)):
+            part = former[same] if same >= 0 else None
+            if part is None and templates[row] not in self._predicted and not first <= row < end:
+                part = self._part(states[row].tolist())
+            parts.append(part)
+        others = parts.copy()
+        del others[own]
+        rows = []
+        if None in others:
+            rows = states.tolist()
+            del rows[own]
+        self._states, self._own, self._parts = states, own, parts
+        self._others, self._rows, self._seldom = others, rows, {}
 
     def _other(self, row: int, place: list[float], tick: float, now: float) -> EntityView:
         """Returns the view of the entity of a row, as predicted or at `place` (in blocks)."""
-        state, part = self._rows[row], self._parts[row]
+        state, part = self._rows[row], self._others[row]
         if part is None:
             ahead = self._ahead(state[ID], tick, now)
             if ahead is not None:
@@ -183,3 +183,26 @@ class ViewBuilder:
                 self._facings[state[ID]] = east / length, north / length
                 break
         return self._facings.get(state[ID], (1.0, 0.0))
+
+
+def _unchanged(before: Any, after: Any) -> list[int]:
+    """Returns for each state, [n, 12], the row of an earlier state that differs in its position at most; -1: none.
+
+    Both are ascending by id. `before` may be None.
+    """
+    if before is None or not len(before):
+        return [-1] * len(after)
+    if PLAIN:
+        rows = {state[ID]: (row, state) for row, state in enumerate(before.tolist())}
+        found = [(rows.get(state[ID], (-1, state)), state) for state in after.tolist()]
+        return [row if old[VX:] == new[VX:] and old[TEMPLATE] == new[TEMPLATE] else -1 for (row, old), new in found]
+    if len(before) == len(after) and (before[:, ID] == after[:, ID]).all():  # mostly
+        at, changed = np.arange(len(after)), before != after
+    else:
+        at = np.searchsorted(before[:, ID], after[:, ID])
+        at[at == len(before)] = 0
+        changed = before[at] != after
+    changed[:, TEMPLATE + 1 : VX] = False
+    at[changed.any(axis=1)] = -1
+    same: list[int] = at.tolist()
+    return same

@@ -136,16 +136,18 @@ class _Way:
         if PLAIN:
             self._lists = _ways(states.tolist(), new.tolist(), placed)
             return
-        self._start = states[:, X : X + 3] / BLOCK
-        self._span = np.zeros_like(self._start)
-        if len(new):
-            ids = states[:, ID]
-            row = np.searchsorted(new[:, ID], ids)
-            row[row == len(new)] = 0
-            moves = new[row, ID] == ids
-            if placed:
-                moves &= ~np.isin(ids, list(placed))
-            self._span[moves] = new[row[moves], X : X + 3] / BLOCK - self._start[moves]
+        self._start, ids = states[:, X : X + 3] / BLOCK, states[:, ID]
+        if len(new) == len(ids) and (new[:, ID] == ids).all():  # mostly
+            self._span = new[:, X : X + 3] / BLOCK - self._start
+        else:
+            self._span = np.zeros_like(self._start)
+            if len(new):
+                row = np.searchsorted(new[:, ID], ids)
+                row[row == len(new)] = 0
+                moves = new[row, ID] == ids
+                self._span[moves] = new[row[moves], X : X + 3] / BLOCK - self._start[moves]
+        if placed:
+            self._span[np.isin(ids, list(placed))] = 0.0
 
     def at(self, share: float) -> list[list[float]]:
         """Returns the positions at a moment, from 0 (the first snapshot) to 1 (the second)."""

@@ -26,6 +26,8 @@ clients join.
 command that changes the template), in simulated time. It counts the frames until a player sees its dash, corrections,
 and bytes. It also measures a replay of ten ticks of a lone player, with a behaviour and without.
 
+`frame` measures the time that a client takes for a frame with 50 other players in view, in simulated time.
+
 `worlds` searches for the most worlds of four players each that one server process holds at 30 Hz, and measures what an
 empty world costs (memory, CPU time), and the time from asking for a match to playing in a new world.
 
@@ -49,7 +51,20 @@ from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
-from scripts.benchmarks import abilities, capacity, entities, jitter, memory, physics, rss, scale, step_c, wire, worlds
+from scripts.benchmarks import (
+    abilities,
+    capacity,
+    entities,
+    frame,
+    jitter,
+    memory,
+    physics,
+    rss,
+    scale,
+    step_c,
+    wire,
+    worlds,
+)
 from scripts.benchmarks.crowds import Samples
 from scripts.benchmarks.peers import app as peers
 from scripts.benchmarks.server import RigError
@@ -307,6 +322,7 @@ def parser() -> argparse.ArgumentParser:
     command.add_argument("--players", type=int, default=100, help="number of bots (default: %(default)s)")
     command.set_defaults(run=scale.run)
     peers.add(commands, each)
+    frame.add(commands, each)
     return parser
 
 

@@ -5,7 +5,7 @@ import tracemalloc
 
 import pytest
 
-from scripts.benchmarks import abilities, entities, memory, wire
+from scripts.benchmarks import abilities, entities, frame, memory, wire
 from tests.lengths import long
 
 
@@ -46,3 +46,10 @@ def test_a_predicted_dash_shows_in_the_next_tick_without_corrections_and_a_comma
     assert ours["causes"] == {}
     assert theirs["frames"] >= rtt_ms * 60 / 1000
     assert theirs["causes"].keys() == {"server act"}
+
+
+def test_a_frame_has_all_others_in_view() -> None:
+    found = frame.measured(5, 0.5, 903)
+    assert found["others"] == 5
+    assert 29 <= found["frames"] <= 31
+    assert 0 < found["median_us"] <= found["p99_us"]
