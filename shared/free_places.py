@@ -3,7 +3,7 @@
 A place is occupied if a block or a solid entity overlaps the box there. Boxes that only touch do not overlap.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 
 from shared import layout
 from shared.checks import SceneError, vector
@@ -34,22 +34,22 @@ def _near(world: WorldState, but: int, box: list[int]) -> layout.Int64s:
 
 def overlapping(world: WorldState, but: int, box: list[int]) -> list[int]:
     """Returns the ids of the solid entities that overlap a box, ascending, without the row `but` (-1: none)."""
-    near = _near(world, but, box)
-    if not len(near):
-        return []
+    return sorted(int(world.entity_rows[row, ID]) for row in _overlaps(world, but, box))
+
+
+def _overlaps(world: WorldState, but: int, box: list[int]) -> Iterator[int]:
+    """Yields the rows of the solid entities that overlap a box, without the row `but` (-1: none)."""
     x0, y0, z0, x1, y1, z1 = box
-    return sorted(
-        int(world.entity_rows[row, ID])
-        for low_x, low_y, low_z, high_x, high_y, high_z, row in near.tolist()
-        if low_x < x1 and low_y < y1 and low_z < z1 and high_x > x0 and high_y > y0 and high_z > z0
-    )
+    for low_x, low_y, low_z, high_x, high_y, high_z, row in _near(world, but, box).tolist():
+        if low_x < x1 and low_y < y1 and low_z < z1 and high_x > x0 and high_y > y0 and high_z > z0:
+            yield row
 
 
 def taken(world: WorldState, row: int, kind: int, box: list[int]) -> bool:
     """Returns whether a block or a solid entity is in the way of a template's box, without the row `row` (-1: none)."""
     if world.kernel.blocks_in(world.bound, *box):
         return True
-    return _meets(world, kind) and bool(overlapping(world, row, box))
+    return _meets(world, kind) and any(True for _ in _overlaps(world, row, box))
 
 
 def _meets(world: WorldState, kind: int) -> bool:

@@ -47,6 +47,8 @@ def to_position(value: object, field: str) -> int:
     Raises:
         SceneError: `value` is not a finite number, or outside +-2^28 blocks.
     """
+    if type(value) is float and -RANGE_BLOCKS <= value <= RANGE_BLOCKS:
+        return rounded(value * BLOCK)
     blocks = finite(value, field)
     if abs(blocks) > RANGE_BLOCKS:
         raise SceneError(f"{field} = {value!r}: outside of +-{RANGE_BLOCKS} blocks")
@@ -63,6 +65,8 @@ def to_velocity(value: object, field: str) -> int:
     Raises:
         SceneError: `value` is not a finite number, or faster than 1024 blocks/s.
     """
+    if type(value) is float and -SPEED_MAX <= value <= SPEED_MAX:
+        return rounded(value * SPEED)
     speed = finite(value, field)
     if abs(speed) > SPEED_MAX:
         raise SceneError(f"{field} = {value!r}: faster than {SPEED_MAX:g} blocks/s")

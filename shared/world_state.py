@@ -294,7 +294,7 @@ class WorldState:
                 found.append(head)
                 head = int(self._entities[head, NEXT])
         rows = self._entities[found]
-        return rows[np.argsort(rows[:, ID])]
+        return rows[np.argsort(rows[:, ID])] if len(found) > 1 else rows
 
     def block(self, x: int, y: int, z: int) -> int | None:
         """Returns the kind of a block; None if its segment is not loaded."""

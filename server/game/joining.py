@@ -1,6 +1,6 @@
 """The handshake of a client: its Hello is checked when it arrives, and answered by a Welcome in a tick."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any, Protocol
 
@@ -17,7 +17,7 @@ from server.observability.errors import FaultReporter
 from server.players.player import Player
 from server.rules import Rules
 from shared import messages
-from shared.messages import Hello, Welcome, encode
+from shared.messages import Hello, join_welcome, pack
 
 
 class Door(Protocol):
@@ -57,7 +57,7 @@ class Joining:
     ) -> None:
         self._world, self._limits, self._counters, self._faults = world, limits, counters, faults
         self._connections, self._roster, self._commands = connections, roster, commands
-        self._rules = world.scene.to_table()
+        self._table = pack(world.scene.to_table())
         self.authenticate = authenticate
         self.run: Runner = at_once
         """Runner of `load_player`."""
@@ -70,9 +70,7 @@ class Joining:
         if hello.version != messages.VERSION:
             self._connections.refuse(session, messages.WRONG_VERSION, other_version(hello))
             return
-        mine = self._world.scene.digests
-        differ = sorted(name for name in mine | hello.scene if mine.get(name) != hello.scene.get(name))
-        if hello.scene and differ:
+        if hello.scene and (differ := _differing(self._world.scene.digests, hello.scene)):
             reason = f"the server plays another scene ({', '.join(name[:40] for name in differ)} differ)"
             self._connections.refuse(session, messages.WRONG_SCENE, reason)
             return
@@ -158,7 +156,7 @@ class Joining:
         elif self.door is not None and (refusal := self.door.refusal(session)) is not None:
             self._connections.refuse(session, *refusal)
             return
-        elif self._roster.connected >= self._limits.clients_max:
+        elif self._roster.full:
             reason = f"the server is full ({self._limits.clients_max} clients)"
             self._connections.refuse(session, messages.FULL, reason)
             return
@@ -181,9 +179,14 @@ class Joining:
     def _admit(self, session: Session, player: Player) -> None:
         """Prepares the welcome of a client that has joined."""
         token = self._roster.issue(player)
-        welcome = encode(Welcome(messages.VERSION, self._world.tick, player.entity, self._rules, token))
+        welcome = join_welcome(self._world.tick, player.entity, self._table, token)
         session.stream.private_due = self._roster.private_of(player)
         session.greeting = (self._world.tick + 1, welcome)
+
+
+def _differing(mine: Mapping[str, bytes], theirs: Mapping[str, bytes]) -> list[str]:
+    """Returns the names of the parts of two scenes that differ, by their digests."""
+    return sorted(name for name in {**mine, **theirs} if mine.get(name) != theirs.get(name))
 
 
 def other_version(hello: Hello) -> str:

@@ -55,9 +55,10 @@ class Roster:
         return self._api.players
 
     @property
-    def connected(self) -> int:
-        """Number of players with a connection, including connections whose loss has not been noticed yet."""
-        return sum(player.session is not None for player in self._api.players.values())
+    def full(self) -> bool:
+        """Whether as many players as may play have a connection, or one whose loss has not been noticed yet."""
+        players, most = self._api.players, self._limits.clients_max
+        return len(players) >= most and sum(player.session is not None for player in players.values()) >= most
 
     def enter(self, session: Session, name: str, loaded: Any = None) -> Player | None:
         """Adds a new player at a spawn point. Call it before the step of a tick.

@@ -3,9 +3,11 @@
 from collections.abc import Iterator
 
 import numpy as np
+import numpy.typing as npt
 
 from shared.checks import Vec
-from shared.layout import ID, TEMPLATE, X, Y
+from shared.free_places import box_at
+from shared.layout import FLOOR, ID, TEMPLATE, X, Y
 from shared.units import BLOCK, BLOCK_SHIFT, to_position
 from shared.world import OverlapError, World
 
@@ -21,6 +23,12 @@ OFFSETS = tuple(
     if max(abs(i), abs(j)) == ring
 )
 """Offsets of the places around a spawn point in steps of `APART` blocks, the nearest rings first."""
+SIDE = 2 * RINGS - 1
+"""Number of places along each axis."""
+PLACES = np.array([i * SIDE + j for i, j in OFFSETS])
+"""Index of each of `OFFSETS` in a table of `SIDE` times `SIDE` places whose middle has the index 0."""
+
+Bools = npt.NDArray[np.bool_]
 
 
 class Spawns:
@@ -29,7 +37,6 @@ class Spawns:
     def __init__(self, world: World) -> None:
         self._world = world
         self._turn = 0
-        self._boxes = [template.row()[:6] for template in world.scene.templates]
         self._full: tuple[int, int, int] | None = None
 
     def spawn(self) -> int | None:
@@ -72,28 +79,27 @@ class Spawns:
         yield from spawns[turn:] + spawns[:turn]
         x, y, z = spawns[turn]
         taken = self._taken(x, y)
-        for order in (False, True):
-            for i, j in OFFSETS:
+        for order in (~taken, taken):
+            for at in np.flatnonzero(order):
+                i, j = OFFSETS[at]
                 place = x + APART * i, y + APART * j, z
-                if ((i, j) in taken) is order and not self._built(kind, place):
+                if not self._built(kind, place):
                     yield place
         self._full = now
 
     def _built(self, kind: int, place: Vec) -> bool:
         """Returns whether a block, or a segment that is not loaded, is in the way of an entity at a place."""
-        box = self._boxes[kind]
-        low = [to_position(part, "spawn") + reach for part, reach in zip(place, box, strict=False)]
-        spans = [
-            range(a >> BLOCK_SHIFT, (a + side - 1 >> BLOCK_SHIFT) + 1) for a, side in zip(low, box[3:], strict=True)
-        ]
-        blocks = self._world.blocks
-        kinds = (blocks.get(x, y, z) for z in spans[2] for y in spans[1] for x in spans[0])
-        return any(kind is None or blocks.stops[kind] for kind in kinds)
+        world = self._world
+        box = box_at(world, kind, [to_position(part, "spawn") for part in place])
+        below = (box[5] - 1) >> BLOCK_SHIFT < world.parameters[FLOOR]
+        return bool(below or world.kernel.blocks_in(world.bound, *box))
 
-    def _taken(self, x: float, y: float) -> set[tuple[int, int]]:
-        """Returns the offsets from a spawn point (in steps of `APART`) with an entity nearby, at any height."""
-        matrix = self._world.matrix
-        places = matrix[matrix[:, ID] != 0][:, (X, Y)]
-        offsets = np.rint((places / BLOCK - (x, y)) / APART)
-        near = offsets[(np.abs(offsets) < RINGS).all(axis=1)].astype(int)
-        return set(map(tuple, near.tolist()))
+    def _taken(self, x: float, y: float) -> Bools:
+        """Returns which of the places `OFFSETS` around a spawn point have an entity nearby, at any height."""
+        matrix, step = self._world.matrix, APART * BLOCK
+        i, j = (np.rint((matrix[:, column] - at * BLOCK) / step) for column, at in ((X, x), (Y, y)))
+        near = (np.maximum(np.abs(i), np.abs(j)) < RINGS) & (matrix[:, ID] != 0)
+        taken = np.zeros(SIDE * SIDE, bool)
+        taken[np.where(near, i * SIDE + j, 0).astype(np.int64)] = True  # 0 is the spawn point, which is not asked for
+        found: Bools = taken[PLACES]
+        return found

@@ -12,9 +12,8 @@ from collections.abc import Mapping
 from itertools import accumulate
 from typing import Any
 
-import msgpack
-
 from server.observability.errors import FaultReporter
+from shared import messages
 from shared.blocks import offset_of, pack, segment_of
 from shared.bounds import bounds, in_ticks
 from shared.checks import Cell
@@ -267,6 +266,8 @@ class ChangeLog:
         else:
             strays = [entity for entity, home in self._home.items() if home == segment]
             rows = self._world.rows(sorted(strays))
+        if not len(rows):
+            return join_part(segment, KEYFRAME, NO_CHANGES)
         placed, ids = self._placed_lately(), rows[:, ID].tolist()
         fields = b"".join(map(self._fields_of, ids)) if self._world.extras.count else b""
         return encode_part(segment, KEYFRAME, rows, placed=placed, attributes=self._of(ids), fields=fields)
@@ -318,8 +319,9 @@ class ChangeLog:
             for entity in entities
             if entity in self._attributes or entity in self._named
         ]
-        if len(tables) > FEW_ENTITIES:
-            ends = accumulate(len(msgpack.packb(values)) + ENTITY_BYTES for _, values in tables)
+        most = ATTRIBUTE_BYTES - ENTITY_BYTES * len(tables)
+        if len(tables) > FEW_ENTITIES and len(messages.pack([values for _, values in tables])) > most:
+            ends = accumulate(len(messages.pack(values)) + ENTITY_BYTES for _, values in tables)
             fits = max(sum(end <= ATTRIBUTE_BYTES for end in ends), 1)
             self._attributes_changed.update(entity for entity, _ in tables[fits:])
             del tables[fits:]

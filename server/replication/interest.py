@@ -1,5 +1,7 @@
 """Interest: the segments around an entity. A segment leaves the view at a larger distance than it enters it."""
 
+import functools
+import itertools
 from collections.abc import Callable
 
 from shared.checks import Cell
@@ -21,10 +23,15 @@ def around(centre: Cell, see: int, exists: Callable[[Cell], bool]) -> tuple[Cell
         exists: returns whether a segment exists.
     """
     x, y, z = centre
+    cube = [(x + i, y + j, z + k) for i, j, k in _nearest_first(see)]
+    return (centre, *filter(exists, cube[1:]))
+
+
+@functools.cache
+def _nearest_first(see: int) -> tuple[Cell, ...]:
+    """Returns the offsets of the segments around a segment, nearest first, and those at one distance in order."""
     span = range(-see, see + 1)
-    cube = [(x + i, y + j, z + k) for k in span for j in span for i in span]
-    seen = [segment for segment in cube if segment == centre or exists(segment)]
-    return tuple(sorted(seen, key=lambda segment: (distance(segment, centre), segment)))
+    return tuple(sorted(itertools.product(span, span, span), key=lambda at: (distance(at, (0, 0, 0)), at)))
 
 
 def update(sees: set[Cell], near: tuple[Cell, ...], keep: int) -> tuple[list[Cell], list[Cell]]:

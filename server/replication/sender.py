@@ -94,8 +94,9 @@ class Sender:
         if self._around.get(centre) != near:
             self._around[centre] = near
         added, dropped = sight.move(self._around[centre], self._limits.keep_radius, self._world.tick)
-        due = [segment for segment in stream.terrain_due if segment in sight.sees] + [s for s in added if exists(s)]
-        stream.terrain_due = self._nearest(stream, due)
+        waiting = [segment for segment in stream.terrain_due if segment in sight.sees]
+        new = [segment for segment in added if exists(segment)]  # nearest first already
+        stream.terrain_due = self._nearest(stream, waiting + new) if waiting else new
         if stream.terrain_now and stream.terrain_now[0] in dropped:
             stream.terrain_now = None
 

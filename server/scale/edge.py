@@ -40,7 +40,7 @@ from server.scale.wire import COMMAND, GONE, HERE, JOIN, KNOWS, SWITCH, Batch, R
 from shared import fields, messages
 from shared.bounds import bounds, in_ticks
 from shared.inputs import Input
-from shared.messages import Hello, Welcome, encode
+from shared.messages import Hello, join_welcome, pack
 
 RESEND_TICKS, RESENT_MAX = 8, 64
 """Ticks without a batch in the records after which the unrecorded batches are sent again: one of them was lost on the
@@ -129,7 +129,7 @@ class EdgeServer(Front):
         self._tokens: dict[int, bytes] = {}
         self._mine = self._roster.mine
         self._known: set[Session] = set()
-        self._scene_table = self.scene.to_table()
+        self._scene_table = pack(self.scene.to_table())
 
     @property
     def newest(self) -> int:
@@ -366,7 +366,7 @@ class EdgeServer(Front):
             session.loading = False
             session.seat(player)
             session.received_at = session.stream.sent_at = now
-            welcome = encode(Welcome(messages.VERSION, record.tick - 1, entity, self._scene_table, token))
+            welcome = join_welcome(record.tick - 1, entity, self._scene_table, token)
             session.stream.private_due = self.replica.kept.private_of(entity)
             session.greeting = (record.tick, welcome)
             session.beginning = self.moves.message()

@@ -84,3 +84,13 @@ def test_on_any_walk_the_near_is_seen_and_nothing_far_is() -> None:
         assert len(set(added)) == len(added)
         assert not before & set(added)
         assert set(dropped) <= before
+
+
+def test_the_order_is_by_distance_and_then_by_index() -> None:
+    rng = random.Random(7)
+    for _ in range(50):
+        centre = rng.randint(-9, 9), rng.randint(-9, 9), rng.randint(-9, 9)
+        see = rng.randint(0, 3)
+        there = {segment for segment in cube(centre, see) if rng.random() < 0.5}
+        wanted = sorted(there | {centre}, key=lambda segment: (distance(segment, centre), segment))
+        assert around(centre, see, there.__contains__) == tuple(wanted)

@@ -1,8 +1,12 @@
 """Spawning: players appear at a spawn point, or beside it in a crowd, at little cost."""
 
+import contextlib
+import random
+
+import numpy as np
 import pytest
 
-from server.game.spawning import OFFSETS, Spawns
+from server.game.spawning import APART, OFFSETS, Spawns
 from shared.world import OverlapError, World
 from tests.worlds import build, floor
 
@@ -73,3 +77,27 @@ def test_where_a_block_is_nothing_is_tried_and_a_gap_is_found(monkeypatch: pytes
     assert entity is not None
     assert world.position(entity) == (-8.0, 10.0, 0.0)
     assert len(tried) == 3
+
+
+def test_places_near_an_entity_are_those_that_round_to_it_at_any_height() -> None:
+    """The table of all places says the same as one comparison per place and entity."""
+    rng = random.Random(3)
+    world = build([floor()], player="person", spawns=((0.0, 0.0, 0.0),))
+    where = []
+    for _ in range(60):
+        at = rng.uniform(-30, 30), rng.uniform(-30, 30), 8.0 * rng.randint(0, 3)
+        with contextlib.suppress(OverlapError):
+            where.append(world.position(world.spawn("person", at)))
+    world.remove(world.spawn("person", (3.0, 3.0, 28.0)))  # its row is free, and not near anything
+    assert len(where) > 20
+    for x, y in ((0.0, 0.0), (1.5, -0.75), (20.0, -31.0)):
+        near = {(np.rint((ex - x) / APART), np.rint((ey - y) / APART)) for ex, ey, _ in where}
+        assert Spawns(world)._taken(x, y).tolist() == [offset in near for offset in OFFSETS]
+
+
+def test_a_spawn_point_below_the_world_is_the_only_place_there() -> None:
+    world = build([floor()], player="person", spawns=((0.0, 0.0, -99.0),))
+    first, second = Spawns(world).spawn(), Spawns(world).spawn()
+    assert first is not None
+    assert world.position(first) == (0.0, 0.0, -99.0)
+    assert second is None

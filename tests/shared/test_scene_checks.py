@@ -6,11 +6,11 @@ from typing import Any
 import pytest
 
 from client_sdk.events import Joined
-from shared.checks import SceneError
+from shared.checks import SceneError, vector
 from shared.inputs import MOVE_MAX, Input, clamp, make_input
 from shared.scene import SCENES, Scene, Template, load_scene
 from shared.terrain import generate
-from shared.units import BLOCK, SPEED, rounded, to_position, to_velocity
+from shared.units import BLOCK, RANGE_BLOCKS, SPEED, SPEED_MAX, rounded, to_position, to_velocity
 from tests.worlds import TEMPLATES, scene
 
 NO_NUMBERS = (math.nan, math.inf, -math.inf, 10**400, "3", None, True)
@@ -158,3 +158,26 @@ def test_an_event_that_is_printed_does_not_show_the_whole_scene() -> None:
     assert repr(Joined(1, load_scene("meadow"), 7)) == (
         "Joined(entity=1, scene=<Scene 'meadow', 64 x 64 x 32 blocks, 32 ticks/s>, tick=7)"
     )
+
+
+def test_a_vector_of_floats_is_checked_like_any_other() -> None:
+    """The short cut for a tuple of floats accepts and refuses the same values as the check of any other sequence."""
+    huge = (1e308, 1e308, 1e308)
+    assert vector(huge, "at") == vector(list(huge), "at") == huge
+    assert vector((1, 2.5, 3), "at") == (1.0, 2.5, 3.0)
+    for bad in (math.nan, math.inf, -math.inf, "1", True, None):
+        for axis in range(3):
+            parts: list[object] = [0.5, 1.5, 2.5]
+            parts[axis] = bad
+            said = []
+            for value in (parts, tuple(parts)):
+                with pytest.raises(SceneError) as error:
+                    vector(value, "at")
+                said.append(str(error.value))
+            assert said[0] == said[1]
+            assert said[0].startswith(f"at.{'xyz'[axis]} = ")
+    for convert, most in ((to_position, RANGE_BLOCKS), (to_velocity, SPEED_MAX)):
+        assert [convert(most, "x"), convert(-most, "x")] == [convert(float(most), "x"), convert(-float(most), "x")]
+        for number in (math.nan, math.inf, -math.inf, math.nextafter(most, math.inf), -math.nextafter(most, math.inf)):
+            with pytest.raises(SceneError, match=r"^x = "):
+                convert(number, "x")
