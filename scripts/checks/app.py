@@ -14,8 +14,9 @@ from concurrent.futures import ThreadPoolExecutor
 from scripts.browser_build import tools
 from scripts.environment import PYTHON, ROOT, Step, run
 
+STUBS = ("hatch_build.py",)
+"""The command that writes the type stubs from the modules as they are now. The checks read them."""
 CHECKS = {
-    "type stubs": ("hatch_build.py",),  # written from the modules as they are now; the others read them
     "ruff format": ("-m", "ruff", "format", "--check"),
     "ruff check": ("-m", "ruff", "check"),
     "language": ("-m", "scripts.checks.language"),
@@ -33,7 +34,7 @@ def main(arguments: list[str]) -> int:
         run("browsers", "-m", "scripts.browser_build.app", "--tests")  # without it, tests in browsers are skipped
         os.environ["PATH"] = tools.path()
     if arguments == ["--long"]:
-        steps = [together(LONG, "long"), in_pairs("long"), alone(LONG, "long")]
+        steps = [*compiled(), together(LONG, "long"), in_pairs("long"), alone(LONG, "long")]
     elif arguments == ["--all"]:
         steps = everything("", "long")
     elif arguments:
@@ -48,10 +49,11 @@ def main(arguments: list[str]) -> int:
 
 def everything(markers: str, profile: str) -> list[Step]:
     """Runs all checks of the sources and the tests with these markers."""
-    steps = [run(title, *command) for title, command in CHECKS.items()]
+    steps = [run("type stubs", *STUBS)]
     with ThreadPoolExecutor(1) as pool:
-        types = pool.submit(mypy)  # beside the tests, many of which wait
-        steps.append(together(markers, profile))
+        types = pool.submit(mypy)  # beside the other checks, and the tests, many of which wait
+        steps += [run(title, *command) for title, command in CHECKS.items()]
+        steps += [*compiled(), together(markers, profile)]
         step, output = types.result()
     print(f"\n== {step.title}\n{output}", end="", flush=True)
     pairs = [in_pairs(profile)] if profile == "long" else []
@@ -64,6 +66,20 @@ def mypy() -> tuple[Step, str]:
     command = (str(PYTHON), "-m", "mypy")
     done = subprocess.run(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, check=False)
     return Step("mypy", done.returncode, time.perf_counter() - started), done.stdout
+
+
+def compiled() -> list[Step]:
+    """Compiles the tests, unless that was done before. Returns the step. The workers report what cannot be collected.
+
+    pytest rewrites all assertions, which takes 10 s of processor time. The workers begin at the same time with the same
+    files, so each of them would do it.
+    """
+    if any((ROOT / "tests").rglob("*-pytest-*.pyc")):
+        return []
+    started = time.perf_counter()
+    command = (str(PYTHON), "-m", "pytest", "--collect-only", "-qqq")
+    subprocess.run(command, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, check=False)
+    return [Step("compiled tests", 0, time.perf_counter() - started)]
 
 
 def together(markers: str, profile: str) -> Step:

@@ -1,6 +1,7 @@
 """The set-up of the environment, and how commands start. Nothing is installed here."""
 
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -65,6 +66,18 @@ def test_two_halves_have_all_pins_with_their_hashes(requirements: str) -> None:
         assert all("==" in pin and pin.endswith("\\") for pin in pins)
         assert half.count("--hash=") >= len(pins) > 5
     assert abs(one.count("==") - two.count("==")) < 10
+
+
+@pytest.mark.parametrize(
+    ("path", "compiled"),
+    [
+        ("numpy/_core/multiarray.py", True), ("pytest/__init__.py", True), ("nats/aio/client.py", True),
+        ("numpy/_core/tests/test_half.py", False), ("mypy/build.py", False), ("pygame/tests/test_utils/png.py", False),
+    ],
+)  # fmt: skip
+def test_the_set_up_compiles_what_commands_import(path: str, compiled: bool) -> None:
+    for found in (f".venv/lib/site-packages/{path}", f".venv/lib/site-packages/{path}".replace("/", "\\")):
+        assert (re.search(environment.UNCOMPILED, found) is None) == compiled
 
 
 def test_a_half_that_cannot_be_installed_is_told(env: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
