@@ -16,7 +16,6 @@ import json
 import re
 import shutil
 import tempfile
-import tokenize
 from collections.abc import Collection, Iterator
 from itertools import pairwise
 from pathlib import Path
@@ -38,6 +37,8 @@ BROWSER, RUNTIME = Path("build/browser"), Path("server/play/runtime")
 _NAMES = "|".join(FOLDERS)
 _IN_TEXT = re.compile(rf"(?<=`)(?=(?:{_NAMES})\.[a-z_])|(?<=python -m )(?=(?:{_NAMES})\b)")
 """Matches where a docstring, comment or message names a module. Neither alternative can occur in other code."""
+_FROM = re.compile(r"from[\s\\]+")
+"""Matches the word `from` of an import and the space behind it, which may have line continuations."""
 
 
 class RewriteError(Exception):
@@ -156,26 +157,20 @@ def rewritten(source: str, name: str, modules: Collection[str]) -> str:
         """Converts a position of the syntax tree, which counts bytes of UTF-8, to an index into the text."""
         return starts[line - 1] + len(lines[line - 1].encode()[:column_bytes].decode())
 
-    names_at = _names_after_from(source, starts)
     inserts = {match.start() for match in _IN_TEXT.finditer(source)}
     for node in ast.walk(tree):
         _refuse(node, name, modules)
         if isinstance(node, ast.Import):
             inserts |= {offset(part.lineno, part.col_offset) for part in node.names if _is_ours(part.name)}
         elif isinstance(node, ast.ImportFrom) and not node.level and _is_ours(node.module or ""):
-            inserts.add(names_at[offset(node.lineno, node.col_offset)])
+            before = _FROM.match(source, offset(node.lineno, node.col_offset))
+            assert before is not None
+            inserts.add(before.end())
     parts, done = [], 0
     for at in sorted(inserts):
         parts += [source[done:at], f"{PACKAGE}."]
         done = at
     return "".join(parts) + source[done:]
-
-
-def _names_after_from(source: str, starts: list[int]) -> dict[int, int]:
-    """Returns the index of the name after each `from`, by the index of the `from`."""
-    tokens = tokenize.generate_tokens(io.StringIO(source).readline)
-    places = [(token.string, starts[token.start[0] - 1] + token.start[1]) for token in tokens]
-    return {at: after for (text, at), (_, after) in pairwise(places) if text == "from"}
 
 
 def _is_ours(module: str) -> bool:

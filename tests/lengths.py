@@ -19,6 +19,15 @@ def long(*values: Any) -> list[Any]:
     return [pytest.param(*value, marks=pytest.mark.slow) for value in every]
 
 
+def contained(*values: Any) -> list[Any]:
+    """Returns parameters of a short run that `scripts/test --all` leaves out.
+
+    Use it where a long run of the same test does everything that the short one does, and more of it.
+    """
+    every = [value if isinstance(value, tuple) else (value,) for value in values]
+    return [pytest.param(*value, marks=pytest.mark.contained) for value in every]
+
+
 def long_but(short: Collection[Any], every: Iterable[Any]) -> list[Any]:
     """Returns the parameters `every` of a test. All but `short` make a long run of it."""
     found = list(every)
