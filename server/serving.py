@@ -28,11 +28,12 @@ from server.persistence.store import Store
 from server.play.play import PlayPages
 from server.players.persisted_state import PersistedState
 from server.players.player import Player
+from server.runtime.alarm import best_alarm
 from server.runtime.event_loop import freeze, on_signals, raise_descriptors, rss_mb
 from server.runtime.structured import structlog
 from server.runtime.tasks import Tasks
 from server.runtime.terrain import TerrainPool
-from server.runtime.ticker import Ticker, best_alarm
+from server.runtime.ticker import Ticker
 from server.runtime.watchdog import Watchdog
 from shared.scene import Scene
 

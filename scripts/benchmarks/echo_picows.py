@@ -27,7 +27,8 @@ from picows import (
 
 from scripts.benchmarks.busy_server import Echo
 from server.runtime import event_loop
-from server.runtime.ticker import Ticker, best_alarm
+from server.runtime.alarm import best_alarm
+from server.runtime.ticker import Ticker
 
 BINARY = WSMsgType.BINARY
 

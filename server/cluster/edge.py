@@ -26,8 +26,8 @@ from server.journal.recorded_world import RecordedWorld
 from server.journal.records import DivergedError
 from server.observability.histogram import Histogram
 from server.rules import Rules
+from server.runtime.alarm import Alarm, best_alarm
 from server.runtime.tasks import Tasks
-from server.runtime.ticker import Alarm, best_alarm
 from server.scale.clock import EdgeClock
 from server.scale.edge import AHEAD_MAX, EdgeServer
 from server.scale.wire import packed

@@ -19,7 +19,8 @@ from server.journal.recorded_world import RecordedWorld
 from server.journal.records import DivergedError
 from server.players.persisted_state import PersistedState
 from server.rules import Rules
-from server.runtime.ticker import Ticker, best_alarm
+from server.runtime.alarm import best_alarm
+from server.runtime.ticker import Ticker
 from server.scale import checkpoint
 from server.scale.sequencer import WorldSequencer, begin_record
 from server.scale.wire import batch_of

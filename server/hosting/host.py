@@ -1,11 +1,11 @@
 """The host of the worlds of one process: makes their games, runs their ticks, and keeps their files.
 
-Theory of operation. Each world has a ticker of its own, and the deadlines are spread over the tick's time. A tick that
-takes longer than the time between two delays other worlds by its own time at most, because its world then waits as
-long, and they catch up. A world that rests has no timer. A world of which `FAILURES_MAX` ticks in a row have failed
-ends alone. Terrain is generated once for each scene, before the first world needs it. Threads make the files of new
-worlds, and close and remove those of worlds that have ended, because a disk may be slow. Only a saved world that comes
-back is read at once.
+Theory of operation. Each world has a ticker of its own, and the deadlines are spread over the tick's time. All tickers
+share one timer (`server.runtime.alarm`); a timer for each would take 30 us of each tick. A tick that takes longer than
+the time between two delays other worlds by its own time at most, because its world then waits as long, and they catch
+up. A world that rests has no alarm. A world of which `FAILURES_MAX` ticks in a row have failed ends alone. Terrain is
+generated once for each scene, before the first world needs it. Threads make the files of new worlds, and close and
+remove those of worlds that have ended, because a disk may be slow. Only a saved world that comes back is read at once.
 """
 
 import asyncio
@@ -27,9 +27,10 @@ from server.hosting.phases import Phases
 from server.hosting.running import NamedTick, OwnedTick, RunningWorld, new_recording
 from server.persistence.new_store import NewStore
 from server.persistence.store import Store
+from server.runtime.alarm import SharedTimer, best_alarm
 from server.runtime.log import WORLD
 from server.runtime.terrain import TerrainPool
-from server.runtime.ticker import FAILURES_MAX, Ticker, best_alarm
+from server.runtime.ticker import FAILURES_MAX, Ticker
 from server.worlds.hosted import HostedWorld
 from server.worlds.kinds import Kind, WorldsError
 from server.worlds.worlds import Worlds
@@ -72,6 +73,7 @@ class WorldHost:
         self.running: dict[str, RunningWorld] = {}
         """Worlds by name."""
         self._phases = Phases()
+        self._timer = SharedTimer(lambda ring: best_alarm(loop, ring))
         self._power = settings.durability == "power"
         shared = settings.fleet is not None
         self.files = (
@@ -219,7 +221,7 @@ class WorldHost:
             kind.scene.tick_rate,
             NamedTick(world.name, game) if self.owned is None else OwnedTick(world.name, game, self.owned),
             lambda: self._broken(world),
-            lambda ring: best_alarm(self._loop, ring),
+            self._timer.alarm,
             game.faults,
             paused=True,
             yields=True,

@@ -51,7 +51,7 @@ def rss_mb() -> float:
 
 
 def raise_descriptors() -> None:
-    """Raises the limit of file descriptors to what the system allows this process: each world takes one to six."""
+    """Raises the limit of file descriptors to what the system allows this process: each world takes up to six."""
     try:
         import resource
     except ImportError:  # Windows

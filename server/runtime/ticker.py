@@ -8,18 +8,15 @@ gets always agrees with the server time. A server at 32 Hz that was stopped for 
 server that is too slow for its rate is never further behind than that, and shows it in `skipped_s`.
 """
 
-import asyncio
-import ctypes
 import math
-import os
-import sys
 import time
 from collections.abc import Callable
-from typing import Any, Protocol
+from typing import Any
 
 from server.config.limits import catch_up_ticks
 from server.observability.errors import FaultReporter
 from server.observability.histogram import Histogram
+from server.runtime.alarm import Alarm
 
 FAILURES_MAX = 10
 """Number of ticks in a row that may raise before the ticker stops."""
@@ -61,6 +58,10 @@ class Schedule:
             self._in_a_row = 0
             return None
         self.late_s = now - deadline
+        if self._in_a_row < self._catch_up and self.start + (self._slot + 1) / self.rate > now:  # no other one is due
+            self._slot += 1
+            self._in_a_row = 0
+            return deadline
         self._drop(now, self._catch_up - self._in_a_row)
         deadline = self.deadline
         self._slot += 1
@@ -77,83 +78,6 @@ class Schedule:
         dropped = max(to_come - self._slot - keep, 0)
         self._slot += dropped
         self.skipped += dropped
-
-
-class Alarm(Protocol):
-    """A timer that calls a function once, at or after a time of `time.monotonic()`."""
-
-    def set(self, at: float) -> None:
-        """Sets the time in seconds and replaces the one set before. A time in the past means now."""
-
-    def close(self) -> None:
-        """Stops the timer."""
-
-
-class LoopAlarm:
-    """A timer of the event loop. Exists everywhere; about 0.6 ms late (p99 1.5 ms) at a timer resolution of 1 ms."""
-
-    def __init__(self, loop: asyncio.AbstractEventLoop, ring: Callable[[], None]) -> None:
-        self._loop = loop
-        self._ring = ring
-        self._handle: asyncio.TimerHandle | None = None
-
-    def set(self, at: float) -> None:
-        self.close()
-        self._handle = self._loop.call_later(max(0.0, at - time.monotonic()), self._ring)
-
-    def close(self) -> None:
-        if self._handle is not None:
-            self._handle.cancel()
-
-
-class TimerfdAlarm:
-    """A Linux timerfd that the event loop reads. About 0.1 ms late (p99 0.3 ms).
-
-    It is created with ctypes because `os.timerfd_create` needs Python 3.13.
-
-    Raises:
-        OSError: the system has no timerfd.
-    """
-
-    def __init__(self, loop: asyncio.AbstractEventLoop, ring: Callable[[], None]) -> None:
-        if sys.platform != "linux" or ctypes.sizeof(ctypes.c_long) != 8:
-            raise OSError("timerfd: for 64-bit Linux only")
-        self._libc = ctypes.CDLL(None, use_errno=True)
-        self._fd = self._libc.timerfd_create(time.CLOCK_MONOTONIC, os.O_NONBLOCK | os.O_CLOEXEC)
-        if self._fd < 0:
-            raise OSError(ctypes.get_errno(), "timerfd_create")
-        self._loop = loop
-        self._ring = ring
-        loop.add_reader(self._fd, self._read)
-
-    def set(self, at: float) -> None:
-        # struct itimerspec: interval (0: fires once) and value, each in seconds and nanoseconds; a value of 0 disarms.
-        seconds, ns = divmod(max(1, int(at * 1e9)), 1_000_000_000)
-        spec = (ctypes.c_long * 4)(0, 0, seconds, ns)
-        timer_abstime = 1
-        if self._libc.timerfd_settime(self._fd, timer_abstime, spec, None) < 0:
-            raise OSError(ctypes.get_errno(), "timerfd_settime")
-
-    def close(self) -> None:
-        if self._fd >= 0:
-            self._loop.remove_reader(self._fd)
-            os.close(self._fd)
-            self._fd = -1
-
-    def _read(self) -> None:
-        try:
-            os.read(self._fd, 8)
-        except BlockingIOError:  # the timer was set again after it was reported ready
-            return
-        self._ring()
-
-
-def best_alarm(loop: asyncio.AbstractEventLoop, ring: Callable[[], None]) -> Alarm:
-    """Returns the most punctual timer that this system and this event loop offer."""
-    try:
-        return TimerfdAlarm(loop, ring)
-    except (OSError, AttributeError, NotImplementedError):
-        return LoopAlarm(loop, ring)
 
 
 class Ticker:

@@ -1,14 +1,13 @@
-"""The schedule, exactly; the ticker with a simulated clock and alarm; the real alarms once."""
+"""The schedule, exactly; the ticker with a simulated clock and alarm."""
 
-import asyncio
 import logging
-import time
 from collections.abc import Callable
 
 import pytest
 
 from server.config.limits import catch_up_ticks
-from server.runtime.ticker import FAILURES_MAX, Alarm, LoopAlarm, Schedule, Ticker, TimerfdAlarm, best_alarm
+from server.runtime.alarm import Alarm
+from server.runtime.ticker import FAILURES_MAX, Schedule, Ticker
 
 RATE = 32  # a power of two: every deadline below is exact
 PERIOD = 1 / RATE
@@ -206,35 +205,6 @@ def test_nothing_runs_after_stop_not_even_a_ring_under_way() -> None:
     bench.ticker.stop()
     bench.ring()
     assert (len(bench.calls), bench.at) == (2, None)
-
-
-@pytest.mark.parametrize("make", [LoopAlarm, TimerfdAlarm, best_alarm])
-async def test_alarms_ring_once_never_early_and_not_after_close(
-    make: Callable[[asyncio.AbstractEventLoop, Callable[[], None]], Alarm],
-) -> None:
-    loop, rang = asyncio.get_running_loop(), asyncio.Event()
-    rings: list[float] = []
-
-    def ring() -> None:
-        rings.append(time.monotonic())
-        rang.set()
-
-    try:
-        alarm = make(loop, ring)
-    except OSError as error:
-        pytest.skip(str(error))
-    for delay_s in (0.01, 0.0, -1.0):
-        at = time.monotonic() + delay_s
-        rang.clear()
-        alarm.set(at + 60)
-        alarm.set(at)
-        await asyncio.wait_for(rang.wait(), 5)
-        assert rings[-1] >= at - 0.001  # asyncio's own timers may be early by their resolution
-    alarm.set(time.monotonic())
-    alarm.close()
-    alarm.close()
-    await asyncio.sleep(0.01)
-    assert len(rings) == 3
 
 
 @pytest.mark.parametrize("phase", [0.0, 0.25, 0.5, 0.75])

@@ -9,10 +9,10 @@ import pytest
 from server.config.settings import Settings, parse
 from server.game import Game
 from server.game.loading import at_once
-from server.hosting import host as host_module
 from server.hosting.declared import declared_kinds
 from server.hosting.host import WorldHost
 from server.rules import Rules
+from server.runtime.alarm import SharedTimer
 from server.runtime.terrain import TerrainPool
 from server.worlds.worlds import Worlds
 from shared import messages
@@ -51,7 +51,7 @@ class Alarm:
 
     all: list["Alarm"]
 
-    def __init__(self, loop: object, ring: Callable[[], None]) -> None:
+    def __init__(self, ring: Callable[[], None]) -> None:
         self.ring, self.at = ring, -1.0
         Alarm.all.append(self)
 
@@ -148,7 +148,7 @@ class Bench:
 
 
 def fake_alarms(monkeypatch: pytest.MonkeyPatch) -> list[Alarm]:
-    """Replaces the timers of tickers. Returns those that are set, now and later."""
+    """Replaces the alarms of tickers. Returns those that are set, now and later."""
     Alarm.all = []
-    monkeypatch.setattr(host_module, "best_alarm", Alarm)
+    monkeypatch.setattr(SharedTimer, "alarm", lambda timer, ring: Alarm(ring))
     return Alarm.all
