@@ -191,6 +191,8 @@ class TickEncoder:
             self._allocate(len(w.changed))
         mine = self._ids, self._parts, self._due, self._packed
         n_parts = self._world.kernel.news(w.entities, w.changed, w.lengths, tick, self._check_ticks, *mine)
+        if not n_parts and not self._due[0]:
+            return [], set()
         deltas: list[SegmentDelta] = []
         start = at = 0
         parts = self._parts[:n_parts].tolist()

@@ -376,7 +376,8 @@ class World(TurnWorld):
                 self._told = self.kernel.lent(self._inputs)
             self._inputs[: len(told)] = told
         self.tick += 1
-        self.edited, self.editing = self.editing, {}
+        if self.editing or self.edited:
+            self.edited, self.editing = self.editing, {}
         if self.placing or self.placed:
             self.placed, self.placing = self.placing, set()
         if self.extras.count:

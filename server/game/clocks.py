@@ -67,6 +67,8 @@ class Clocks:
 
     def refill(self) -> None:
         """Lets each client send further messages, those of one tick. The fast path does it for its sessions."""
+        if self._connections.all_fast:
+            return
         most = self._limits.messages_per_tick
         for session in self._connections.sessions:
             if session.row >= 0:
@@ -78,6 +80,8 @@ class Clocks:
 
     def check(self, now: float) -> None:
         """Closes the connections of clients that have exceeded a time limit."""
+        if self._connections.all_fast:
+            return
         limits, kick = self._limits, self._connections.kick
         for session in tuple(self._connections.sessions):
             if session.row >= 0 or session.closed:

@@ -27,6 +27,10 @@ class Commands:
     ) -> None:
         self._world, self._api, self._limits, self._faults, self._saves = world, api, limits, faults, saves
         self._ahead = bounds(world.scene.tick_rate).ahead
+        self._edits_max = 2 * limits.edits_per_s
+        self._edits_per_tick = limits.edits_per_s / world.scene.tick_rate
+        self._waiting = False
+        """Whether a player may have commands that wait."""
 
     @property
     def trouble(self) -> bool:
@@ -49,14 +53,14 @@ class Commands:
             player.settle(command.number, messages.TOO_MANY)
         else:
             player.commands.append(command)
+            self._waiting = True
 
     def carry_out(self) -> None:
         """Carries out the due commands of all players, in the order in which the players joined."""
+        if not self._waiting:
+            return
         tick = self._world.tick + 1
-        rate = self._limits.edits_per_s
         for player in tuple(self._api.players.values()):
-            if player.edits_left != 2 * rate:
-                player.edits_left = min(player.edits_left + rate / self._world.scene.tick_rate, 2 * rate)
             while player.commands and player.commands[0].tick <= tick:
                 if player.session is not None and player.session.closed:
                     break
@@ -73,6 +77,7 @@ class Commands:
                 reason = self._api.hooks.reason
                 self._api.outcome.verdicts.append((player.entity, command.number, verdict, reason))
                 self._world.note(persisted_state.note_of_answer(player.entity, command.number, verdict, reason))
+        self._waiting = any(player.commands for player in self._api.players.values())
 
     def _verdict(self, player: Player, command: Command) -> int:
         if command.name != edits.NAME:
@@ -80,9 +85,20 @@ class Commands:
         edit = edits.unpack(command.payload)
         if edit is None:
             return messages.INVALID
+        self._refill(player)
         if player.edits_left < 1:
             return messages.TOO_MANY
         player.edits_left -= 1
         if not self._api.hooks.may_edit(player, edit):
             return messages.FORBIDDEN
         return edits.apply(self._world, player.entity, edit)
+
+    def _refill(self, player: Player) -> None:
+        """Adds the edits of the ticks since the latest call to those that a player may do now."""
+        tick = self._world.tick + 1
+        left, most = min(player.edits_left, self._edits_max), self._edits_max
+        for _ in range(player.edits_tick, tick):
+            if left == most:
+                break
+            left = min(left + self._edits_per_tick, most)
+        player.edits_left, player.edits_tick = left, tick

@@ -29,6 +29,13 @@ class Connections:
     def __init__(self, roster: Roster, counters: Counters, faults: FaultReporter) -> None:
         self._roster, self._counters, self._faults = roster, counters, faults
         self.sessions: list[Session] = []
+        self.fast = 0
+        """Number of sessions on the fast path (`server.game.fast_path`)."""
+
+    @property
+    def all_fast(self) -> bool:
+        """Whether all sessions are on the fast path, so that each of them plays and has nothing special to do."""
+        return self.fast == len(self.sessions)
 
     def open(self, link: Transport, now: float) -> Session:
         """Adds a new connection and returns its session."""

@@ -60,7 +60,7 @@ class FastPath:
         counters: where snapshots and bytes are counted.
         clocks: the time of the tick, and the allowances of messages.
         players: the players by entity.
-        connections: ends a connection that fails.
+        connections: counts the sessions here, and ends a connection that fails.
         receive: takes a message of a session that is not on the fast path: session, message, time of arrival.
         kernel: the kernel to use.
         newest: returns the latest tick whose inputs were taken; None: that of the world.
@@ -108,8 +108,6 @@ class FastPath:
         self._measuring = Arguments(kernel, "d", values=(0.0, *spans, flow.STALL_RTTS, flow.HOLD_S_MAX, 1 / rate))
         self._shared = 0
         """Version of the shared values that all sessions here have been sent."""
-        self._n = 0
-        """Number of sessions here."""
 
     # -- the tick ------------------------------------------------------------------------------------------
 
@@ -124,7 +122,7 @@ class FastPath:
             The inputs by entity.
         """
         rows = self._rows
-        if not self._n:
+        if not self._connections.fast:
             return {}
         n = self._kernel.take_inputs(
             rows.numbers_lent,
@@ -142,7 +140,7 @@ class FastPath:
     def confirm(self, tick: int) -> None:
         """Files the statuses of a tick at an edge, whose record has the inputs that were taken for it."""
         self._confirmed = tick
-        if self._n:
+        if self._connections.fast:
             rows = self._rows
             self._kernel.confirm_inputs(rows.numbers_lent, rows.unrecorded_lent, tick, rows.most)
 
@@ -158,7 +156,7 @@ class FastPath:
             shared: version of the shared values.
             now: the current time in seconds.
         """
-        if not self._n:
+        if not self._connections.fast:
             return
         if shared != self._shared:
             self.recall_all()
@@ -247,6 +245,8 @@ class FastPath:
         for latest in self._changed:
             lengths[latest] = 0
         self._changed.clear()
+        if self._log.quiet:
+            return b""
         deltas, parts, at = self._log.since(self._world.tick - 1), [], 0
         for segment in deltas.changed:
             number = self._numbers.get(segment)
@@ -273,7 +273,7 @@ class FastPath:
         if not fits(session, tick, self._newest(), self._rows.slots):
             session.plain = 0
             return
-        if self._n == 0:
+        if not self._connections.fast:
             self._shared = shared
         elif shared != self._shared:
             return
@@ -285,7 +285,7 @@ class FastPath:
         session.fast_path, session.enrolled, session.plain = self, tick, 0
         if session.framed is not None:
             session.framed.inlet = partial(self.arrivals.post_frame, session.row)
-        self._n += 1
+        self._connections.fast += 1
 
     def _see(self, segment: Cell) -> int:
         """Notes that one more session sees a segment. Returns the segment's number."""
@@ -326,7 +326,7 @@ class FastPath:
         soon = self._world.tick - session.enrolled < SOON
         session.patience = min(2 * max(session.patience, PATIENCE), PATIENCE_MAX) if soon else PATIENCE
         session.plain = 0
-        self._n -= 1
+        self._connections.fast -= 1
 
     def recall_all(self) -> None:
         """Takes all sessions off the fast path."""

@@ -183,6 +183,8 @@ class Front:
         fast_path = self.fast_path
         if fast_path is not None:
             fast_path.send(values.version, now)
+            if self.connections.all_fast:
+                return
         for session in tuple(self.sessions):
             if session.row < 0 and session.entity and not session.closed:
                 try:

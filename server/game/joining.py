@@ -103,6 +103,8 @@ class Joining:
 
         Their time limits begin now: a client sends nothing while its player is loaded.
         """
+        if self._connections.all_fast:
+            return
         sessions = self._connections.sessions
         joining = [session for session in sessions if session.hello is not None and not session.closed]
         for session in joining[: self._limits.joins_per_tick]:

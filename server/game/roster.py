@@ -76,7 +76,7 @@ class Roster:
         if entity is None:
             return None
         player = self._api.players[entity] = Player(entity, name, session.subject, self._queue())
-        player.edits_left = 0.0  # otherwise each leave and new join would give another burst
+        player.edits_left, player.edits_tick = 0.0, self._world.tick  # a leave and a new join give no other burst
         player.announced, player.loaded = False, loaded
         if session.reserved is not None:
             player.handed, session.reserved.player = session.reserved.data, player

@@ -60,7 +60,8 @@ class Sequencer:
         api, world = self._api, self._world
         with api.turn:
             api.hooks.start()
-            self._roster.leave(now)
+            if len(api.players) > self._connections.fast:  # otherwise all players have a connection
+                self._roster.leave(now)
             self._joining.join(now)
             self._roster.revive()
             self._commands.carry_out()
@@ -97,8 +98,11 @@ class Sequencer:
             inputs = {entity: player.inputs.take(tick) for entity, player in players.items()}
         else:
             inputs = self.fast_path.take(tick, everyone=world.recorded or world.extras.count > 0)
-            inputs |= {entity: player.inputs.take(tick) for entity, player in players.items() if player.row < 0}
-            inputs = {entity: inputs[entity] for entity in sorted(inputs)}  # players join with ascending numbers
-        inputs.update(api.steered)
-        api.steered.clear()
+            if len(players) > self._connections.fast:
+                inputs |= {entity: player.inputs.take(tick) for entity, player in players.items() if player.row < 0}
+            if len(inputs) > 1:
+                inputs = {entity: inputs[entity] for entity in sorted(inputs)}  # players join with ascending numbers
+        if api.steered:
+            inputs.update(api.steered)
+            api.steered.clear()
         return inputs

@@ -84,7 +84,7 @@ class Hooks:
         for _ in range(len(self._soon)):  # functions that these pass to `soon` wait for the next tick
             act, arguments = self._soon.popleft()
             self._call(act, *arguments)
-        for method, values in self._timers.due(self._world.tick + 1):
+        for method, values in self._timers.due(self._world.tick + 1) if self._timers.waiting else ():
             found = getattr(self._rules, method, None)
             self._call(*((self._lacks, method) if found is None else (found, *values)))
 
@@ -160,12 +160,14 @@ class Hooks:
 
     def act(self) -> None:
         """Calls the hooks of contacts and zones for what is new, then `on_tick`."""
-        self._watchers.report(self._call)
+        if not self._watchers.idle:
+            self._watchers.report(self._call)
         self._call(self._rules.on_tick)
 
     def stepped(self) -> None:
         """Takes note of what the step has changed, for the hooks of contacts and zones. Call it after the step."""
-        self._watchers.stepped()
+        if not self._watchers.idle:
+            self._watchers.stepped()
 
     # -- called by the game API ------------------------------------------------------------------------------
 

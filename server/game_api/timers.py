@@ -34,6 +34,11 @@ class Timers:
         heapify(self._queue)
         self._number = max(entries.table, default=0)
 
+    @property
+    def waiting(self) -> bool:
+        """Whether a timer may wait."""
+        return bool(self._queue)
+
     def start(self, now: int, ticks: int, method: str, arguments: bytes) -> int:
         """Starts a timer and returns its number.
 

@@ -35,6 +35,8 @@ class Watchers:
         self._reports_contacts = overrides(rules, "on_contact") or overrides(rules, "on_contact_end")
         self._blocks = BlockContacts(world, goes_on=goes_on) if overrides(rules, "on_block_contact") else None
         self._reports_visits = overrides(rules, "on_enter") or overrides(rules, "on_exit")
+        self.idle = not (self._reports_contacts or self._reports_visits or self._blocks is not None)
+        """Whether the rules have none of the hooks."""
         self._stepped = np.zeros(0, np.int64)
 
     @property

@@ -51,8 +51,8 @@ class Player:
         sends the command again and gets the same verdict."""
         self.reasons: dict[int, str] = {}
         """Reasons of the refusals among `settled` for which the rules gave one."""
-        self.edits_left = math.inf
-        """Number of edits that the player may do now; it grows with time."""
+        self.edits_left, self.edits_tick = math.inf, 0
+        """Number of edits that the player could do in a tick, and that tick. It grows with time up to a limit."""
         self.tokens: list[bytes] = []
         """Digests of the valid resume tokens: the newest one, and the one before until the client has the newest."""
         self.reconnect_until = math.inf

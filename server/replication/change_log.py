@@ -52,7 +52,15 @@ class _Tick:
 
     def more(self) -> set[Cell]:
         """Returns the segments with changes other than motion: removals, edits, attributes, extra columns."""
+        if not (self.gone or self.edited or self.attributes or self.fields):
+            return NOWHERE
         return self.gone.keys() | self.edited.keys() | self.attributes.keys() | self.fields.keys()
+
+
+NOWHERE: set[Cell] = set()
+"""No segments. It stays empty."""
+UNCHANGED = _Tick()
+"""A tick without changes. It stays as it is."""
 
 
 class DeltaCache(dict[Cell, bytes]):
@@ -126,6 +134,8 @@ class ChangeLog:
         }
         self.moved: list[int] = []
         """Entities that have come into a segment in the latest recorded tick."""
+        self.quiet = True
+        """Whether the latest recorded tick has changed nothing that clients are sent."""
         self._parts: dict[int, DeltaCache] = {}
         self._packed: dict[Cell, tuple[int, bytes]] = {}
         self._packs_left = PACKS_PER_TICK
@@ -169,18 +179,32 @@ class ChangeLog:
         Deltas of the newest tick, which are nearly all, are made of these packed changes. Python code handles only
         entities that have come into another segment.
         """
-        now, homes = self._now, self._home
+        world, now = self._world, self._now
+        deltas, self._due = self._encoder.pack(now.acted, world.placed)
+        self._latest = {segment: packed for segment, _, _, packed in deltas}
+        self._latest_fields = {}
+        self.moved.clear()
+        self._parts.clear()
+        self._packs_left = PACKS_PER_TICK
+        noted = now.acted or now.gone or world.placed or world.edited or self._attributes_changed or world.fields_set
+        self.quiet = not (deltas or self._due or noted)
+        if self.quiet:
+            self._ticks.put(world.tick, UNCHANGED)
+            return
+        self._file(now, deltas)
+        self._ticks.put(world.tick, now)
+        self._now = _Tick()
+
+    def _file(self, now: _Tick, deltas: list[SegmentDelta]) -> None:
+        """Files the changes of a tick in `now`. `deltas` are those of the entities' states."""
+        homes = self._home
         now.placed = self._world.placed
         if now.placed:
             self._placed_at = self._world.tick
         for x, y, z in self._world.edited:
             now.edited[segment_of(x, y, z)].add(offset_of(x, y, z))
-        deltas, self._due = self._encoder.pack(now.acted, now.placed)
-        self._latest = {}
-        self.moved.clear()
-        for segment, ids, whole, packed in deltas:
+        for segment, ids, whole, _ in deltas:
             now.changed[segment] = ids
-            self._latest[segment] = packed
             for entity in whole:
                 home = homes.get(entity)
                 if home != segment:
@@ -197,10 +221,6 @@ class ChangeLog:
         self._attributes_changed.clear()
         if self._world.extras.count:
             self._record_fields(now, deltas)
-        self._ticks.put(self._world.tick, now)
-        self._now = _Tick()
-        self._parts.clear()
-        self._packs_left = PACKS_PER_TICK
 
     def _record_fields(self, now: _Tick, deltas: list[SegmentDelta]) -> None:
         """Packs the extra columns of the entities that are sent whole, and of those whose extra columns changed."""
