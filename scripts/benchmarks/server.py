@@ -70,6 +70,68 @@ class RigError(Exception):
     """A process of the benchmark has failed. The message says why."""
 
 
+class Load:
+    """A process that generates load (`scripts.loadgen.generator`).
+
+    Args:
+        port: port of the server.
+        seed: source of the players' chance.
+        paths: paths that the players join in turn.
+    """
+
+    def __init__(self, port: int, *, seed: int = 1, paths: Sequence[str] = ("/",)) -> None:
+        order = {"port": port, "seed": seed, "rate": RATE, "joins_per_s": JOINS_PER_S, "paths": paths}
+        self._process, self._errors = _started("scripts.loadgen.generator", json.dumps(order))
+        self._said: queue.Queue[Figures] = queue.Queue()
+        threading.Thread(target=self._listen, daemon=True).start()
+
+    def hold(self, clients: int) -> bool:
+        """Waits until `clients` play and have their terrain. Returns whether all of them play."""
+        self.tell(f"clients {clients}")
+        deadline, all_play = time.monotonic() + clients / JOINS_PER_S + JOIN_S, False
+        while time.monotonic() < deadline and not all_play:
+            status = self.next()
+            all_play = status.get("playing") == clients == status.get("clients")
+        time.sleep(SETTLE_S)
+        return all_play
+
+    def tell(self, command: str) -> None:
+        """Sends a command of the generator."""
+        assert self._process.stdin is not None
+        self._process.stdin.write(command + "\n")
+        self._process.stdin.flush()
+
+    def next(self) -> Figures:
+        """Returns the next figures that the generator reports, or has reported."""
+        try:
+            return self._said.get(timeout=PATIENCE_S)
+        except queue.Empty:
+            cause = self._errors.cause(self._process.poll())
+            raise RigError(f"the generator of load does not answer: {cause}") from None
+
+    def drain(self) -> Figures:
+        """Returns the newest figures that the generator has reported; empty if there are none."""
+        status: Figures = {}
+        while not self._said.empty():
+            status = self._said.get()
+        return status
+
+    def stop(self) -> None:
+        """Asks the process to end. `close` waits for that."""
+        self._process.terminate()
+
+    def close(self) -> None:
+        """Ends the process."""
+        self.stop()
+        _end(self._process)
+
+    def _listen(self) -> None:
+        assert self._process.stdout is not None
+        with contextlib.suppress(ValueError):  # closed
+            for line in self._process.stdout:
+                self._said.put(json.loads(line))
+
+
 class Rig:
     """A server process and a process that generates load.
 
@@ -80,35 +142,26 @@ class Rig:
     """
 
     def __init__(self, *command: str, seed: int = 1, paths: Sequence[str] = ("/",)) -> None:
-        self._server, errors = self._start(*command)
+        self._server, errors = _started(*command)
         assert self._server.stdout is not None
         line = self._server.stdout.readline()
         if not line.startswith("listening on "):
-            self._end(self._server)
+            _end(self._server)
             raise RigError(f"the server did not start: {errors.cause(self._server.returncode)}")
         self.port = int(line.rpartition(":")[2])
-        order = {"port": self.port, "seed": seed, "rate": RATE, "joins_per_s": JOINS_PER_S, "paths": paths}
-        self._generator, self._errors = self._start("scripts.loadgen.generator", json.dumps(order))
-        self._said: queue.Queue[Figures] = queue.Queue()
-        threading.Thread(target=self._listen, daemon=True).start()
+        self.load = Load(self.port, seed=seed, paths=paths)
 
     def hold(self, clients: int, seconds: float) -> Figures:
         """Waits until `clients` play, then measures for `seconds`. Returns the counts of both sides."""
-        self._tell(f"clients {clients}")
-        deadline = time.monotonic() + clients / JOINS_PER_S + JOIN_S
-        while time.monotonic() < deadline:
-            status = self._next()
-            if status.get("playing") == clients == status.get("clients"):
-                break
-        time.sleep(SETTLE_S)
-        gone = self._drain().get("gone", 0)
+        self.load.hold(clients)
+        gone = self.load.drain().get("gone", 0)
         before = self.stats()
-        self._tell("begin")
+        self.load.tell("begin")
         time.sleep(seconds)
-        self._tell("end")
-        figures = self._next()
+        self.load.tell("end")
+        figures = self.load.next()
         while "seconds" not in figures:
-            figures = self._next()
+            figures = self.load.next()
         after = self.stats()
         ticks = max(1, after["ticks"] - before["ticks"])
         cpu_s = after["cpu_s"] - before["cpu_s"]
@@ -149,7 +202,7 @@ class Rig:
 
     def leaving(self, per_s: float) -> None:
         """Makes the oldest clients leave from now on, `per_s` per second, each replaced by a new one."""
-        self._tell(f"leaving {per_s}")
+        self.load.tell(f"leaving {per_s}")
 
     def collect(self) -> float:
         """Makes the server collect all its garbage, which not every kind can. Returns the CPU time in seconds."""
@@ -168,58 +221,34 @@ class Rig:
             return dict(json.loads(connection.getresponse().read()))
 
     def close(self) -> None:
-        for process in (self._generator, self._server):
-            process.terminate()
-        for process in (self._generator, self._server):
-            self._end(process)
+        self.load.stop()
+        self._server.terminate()
+        self.load.close()
+        _end(self._server)
 
-    @staticmethod
-    def _end(process: subprocess.Popen[str]) -> None:
-        """Waits at most `PATIENCE_S` for a process to end, then kills it."""
-        try:
-            process.wait(PATIENCE_S)
-        except subprocess.TimeoutExpired:
-            process.kill()
-            process.wait()
-        for pipe in (process.stdin, process.stdout):
-            if pipe is not None:
-                with contextlib.suppress(OSError):
-                    pipe.close()
 
-    @staticmethod
-    def _start(module: str, *arguments: str) -> tuple[subprocess.Popen[str], Stderr]:
-        command, errors = (sys.executable, "-m", module, *arguments), Stderr()
-        try:
-            process = subprocess.Popen(
-                command, cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=errors.pipe, text=True
-            )
-        finally:
-            errors.started()
-        return process, errors
+def _started(module: str, *arguments: str) -> tuple[subprocess.Popen[str], Stderr]:
+    command, errors = (sys.executable, "-m", module, *arguments), Stderr()
+    try:
+        process = subprocess.Popen(
+            command, cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=errors.pipe, text=True
+        )
+    finally:
+        errors.started()
+    return process, errors
 
-    def _listen(self) -> None:
-        assert self._generator.stdout is not None
-        with contextlib.suppress(ValueError):  # closed
-            for line in self._generator.stdout:
-                self._said.put(json.loads(line))
 
-    def _next(self) -> Figures:
-        try:
-            return self._said.get(timeout=PATIENCE_S)
-        except queue.Empty:
-            cause = self._errors.cause(self._generator.poll())
-            raise RigError(f"the generator of load does not answer: {cause}") from None
-
-    def _drain(self) -> Figures:
-        status: Figures = {}
-        while not self._said.empty():
-            status = self._said.get()
-        return status
-
-    def _tell(self, command: str) -> None:
-        assert self._generator.stdin is not None
-        self._generator.stdin.write(command + "\n")
-        self._generator.stdin.flush()
+def _end(process: subprocess.Popen[str]) -> None:
+    """Waits at most `PATIENCE_S` for a process to end, then kills it."""
+    try:
+        process.wait(PATIENCE_S)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        process.wait()
+    for pipe in (process.stdin, process.stdout):
+        if pipe is not None:
+            with contextlib.suppress(OSError):
+                pipe.close()
 
 
 @contextlib.contextmanager

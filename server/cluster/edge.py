@@ -151,7 +151,8 @@ class EdgePart(Part):
     def stats(self) -> dict[str, Any]:
         core = self.core
         figures: dict[str, Any] = {"edge_lead_ms": round(1e3 * self.clock.lead_s, 3), "batches_late": self.clock.late}
-        figures |= {"bus_round_trip_ms": self.round_trip.summary(), "sheds": self.sheds}
+        figures |= {"bus_round_trip_ms": self.round_trip.summary(), "bus_round_trip_counts": self.round_trip.counts()}
+        figures["sheds"] = self.sheds
         if core is not None:
             figures |= {**core.stats(), "handovers_asked": core.moves.asked}
         return {**super().stats(), **figures}

@@ -103,7 +103,7 @@ def test_the_benchmark_names_what_is_missing(
     monkeypatch.setattr(bench, "ROOT", tmp_path)
     monkeypatch.setattr(bench, "PATIENCE_S", 3.0)
     with pytest.raises(bench.RigError, match="No module named 'no_such_library'") as told, rig(tmp_path) as running:
-        running._next()
+        running.load.next()
     assert str(told.value).startswith(error or "the generator of load does not answer")
 
 
