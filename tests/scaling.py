@@ -36,11 +36,11 @@ def causes(player: Participant) -> Counter[str]:
 
 
 def hashes_agree(match: ScaledMatch) -> None:
-    """Checks that all parts had the same world at every tick of the log."""
+    """Checks that all parts had the same world at the ticks of the log at which they compared it."""
     ticks = [record.tick for record in map(record_of, match.log.records) if record.journal is not None]
     assert match.differ == []
     assert ticks == list(range(1, len(ticks) + 1))
-    assert set(match.hashes) == set(ticks)
+    assert set(match.hashes) == {tick for tick in ticks if tick % match.hash_every == 0} != set()
 
 
 def asks(sent: Counter[str]) -> Policy:

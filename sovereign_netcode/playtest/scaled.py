@@ -178,7 +178,7 @@ class ScaledMatch(Simulation):
         rules: Callable[[], Rules] | None = None,
         bus: Mapping[str, Any] = MappingProxyType({}),
         fails: tuple[float, float] | None = None,
-        hash_every: int = 1,
+        hash_every: int = 4,
     ) -> None:
         super().__init__(seed)
         self.hash_every = hash_every

@@ -14,7 +14,7 @@ from server.journal.records import replay
 from tests.behaving import BUTTONS, CLASSES, Acrobat, Presser, scene
 from tests.e2e.processes import START_S, ServerProcess, running, stats
 from tests.e2e.test_kills import looked_at
-from tests.lengths import long
+from tests.lengths import contained, long
 
 pytestmark = pytest.mark.e2e
 
@@ -45,7 +45,7 @@ def play(url: str, seconds: float, seed: int) -> None:
         assert len(joined) == len(clients)
 
 
-@pytest.mark.parametrize("kills", [1, *long(12)])
+@pytest.mark.parametrize("kills", [*contained(1), *long(12)])
 def test_no_state_of_behaviours_is_lost_in_kills(tmp_path: Path, kills: int) -> None:
     data, expected = tmp_path / "data", None
     for life in range(kills):

@@ -25,6 +25,7 @@ from shared.snapshot import VERDICT, decode_parts
 from shared.units import BLOCK
 from shared.world import World
 from tests.e2e.processes import END_S, ServerProcess, page, running, stats, until
+from tests.lengths import contained
 
 pytestmark = pytest.mark.e2e
 
@@ -147,7 +148,7 @@ def looked_at(data: Path, scene: Scene, copy: Path, game: str = "") -> tuple[Wor
     return store.world, store.restored
 
 
-@pytest.mark.parametrize("kills", [5, pytest.param(50, marks=[pytest.mark.slow, pytest.mark.longest])])
+@pytest.mark.parametrize("kills", [*contained(5), pytest.param(50, marks=[pytest.mark.slow, pytest.mark.longest])])
 def test_no_acknowledged_edit_is_lost_in_kills(tmp_path: Path, kills: int) -> None:
     seed = 17
     rng, cells, scene = random.Random(seed), Cells(), load_scene("flat")

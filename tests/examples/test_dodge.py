@@ -14,7 +14,7 @@ from sovereign_netcode.playtest import PRESETS, Link, Match, Player, check_behav
 from sovereign_netcode.shared.inputs import NEUTRAL, Input, make_input
 from sovereign_netcode.shared.scene import load_scene
 from tests.examples.played import check, played
-from tests.lengths import long, long_but
+from tests.lengths import contained, long, long_but
 
 DASH, FIRE = 2, 4
 """Bits of the buttons, which are "jump", "dash" and "fire"."""
@@ -27,7 +27,7 @@ class Small(Dodge):
     players_min = 0
 
 
-@pytest.mark.parametrize(("seconds", "seed"), [(3, 1), *long((20, 902))], ids=["short", "long"])
+@pytest.mark.parametrize(("seconds", "seed"), [*contained((3, 1)), *long((20, 902))], ids=["short", "long"])
 @pytest.mark.parametrize("link", LINKS)
 def test_bots_play(link: str, seconds: float, seed: int) -> None:
     match = played(Small(), [DodgePlayer() for _ in range(3)], link, seconds, seed)

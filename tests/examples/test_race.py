@@ -14,7 +14,7 @@ from sovereign_netcode.shared.checks import SceneError
 from sovereign_netcode.shared.inputs import NEUTRAL, Input, make_input
 from sovereign_netcode.shared.scene import load_scene
 from tests.examples.played import check, played
-from tests.lengths import long, long_but
+from tests.lengths import contained, long, long_but
 
 BOOST = 2
 """Bit of the button "boost"."""
@@ -27,7 +27,7 @@ class Small(Race):
     players_min = 0
 
 
-@pytest.mark.parametrize(("seconds", "seed"), [(8, 1), *long((30, 902))], ids=["short", "long"])
+@pytest.mark.parametrize(("seconds", "seed"), [*contained((8, 1)), *long((30, 902))], ids=["short", "long"])
 @pytest.mark.parametrize("link", LINKS)
 def test_bots_race(link: str, seconds: float, seed: int) -> None:
     match = played(Small(), [RacePlayer() for _ in range(3)], link, seconds, seed)

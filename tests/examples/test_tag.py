@@ -14,7 +14,7 @@ from sovereign_netcode.playtest import Link, Match, Player, bot
 from sovereign_netcode.server.journal.records import NOTE, Recording
 from sovereign_netcode.server.players.persisted_state import restored
 from sovereign_netcode.shared.scene import load_scene
-from tests.lengths import long
+from tests.lengths import contained, long
 
 TYPICAL = Link(0.05, 0.01, 0.01)
 CAUSES = {"late input", "other entity", "server act", "unknown edit", "missing terrain"}
@@ -42,7 +42,7 @@ def said(match: Match) -> dict[int, Any]:
     return {entity: match.game.api.kept.attributes.get(entity) for entity in match.game.api.entities()}
 
 
-@pytest.mark.parametrize(("count", "seconds"), [(6, 15), *long((20, 50))], ids=["short", "long"])
+@pytest.mark.parametrize(("count", "seconds"), [*contained((6, 15)), *long((20, 50))], ids=["short", "long"])
 def test_bots_play_tag_and_a_recording_gives_the_same_scores(count: int, seconds: float) -> None:
     match, players, file = played(count, seconds, 21, TYPICAL)
     game = match.game

@@ -6,13 +6,13 @@ import pytest
 
 from scripts.fuzzing import app as fuzz
 from scripts.fuzzing import targets
-from tests.lengths import long
+from tests.lengths import contained, long
 
 INPUTS = {"client": 20_000, "server": 10_000, "value": 10_000, "edit": 10_000, "session": 8_000, "settings": 150}
 SEED = 7
 
 
-@pytest.mark.parametrize("share", [0.05, *long(1.0)])
+@pytest.mark.parametrize("share", [*contained(0.05), *long(1.0)])
 @pytest.mark.parametrize("name", sorted(targets.TARGETS))
 def test_a_short_run_from_the_corpus_that_is_kept(name: str, share: float) -> None:
     found = fuzz.fuzz(name, round(share * INPUTS[name]), SEED)

@@ -13,7 +13,7 @@ import pytest
 from server.persistence import mark
 from server.persistence.database import StoreError
 from server.persistence.store import Store
-from tests.lengths import long
+from tests.lengths import contained, long
 from tests.server.test_store import SCENE, altered, keep, refused
 from tests.server.test_store_faults import HEAD, Torn, damaged_copy, found_in
 
@@ -99,7 +99,7 @@ def test_a_world_that_lost_its_file_is_named(torn: Torn, tmp_path: Path) -> None
     assert "world.db: damaged (it is missing, and world.mark is there)" in refused(copy)
 
 
-@pytest.mark.parametrize("every", [4, *long(1)])
+@pytest.mark.parametrize("every", [*contained(4), *long(1)])
 def test_a_flipped_bit_in_the_file_is_named_or_makes_no_difference(torn: Torn, tmp_path: Path, every: int) -> None:
     """The log is in the database file here, as it is after a checkpoint."""
     shutil.copytree(torn.good, tmp_path / "whole")
@@ -119,7 +119,7 @@ def test_a_flipped_bit_in_the_file_is_named_or_makes_no_difference(torn: Torn, t
     assert named > len(pages) / 2
 
 
-@pytest.mark.parametrize("every", [9, *long(3)])
+@pytest.mark.parametrize("every", [*contained(9), *long(3)])
 def test_a_mark_that_is_damaged_costs_no_world(torn: Torn, tmp_path: Path, every: int) -> None:
     whole = (torn.last, torn.hashes[torn.last])
     good = (torn.good / "world.mark").read_bytes()

@@ -15,7 +15,7 @@ from server.persistence import database
 from server.persistence import store as stores
 from server.persistence.database import Database, StoreError
 from server.persistence.store import Store
-from tests.lengths import long
+from tests.lengths import contained, long
 from tests.server.test_store import SCENE, copied, crashed, keep, play, until
 
 HEAD = 32
@@ -89,7 +89,7 @@ def test_a_crash_at_any_byte_of_the_log_keeps_all_that_was_durable_by_then(store
         assert found_in(copy) == (tick, torn.hashes[tick])
 
 
-@pytest.mark.parametrize("turns", [48, *long(150)])
+@pytest.mark.parametrize("turns", [*contained(48), *long(150)])
 def test_a_garbled_file_is_refused_or_makes_no_difference(store: Store, tmp_path: Path, turns: int) -> None:
     torn = Torn(store, tmp_path)
     shutil.copytree(torn.good, tmp_path / "whole")

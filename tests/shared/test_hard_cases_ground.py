@@ -11,6 +11,7 @@ from shared.inputs import Input
 from shared.scene import Template
 from shared.units import BLOCK
 from shared.world import World
+from tests.lengths import contained, long
 from tests.worlds import EAST, STEP, TEMPLATES, WEST, around, build, floor, high, low, settle, steps
 
 FACES = (2, 32, 512, 8192, 131072, 0, -3)
@@ -261,7 +262,7 @@ def pressed(compiled: bool) -> tuple[World, int]:
     return world, entity
 
 
-@pytest.mark.parametrize("ticks", [1000, pytest.param(100_000, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("ticks", [*contained(1000), *long(100_000)])
 def test_h30_pressed_into_a_floor_and_two_walls(compiled: bool, ticks: int) -> None:
     """The hash over the entity is constant. The hash over the world also contains the tick."""
     world, entity = pressed(compiled)

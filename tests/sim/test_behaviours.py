@@ -18,7 +18,7 @@ from shared.inputs import Input
 from shared.units import BLOCK
 from sovereign_netcode.playtest import Link, Match, Player, wander
 from tests.behaving import BUTTONS, CLASSES, Playground, Presser, scene
-from tests.lengths import long
+from tests.lengths import contained, long
 from tests.piling import Piles
 
 DASH, FIRE = (1 << BUTTONS.index(name) for name in ("dash", "fire"))
@@ -52,7 +52,7 @@ def told(player: Player) -> Counter[str]:
 
 @pytest.mark.parametrize(
     ("preset", "ticks"),
-    [("far", 200), *long(*((preset, 8_000 if preset == "typical" else 2_500) for preset in PRESETS))],
+    [*contained(("far", 200)), *long(*((preset, 8_000 if preset == "typical" else 2_500) for preset in PRESETS))],
 )
 def test_a_lone_player_with_every_ability_is_corrected_for_late_inputs_only(preset: str, ticks: int) -> None:
     match = joined(Playground(), PRESETS[preset], Presser(), seed=11)
@@ -190,7 +190,7 @@ class Crowd(Presser):
         return input_
 
 
-@pytest.mark.parametrize(("players", "seconds", "seed"), [(4, 4, 5), *long((30, 3, 6), (12, 6, 7))])
+@pytest.mark.parametrize(("players", "seconds", "seed"), [*contained((4, 4, 5)), *long((30, 3, 6), (12, 6, 7))])
 def test_players_who_dash_into_each_other_are_corrected_for_each_other(players: int, seconds: int, seed: int) -> None:
     counts = {}
     for neighbours in (True, False):
@@ -206,7 +206,9 @@ def test_players_who_dash_into_each_other_are_corrected_for_each_other(players: 
     assert counts[True] < counts[False]
 
 
-@pytest.mark.parametrize(("players", "seconds", "seed"), [(3, 4, 1), *long(*((6, 15, seed) for seed in range(2, 8)))])
+@pytest.mark.parametrize(
+    ("players", "seconds", "seed"), [*contained((3, 4, 1)), *long(*((6, 15, seed) for seed in range(2, 8)))]
+)
 def test_boxes_and_blocks_put_into_each_other_make_nobody_diverge(players: int, seconds: int, seed: int) -> None:
     match = joined(Piles(), PRESETS["regional"], *(Presser(6) for _ in range(players)), seed=seed)
     match.run(seconds)
@@ -239,7 +241,7 @@ def test_an_ability_that_nobody_uses_costs_no_bytes_while_players_walk() -> None
 
 
 @pytest.mark.parametrize(
-    ("preset", "seed"), [("thin", 5), *long(*((preset, seed) for preset in PRESETS for seed in (6, 7)))]
+    ("preset", "seed"), [*contained(("thin", 5)), *long(*((preset, seed) for preset in PRESETS for seed in (6, 7)))]
 )
 def test_each_announcement_reaches_its_own_player_once(preset: str, seed: int) -> None:
     """Holds also where an input is late, so that the client predicts the announcement for another tick or not at all.

@@ -11,7 +11,7 @@ from client_sdk.netsim.links import PRESETS
 from shared.inputs import Input
 from shared.scene import load_scene
 from sovereign_netcode.playtest import Link, Match
-from tests.lengths import long, long_but
+from tests.lengths import contained, long, long_but
 
 
 def walking(core: Core, rng: random.Random) -> Input:
@@ -40,7 +40,7 @@ def test_late_first_inputs_are_named_as_the_cause_of_corrections(seed: int) -> N
     assert player.core.stats.divergences == 0
 
 
-@pytest.mark.parametrize("players", [5, *long(20)])
+@pytest.mark.parametrize("players", [*contained(5), *long(20)])
 def test_keys_that_are_held_while_joining_over_bad_lines_are_explained(players: int) -> None:
     for preset in ("typical", "far"):
         match = Match(load_scene("flat"), 1)

@@ -27,6 +27,7 @@ from shared.inputs import Input, make_input
 from shared.scene import load_scene
 from sovereign_netcode.playtest.match import wander
 from sovereign_netcode.playtest.scaled import ScaledMatch, Seat
+from tests.lengths import contained, long
 from tests.scaling import PATH, ROUGH, Tally, asks, calm, causes, edits, hashes_agree, roam, torment
 
 
@@ -286,9 +287,7 @@ def tour(match: ScaledMatch, player: Seat, seconds: float, every: float = 5.0) -
     return moves
 
 
-@pytest.mark.parametrize(
-    ("seed", "seconds"), [(1, 60), pytest.param(2, 300, marks=pytest.mark.slow)], ids=["short", "long"]
-)
+@pytest.mark.parametrize(("seed", "seconds"), [*contained((1, 30)), *long((2, 300))], ids=["short", "long"])
 def test_a_lone_player_who_is_moved_between_edges_has_no_corrections(seed: int, seconds: float) -> None:
     match = ScaledMatch(load_scene("hills"), seed, edges=4)
     player = match.join(edits, Link(delay_s=0.03))  # without jitter, so that no input is late by itself
