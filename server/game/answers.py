@@ -17,23 +17,23 @@ class Answers:
 
     def __init__(self, players: Mapping[int, Player]) -> None:
         self._players = players
-        self._waiting: deque[tuple[int, tuple[int, int, int, str]]] = deque()
+        self.waiting: deque[tuple[int, tuple[int, int, int, str]]] = deque()
         """The verdicts in order, each with its tick (`Outcome.verdicts`)."""
 
     def take(self, tick: int, verdicts: list[tuple[int, int, int, str]]) -> None:
         """Takes the verdicts of a tick."""
         for verdict in verdicts:
-            self._waiting.append((tick, verdict))
+            self.waiting.append((tick, verdict))
 
     def release(self, durable: int) -> None:
         """Queues the verdicts up to a durable tick to be sent to the players."""
-        while self._waiting and self._waiting[0][0] <= durable:
-            entity, number, verdict, reason = self._waiting.popleft()[1]
+        while self.waiting and self.waiting[0][0] <= durable:
+            entity, number, verdict, reason = self.waiting.popleft()[1]
             if entity in self._players:
                 self._players[entity].settle(number, verdict, reason)
 
     def notes(self) -> Iterator[list[Any]]:
         """Yields the verdicts that are not durable yet, as notes for a checkpoint."""
-        for _, verdict in self._waiting:
+        for _, verdict in self.waiting:
             if verdict[0] in self._players:
                 yield persisted_state.note_of_answer(*verdict)

@@ -57,12 +57,14 @@ class Edge:
             log.note_removal(entity)
         log.record()
         self.answers.take(tick, outcome.verdicts)
-        self.answers.release(self._durable())
-        for entity in outcome.private & players.keys():
+        if self.answers.waiting:
+            self.answers.release(self._durable())
+        for entity in outcome.private & players.keys() if outcome.private else ():
             session = players[entity].session
             if session is not None:
                 session.stream.private_due = self._kept.private_of(entity)
-        self._deliver(outcome.events)
+        if outcome.events:
+            self._deliver(outcome.events)
         for entity, name, payload in outcome.announced:
             self._announce(entity, name, payload)
 

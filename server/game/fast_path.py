@@ -135,7 +135,9 @@ class FastPath:
             rows.slots,
             rows.most,
         )
-        return rows.taken_by(range(len(rows.sessions)) if everyone else rows.changed[:n].tolist())
+        if everyone:
+            return rows.taken_by(range(len(rows.sessions)))
+        return rows.taken_by(rows.changed[:n].tolist()) if n else {}
 
     def confirm(self, tick: int) -> None:
         """Files the statuses of a tick at an edge, whose record has the inputs that were taken for it."""

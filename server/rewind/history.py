@@ -16,7 +16,6 @@ its former position. A client that was not sent every tick interpolates between 
 import math
 from collections import deque
 from collections.abc import Iterable
-from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -26,6 +25,7 @@ from shared.between import between
 from shared.checks import Cell, Vec, finite
 from shared.hits import Hit as Hit
 from shared.hits import Targets, boxes_of
+from shared.kernels import Kernel
 from shared.layout import ID, TEMPLATE, Int64s, X
 from shared.units import SEGMENT_SHIFT
 from shared.world import World
@@ -34,19 +34,38 @@ WINDOW_S = 0.5
 """Seconds that a query can look back by default."""
 KEPT = [ID, TEMPLATE, X, X + 1, X + 2]
 """Columns of a row that are kept."""
+ROOM_MIN = 16
+"""Number of rows for which undo data may have room beyond four times the rows they need."""
 Floats = npt.NDArray[np.float64]
 
 
-class _Undo(NamedTuple):
-    """The undo data of one tick.
+class _Undo:
+    """The undo data of one tick. They are used again for a later tick.
 
-    `rows`: the number of each changed row of the matrix and its former contents, [n, 6]. `blocks`: the former kinds of
-    the changed blocks. `placed`: the entities that the rules placed in the tick.
+    Args:
+        kernel: the kernel that writes the rows.
+        room: number of rows for which there is room.
     """
 
-    rows: Int64s
-    blocks: dict[Cell, int]
-    placed: set[int]
+    __slots__ = ("blocks", "gone", "lent", "n", "placed", "room")
+
+    def __init__(self, kernel: Kernel, room: int) -> None:
+        self.room = np.empty((room, 1 + len(KEPT)), np.int64)
+        self.lent = kernel.lent(self.room)
+        self.n = 0
+        """Number of the rows in `room`."""
+        self.gone: Int64s | None = None
+        """Further rows: those of removed entities."""
+        self.blocks: dict[Cell, int] = {}
+        """Former kinds of the changed blocks."""
+        self.placed: set[int] = set()
+        """Entities that the rules placed in the tick."""
+
+    @property
+    def rows(self) -> Int64s:
+        """The number of each changed row of the matrix and its former contents, [n, 6]."""
+        rows: Int64s = self.room[: self.n]
+        return rows if self.gone is None else np.concatenate((rows, self.gone))
 
 
 class Rewind:
@@ -60,7 +79,10 @@ class Rewind:
     def __init__(self, world: World, window_s: float = WINDOW_S) -> None:
         self._world = world
         self._reach = window_s * world.scene.tick_rate
+        self._kept = math.ceil(self._reach)
         self._undo: deque[_Undo] = deque()
+        self._spare: _Undo | None = None
+        """Undo data that are no longer needed."""
         self._placed_at = -math.inf
         """Newest tick in which an entity was placed."""
         self._boxes = np.array(boxes_of(world.scene)).reshape(-1, 2, 3)
@@ -81,24 +103,26 @@ class Rewind:
             self._now = np.concatenate((self._now, np.zeros((more, len(KEPT)), np.int64)))
             self._now_lent = world.kernel.lent(self._now)
         n = int(w.lengths[layout.N_CHANGED])
-        rows = np.empty((n, 1 + len(KEPT)), np.int64)
-        self._alive += world.kernel.recall(w.entities, w.changed, self._now_lent, world.kernel.lent(rows), n)
+        undo = self._spare
+        if undo is None or not n <= len(undo.room) <= 4 * n + ROOM_MIN:
+            undo = _Undo(world.kernel, n + n // 2 + ROOM_MIN // 2)
+        self._spare = None
+        undo.n, undo.gone, undo.blocks, undo.placed = n, None, world.edited, world.placed
+        self._alive += world.kernel.recall(w.entities, w.changed, self._now_lent, undo.lent, n)
         if self._alive != len(world):  # some have been removed
             matrix = world.matrix
             gone = np.flatnonzero(self._now[: len(matrix), 0] != matrix[:, ID])
-            rows = np.concatenate((rows, np.column_stack((gone, self._now[gone]))))
+            undo.gone = np.column_stack((gone, self._now[gone]))
             self._now[gone] = 0
             self._alive = len(world)
-        self._undo.append(_Undo(rows, world.edited, world.placed))
+        self._undo.append(undo)
         self._tick = world.tick
         if world.placed:
             self._placed_at = world.tick
-        kept = math.ceil(self._reach)
         # A query within the reach may be in a gap of up to the same length, which begins that much earlier.
-        if self._tick - self._placed_at <= 2 * kept:
-            kept *= 2
+        kept = self._kept if self._tick - self._placed_at > 2 * self._kept else 2 * self._kept
         while len(self._undo) > kept:
-            self._undo.popleft()
+            self._spare = self._undo.popleft()
 
     def at(self, seen: float, own: int = 0, gaps: Iterable[tuple[int, int]] = ()) -> "Past":
         """Returns the world at a moment. A moment outside of what is kept is moved to its nearest end.
@@ -125,7 +149,8 @@ class Rewind:
                 after = states.copy()
             if undone <= last:
                 placed |= undo.placed
-            states[undo.rows[:, 0]] = undo.rows[:, 1:]
+            rows = undo.rows
+            states[rows[:, 0]] = rows[:, 1:]
             if undone > tick:
                 blocks |= undo.blocks
         entities = _between(states, after, (seen - first) / (last - first), placed)
