@@ -49,8 +49,12 @@ class BatchInputs(InputQueue):
         return self.latest if self._bounds.stands_in(self.missing) else NEUTRAL
 
     def take(self, tick: int) -> Input:
-        self.used += not self.missing
-        self.substituted += self.missing > 0
+        if self.missing:
+            self._substituted += 1
+        else:
+            self._used += 1
+            if self.override is None:
+                return self.latest
         return self.coming(tick)
 
 

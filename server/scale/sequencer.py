@@ -211,15 +211,14 @@ class WorldSequencer:
 
     def _judge(self, tick: int, now: float) -> None:
         """Notes for how many ticks the batch of each edge is missing, and gives up silent edges."""
-        missing = {edge: tick - number for edge, number in self._newest.items()}
+        missing = {edge: max(tick - number, 0) for edge, number in self._newest.items()}
         for player in self.api.players.values():
-            inputs, session = player.inputs, player.session
-            if not isinstance(inputs, BatchInputs):
-                continue
-            if session is None:
-                inputs.missing += 1
-            elif isinstance(session.link, RemoteLink):
-                inputs.missing = max(missing.get(session.link.edge, 0), 0)
+            inputs, session = player.counts, player.session
+            if isinstance(inputs, BatchInputs):
+                if session is None:
+                    inputs.missing += 1
+                elif isinstance(link := session.link, RemoteLink):
+                    inputs.missing = missing.get(link.edge, 0)
         for edge in [edge for edge, taken in self._taken.items() if tick - taken > self._gone]:
             del self._newest[edge], self._taken[edge]
             self._waiting.pop(edge, None)
