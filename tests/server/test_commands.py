@@ -1,5 +1,6 @@
 """Commands of clients: carried out in their tick, bounded, answered."""
 
+import random
 from collections.abc import Sequence
 from typing import Any
 
@@ -84,6 +85,26 @@ def test_commands_are_bounded_in_number_and_rate() -> None:
     assert sorted(verdicts(link)) == list(range(1, 9))
     assert [verdicts(link)[n] for n in range(5, 9)] == [messages.TOO_MANY] * 4
     assert sum(verdict == messages.DONE for verdict in verdicts(link).values()) == 2  # two seconds of edits at once
+
+
+@pytest.mark.parametrize("edits_per_s", [0.5, 7.0, 10.0, 31.0])
+def test_the_rate_of_edits_is_the_same_whether_they_come_in_every_tick_or_seldom(edits_per_s: float) -> None:
+    table, rng = Table(Limits(edits_per_s=edits_per_s), resume_s=60.0), random.Random(5)
+    link, number, left = table.join(), 0, 0.0
+    expected: dict[int, bool] = {}
+    per_tick, most = edits_per_s * table.tick_s, 2 * edits_per_s
+    left = min(left + per_tick, most)  # of the tick in which it joined
+    for tick in range(400):
+        left = min(left + per_tick, most)
+        for _ in range(rng.choice((0, 0, 0, 1, 2, 5)) if tick % 100 < 50 else rng.random() < 0.02):
+            number += 1
+            link.say(order(number, 0, 18, 16, 1, 5 * (number % 2)))
+            expected[number] = left < 1
+            left -= left >= 1
+        table.tick()
+    assert number > 50
+    assert {n: verdict == messages.TOO_MANY for n, verdict in verdicts(link).items()} == expected
+    assert 0 < sum(expected.values()) < number
 
 
 class Disk:
