@@ -87,11 +87,16 @@ def best_alarm(loop: asyncio.AbstractEventLoop, ring: Callable[[], None]) -> Ala
         return LoopAlarm(loop, ring)
 
 
+ROUND_S = 0.005
+"""Seconds after which no further alarm of a shared timer rings before the event loop has run once."""
+
+
 class SharedTimer:
     """Many alarms on one timer: the timer rings when the first of them is due, and then all that are due by now ring.
 
     Each alarm rings once at most before the event loop goes on, so ticks of one world that is behind do not hold up the
-    other worlds and the sockets.
+    other worlds. After `ROUND_S` the event loop goes on as well, so that messages do not wait for the ticks of all
+    worlds. Then the remaining alarms ring at once, the earliest first.
 
     Args:
         make: makes the timer, which calls the given function.
@@ -148,9 +153,11 @@ class SharedTimer:
                 _, number, alarm = due.pop(0)
                 if alarm.number == number:
                     alarm.ring()
+                    if self._clock() - now >= ROUND_S:
+                        break
         finally:
             self._ringing = False
-            for entry in due:  # one has raised
+            for entry in due:
                 insort(self._queue, entry)
             self._set()
 

@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import pytest
 
-from server.runtime.alarm import Alarm, LoopAlarm, SharedTimer, TimerfdAlarm, best_alarm
+from server.runtime.alarm import ROUND_S, Alarm, LoopAlarm, SharedTimer, TimerfdAlarm, best_alarm
 
 
 class Timer:
@@ -80,6 +80,20 @@ def test_an_alarm_that_is_set_to_the_past_while_it_rings_lets_the_event_loop_go_
     assert bench.ring(2.5) == ["behind", "other"]
     assert bench.timers[0].at == 1.5
     assert bench.ring(2.5) == ["behind"]
+
+
+def test_after_some_time_of_ringing_the_event_loop_goes_on_and_the_earliest_alarms_ring_first() -> None:
+    bench = Bench()
+
+    def work(seconds: float) -> None:
+        bench.now += seconds
+
+    alarms = [bench.alarm(str(n), n / 1000, lambda: work(0.4 * ROUND_S)) for n in range(7)]
+    assert bench.ring(1.0) == ["0", "1", "2"]
+    alarms[0].set(0.0035)  # it is behind
+    assert bench.timers[0].at == 0.003
+    assert bench.ring(1.1) == ["3", "0", "4"]
+    assert bench.ring(1.2) == ["5", "6"]
 
 
 def test_the_latest_time_of_an_alarm_counts() -> None:
