@@ -28,6 +28,8 @@ and bytes. It also measures a replay of ten ticks of a lone player, with a behav
 
 `frame` measures the time that a client takes for a frame with 50 other players in view, in simulated time.
 
+`joins` measures the server's CPU time for a join, with its first snapshot and terrain, until 200 clients play.
+
 `worlds` searches for the most worlds of four players each that one server process holds at 30 Hz, and measures what an
 empty world costs (memory, CPU time), and the time from asking for a match to playing in a new world.
 
@@ -57,6 +59,7 @@ from scripts.benchmarks import (
     entities,
     frame,
     jitter,
+    joins,
     memory,
     physics,
     rss,
@@ -323,6 +326,7 @@ def parser() -> argparse.ArgumentParser:
     command.set_defaults(run=scale.run)
     peers.add(commands, each)
     frame.add(commands, each)
+    joins.add(commands, each)
     return parser
 
 

@@ -124,7 +124,14 @@ def measured(players: Sequence[int], seconds: float, rounds: int, console: Conso
 def costs(figures: dict[str, Any]) -> tuple[dict[str, Line], dict[str, Line], Line]:
     """Returns the lines of the own work, those of the processes, and that of an edge's work beyond a game's."""
     more = line(figures["work"], lambda row: row["edge"] - row["game"])
-    return lines(figures["work"], (*PARTS, "log", "batches")), lines(figures["live"], PROCESSES), more
+    return lines(figures["work"], (*PARTS, "log", "batches")), lines(calm(figures["live"]), PROCESSES), more
+
+
+def calm(rows: Rows) -> Rows:
+    """Returns the windows in which hardly any batches were late, or all if there were too few of them."""
+    kept = [row for row in rows if row["calm"]]
+    enough = all(len({row["players"] for row in kept if name in row}) > 1 for name in ("edge", "server"))
+    return kept if enough else rows
 
 
 def show(figures: dict[str, Any], console: Console) -> None:
@@ -138,7 +145,9 @@ def show(figures: dict[str, Any], console: Console) -> None:
     for name, title in WHOLE.items():
         table.add_row(f"process: {title}", *map(str, whole[name]))
     console.print(table)
-    for players, loss in losses(figures["live"]).items():
+    rows, kept = figures["live"], calm(figures["live"])
+    console.print(f"process: {len(kept)} of {len(rows)} windows count; in the others, many batches were late")
+    for players, loss in losses(kept).items():
         console.print(f"loss to the bus with {players} clients, in %: {loss}", soft_wrap=True, highlight=False)
     console.print(bus_table(figures, own))
     show_arithmetic({**whole, "sequencer": own["sequencer"], "standby": own["standby"]}, whole, console)
@@ -147,7 +156,9 @@ def show(figures: dict[str, Any], console: Console) -> None:
 def losses(rows: Rows) -> dict[int, Figure]:
     """Returns what an edge costs more than a server in one process with as many clients, in %, by their number."""
     found = {}
-    for players in sorted({row["players"] for row in rows}):
+    for players in sorted(
+        {row["players"] for row in rows if "edge" in row} & {row["players"] for row in rows if "server" in row}
+    ):
         edge, one = (
             mean([row[name] for row in rows if row["players"] == players and name in row])
             for name in ("edge", "server")

@@ -21,6 +21,9 @@ PATIENT = ("--takeover-s", "10")
 COUNTED = {"edge": ("bus_bytes_out", "batches_late"), "sequencer": ("tick", "bus_bytes_out")}
 """Figures of the parts that grow."""
 PROCESSES = ("server", "edge", "sequencer", "standby", "bus")
+LATE_SHARE = 0.02
+"""Share of late batches beyond which a measurement is not calm: the machine was too busy, and clients of an edge cost
+much more while their inputs are late."""
 WINDOW_S = 1.0
 """Seconds of one measurement."""
 
@@ -74,8 +77,8 @@ class Processes:
             where: "server" or "edge1".
 
         Returns:
-            The CPU time of each process in microseconds per tick, by its name, in each window; and the figures of the
-            world on many processes during all of them.
+            The CPU time of each process in microseconds per tick, by its name, in each window, and whether hardly any
+            batches were late then (`calm`); and the figures of the world on many processes during all of them.
 
         Raises:
             RigError: the players do not play in time.
@@ -94,9 +97,10 @@ class Processes:
             ticks = (time.monotonic() - began) * RATE
             window = {name: 1e6 * (cpu_s(pid) - spent[name]) / ticks for name, pid in pids.items()}
             windows.append({"players": players, **window})
-        after = await self._figures()
+        bus = _between(before, await self._figures())
         await asyncio.to_thread(load.hold, 0)
-        return windows, {"players": players, **_between(before, after)}
+        calm = where == "server" or bus["batches_late"] <= LATE_SHARE * bus["ticks"]
+        return [window | {"calm": calm} for window in windows], {"players": players, **bus}
 
     async def _figures(self) -> dict[str, Any]:
         figures = {part.role: await part.stats() for part in (self.cluster.edges[0], self.cluster.sequencer)}

@@ -48,7 +48,8 @@ def made(rng: random.Random, noise: float, per: dict[str, float]) -> dict[str, A
         return 900 + per.get(name, 0.0) * players + rng.gauss(0, noise)
 
     def windows(*names: str) -> list[dict[str, float]]:
-        return [{"players": n, **{name: us(name, n) for name in names}} for n in (50, 100, 150) for _ in range(6)]
+        numbers = [n for n in (50, 100, 150) for _ in range(6)]
+        return [{"players": n, "calm": True, **{name: us(name, n) for name in names}} for n in numbers]
 
     trip = {"p50": 4.0, "p99": 6.0, "max": 7.0}
     bus = {"log_bytes": 80.0, "batch_bytes": 60.0, "bus_round_trip_ms": trip, "edge_lead_ms": 3.0, "batches_late": 0}
