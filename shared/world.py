@@ -10,8 +10,7 @@ scene that get the same calls in the same order have the same `state_hash()` at 
 form of the kernel. For this, all state is whole numbers, and entities take their turns in ascending order of id.
 
 A `World` is made of layers. `shared.world_state` holds the state in memory and reads it. `shared.world_changes`
-changes it, wakes the entities that a change could concern, and reports each change to an observer. `shared.world_turns`
-changes it for the behaviours of a scene. This module checks the arguments.
+changes it and wakes what a change could concern. `shared.world_turns` is for behaviours. This module checks arguments.
 """
 
 from collections.abc import Iterable, Mapping
