@@ -70,6 +70,7 @@ def numba_sources(root: Path, *, bounds: bool = False) -> list[Source]:
     from shared import jit, layout
 
     _without_machine_code()
+    _flags_compare_fast()
     options: dict[str, Any] = {name: value for name, value in jit.OPTIONS.items() if name != "cache"}
     options["boundscheck"] = bounds
     jit.OPTIONS.clear()
@@ -94,14 +95,34 @@ def _without_machine_code() -> None:
 
     Options of Numba could leave out the functions, too, but they would change the symbols, and so the object files.
     """
-    from numba.core import codegen, lowering
+    from numba.core import codegen, cpu, lowering
 
     def nothing(*_: Any) -> None:
         pass
 
+    def own_function(_context: Any, library: Any, *_: Any) -> Any:
+        """Links a compiled function. Returns a new built-in function, by which Numba knows it. Nothing calls that."""
+        library._ensure_finalized()
+        return [].append
+
     codegen.JITCodeLibrary._finalize_specific = nothing  # type: ignore[method-assign]
+    cpu.CPUContext.get_executable = own_function  # type: ignore[method-assign]
     lowering.Lower.create_cpython_wrapper = nothing  # type: ignore[method-assign]
     lowering.Lower.create_cfunc_wrapper = nothing  # type: ignore[method-assign]
+
+
+def _flags_compare_fast() -> None:
+    """Lets Numba compare its flags by what was set, in this process. It reads 40 properties of both otherwise, for each
+    call of a function that it meets."""
+    from numba.core.targetconfig import TargetConfig
+
+    plain: Any = TargetConfig.__eq__
+
+    def equal(one: Any, other: Any) -> Any:
+        return one is other or (type(one) is type(other) and one._values == other._values) or plain(one, other)
+
+    TargetConfig.__eq__ = equal  # type: ignore[method-assign]
+    TargetConfig.__hash__ = lambda flags: hash(type(flags))  # type: ignore[method-assign]
 
 
 def _wrapper(name: str, kinds: str, returns: bool) -> str:

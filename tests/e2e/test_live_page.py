@@ -73,7 +73,7 @@ async def test_a_bot_is_seen_running() -> None:
 
 def test_the_picture_of_the_readme_is_made_by_its_script(tmp_path: Path) -> None:
     picture = tmp_path / "live.png"
-    command = [sys.executable, "scripts/live_picture.py", "--seconds", "3", "--out", str(picture)]
+    command = [sys.executable, "scripts/live_picture.py", "--seconds", "1", "--out", str(picture)]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=180)
     assert done.returncode == 0, done.stderr
     data = picture.read_bytes()
