@@ -97,7 +97,9 @@ class Changing(ProgramSide):
     def _copy(self, message: Message) -> None:
         """Sends a message of the input loop over the second connection, too."""
         if self.handover is not None:
-            self.handover.copy(message, self._commands.again)
+            play = self._worlds.play
+            acked = -1 if play is None else play.world.prediction.confirmed.tick
+            self.handover.copy(message, acked, self._commands.again)
 
     def _order(self, command: messages.Command) -> int:
         number = super()._order(command)

@@ -16,7 +16,7 @@ from typing import Any, Protocol
 from client_sdk.replica import Replica
 from client_sdk.worlds import Worlds
 from shared import messages
-from shared.messages import Beside, HandOver, Inputs, Message, ProtocolError, Snapshot, Terrain, Welcome, encode
+from shared.messages import Beside, HandOver, Held, Inputs, Message, ProtocolError, Snapshot, Terrain, Welcome, encode
 
 HANDOVER_S = 15.0
 """Time after which a client gives up a hand-over, in seconds."""
@@ -85,13 +85,14 @@ class Handover:
             case _:
                 self.waiting.append(message)
 
-    def copy(self, message: Any, commands: Callable[[], list[bytes]]) -> None:
+    def copy(self, message: Any, acked: int, commands: Callable[[], list[bytes]]) -> None:
         """Sends a message of the input loop over the second connection, too, once its replica is complete.
 
         It goes on even if the terrain of another segment is missing for a while: the server expects every tick.
 
         Args:
             message: the message.
+            acked: tick of the newest snapshot over the first connection.
             commands: returns the commands without a result, which are sent ahead of the first message.
         """
         if self.replica is None:
@@ -101,8 +102,14 @@ class Handover:
                 return
             self._copies = True
             self._out += commands()
+            if not isinstance(message, Inputs) and self._worlds.play is not None:
+                self._worlds.play.begin_copies()
+            if isinstance(message, Held):
+                return  # the input that it means has not come over this connection
         if isinstance(message, Inputs):
             message = message._replace(acked=self.replica.confirmed.world.tick)
+        elif isinstance(message, Held):
+            message = message._replace(behind=max(message.behind + acked - self.replica.confirmed.world.tick, 0))
         self._out.append(encode(message))
 
     def copy_command(self, message: bytes) -> None:

@@ -11,13 +11,13 @@ begins.
 
 import math
 import traceback
-from struct import iter_unpack
 
 from client_sdk.controls import Controls
 from client_sdk.events import BehaviourFailed, Diverged, Resynchronised
 from client_sdk.pending_events import PendingEvents
 from client_sdk.prediction.prediction import NONDETERMINISM, NOTHING
 from client_sdk.replica import Replica
+from client_sdk.sent_inputs import PRICE_S, ROWS_MAX, SentInputs, margins_of
 from client_sdk.stats import Stats
 from client_sdk.timing.lead import PricedLead, jump_ticks
 from client_sdk.timing.timeline import Timeline
@@ -36,10 +36,7 @@ from shared.messages import (
     Resync,
     Snapshot,
 )
-from shared.ring import Ring
 
-ROWS_MAX = 16
-"""Limit of the inputs in one message."""
 LEAD_S_MAX = AHEAD_S
 """Longest possible lead in seconds. A timeline that is certainly further ahead starts again, because the server refuses
 its inputs."""
@@ -60,7 +57,7 @@ class InputLoop:
 
     def __init__(self, world: Replica, stats: Stats, events: PendingEvents, now: float) -> None:
         self.world = world
-        self._lead = PricedLead()
+        self._lead = PricedLead(PRICE_S)
         self.timeline = Timeline(world.clock.rate, self._lead.start(world.clock, now), now)
         self.newest = -1
         self.seen = 0.0
@@ -72,7 +69,9 @@ class InputLoop:
         self._settled = False
         self._step = self._stepped = 0.0
         self._bounds = bounds(world.scene.tick_rate)
-        self._phases: Ring[float] = Ring(self._bounds.predicted)
+        self._observed = [(-1, 0.0), (-1, 0.0)]
+        """Newest tick with an observed margin, and its need, over the connection and over a second one."""
+        self._sent = SentInputs(world.scene.tick_rate, world.scene.input_row_bytes)
         self._stats, self._events = stats, events
 
     def restart(self, now: float, cause: str) -> list[Message]:
@@ -90,12 +89,14 @@ class InputLoop:
         # Bounded, even if the server reports a wrong time: all ticks after the confirmed one are replayed here.
         end = confirmed + self._bounds.unconfirmed
         tick = min(max(math.floor(self.timeline.tick(now)), confirmed), end)
+        self._sent.restart()
+        self._observed = [(-1, 0.0), (-1, 0.0)]
         messages: list[Message] = []
         if tick < self.newest and cause == RECONNECTED:
             tick = min(self.newest, end)
         elif tick < self.newest:
             messages.append(Restart(tick + 1))
-            self._phases = Ring(self._bounds.predicted)
+            self._sent.forget()
             self._settling = now
         if prediction.begun:
             self._stats.resyncs += 1
@@ -129,15 +130,27 @@ class InputLoop:
 
     def prepare(self, snapshot: Snapshot, now: float) -> None:
         """Learns arrival margins from a second connection, so that inputs are in time over it, too."""
-        one, newest, margins = self._bounds.margin_one, snapshot.newest, snapshot.margins
-        for tick, (margin,) in enumerate(iter_unpack("<h", margins), newest + 1 - len(margins) // 2):
-            phase = self._phases.get(tick)
-            if phase is not None and margin != MARGIN_REFUSED and self._settling is None:
-                self._lead.observe(tick, margin / one, phase, now)
+        self._sent.arrived(snapshot, 1)
+        one = self._bounds.margin_one
+        needs = list[tuple[int, float]]()
+        for tick, margin in margins_of(snapshot):
+            phase = self._sent.phase(tick)
+            if phase is None:
+                continue
+            if margin == MARGIN_REFUSED:
+                self._sent.restart()
+            elif self._settling is None:
+                needs.append((tick, phase - margin / one))
+        self._observe(needs, now, 1)
+
+    def begin_copies(self) -> None:
+        """Notes that messages go over a second connection, too, from now on: it has not got the latest input."""
+        self._sent.restart()
 
     def change_over(self) -> None:
         """Notes that a second connection has taken over: input statuses of the first may have been lost."""
         self._late = True
+        self._sent.change_over()
 
     def answered(self, sent: float) -> None:
         """Notes that a ping sent at `sent` was answered, so the server has received everything sent before it."""
@@ -207,32 +220,50 @@ class InputLoop:
         Arrival margins go to the lead controller. Input statuses are counted, and a missing input sets `_late`, which
         becomes the cause of a correction.
         """
-        stats, phases, margins, statuses = self._stats, self._phases, snapshot.margins, snapshot.statuses
-        one = self._bounds.margin_one
-        for tick, (margin,) in enumerate(iter_unpack("<h", margins), snapshot.newest + 1 - len(margins) // 2):
-            phase = phases.get(tick)
+        stats, sent, statuses = self._stats, self._sent, snapshot.statuses
+        one, needs = self._bounds.margin_one, list[tuple[int, float]]()
+        sent.arrived(snapshot)
+        for tick, margin in margins_of(snapshot):
+            phase = sent.phase(tick)
             if phase is None:
-                continue  # no input was sent for this tick
+                continue  # nothing was sent for this tick
             if margin == MARGIN_REFUSED:  # the input was too early, by at least `ahead` ticks
                 stats.inputs_refused += 1
+                sent.restart()
                 margin = math.floor(self._bounds.ahead * one)
-            stats.inputs_late += margin < 0
-            if self._settling is None:
-                self._lead.observe(tick, margin / one, phase, now)
+            if margin < 0 and sent.changed(tick):
+                stats.inputs_late += 1
+            needs.append((tick, phase - margin / one))
+        if self._settling is None:
+            self._observe(needs, now)
         if self._settling is not None or self._settled:  # the server may have used inputs that were withdrawn
             self._late, self._settled = True, False
-        used = statuses.count(USED)
-        stats.inputs_used += used
-        if used == len(statuses):
-            return
-        neutralised = statuses.count(NEUTRALISED)
-        missing = statuses.count(REPEATED) + neutralised
-        if IDLE in statuses:  # the very first inputs were late, and the server had no earlier one to repeat
-            ticks = enumerate(statuses, snapshot.first)
-            missing += sum(status == IDLE and phases.get(tick) is not None for tick, status in ticks)
+        used, missing = statuses.count(USED), sent.replaced(snapshot)
+        stats.inputs_used += used - missing
+        if used < len(statuses):
+            for tick, status in enumerate(statuses, snapshot.first):
+                if status in (REPEATED, NEUTRALISED):
+                    missing += 1
+                    stats.inputs_late += sent.has(tick) and not sent.changed(tick)
+                elif status == IDLE:  # the very first inputs were late, and the server had no earlier one to repeat
+                    missing += sent.has(tick)
+            stats.inputs_neutralised += statuses.count(NEUTRALISED)
         stats.inputs_substituted += missing
-        stats.inputs_neutralised += neutralised
         self._late |= missing > 0
+
+    def _observe(self, needs: list[tuple[int, float]], now: float, connection: int = 0) -> None:
+        """Passes the needs of messages (`client_sdk.timing.lead`) to the lead, and needs for the ticks between them.
+
+        Args:
+            needs: ticks and needs, as phases, of the messages that a snapshot reports.
+            now: local time in seconds.
+            connection: 1 for a second connection, else 0.
+        """
+        before, last = self._observed[connection]
+        for tick, need in self._sent.filled(needs, before, last):
+            self._lead.observe(tick, 0.0, need, now)
+        if needs:
+            self._observed[connection] = needs[-1]
 
     def unreceived(self) -> list[Message]:
         """Returns the inputs to send again after a reconnect: those that the server may not have received yet."""
@@ -256,7 +287,7 @@ class InputLoop:
         reached = self.world.prediction.confirmed.tick - timeline.rate * now
         if reached <= timeline.phase <= clock.phase + (LEAD_S_MAX + clock.rtt_s / 2) * timeline.rate:
             return False
-        self._lead = PricedLead()
+        self._lead = PricedLead(PRICE_S)
         timeline.phase = max(self._lead.start(clock, now), reached + clock.rtt_s / 2 * timeline.rate) + timeline.own
         return True
 
@@ -307,21 +338,17 @@ class InputLoop:
         if to >= first:
             clock, phase = self.world.clock, timeline.phase
             timeline.made(timeline.tick(now) - first, now)
-            rows, scene = b"", self.world.scene
+            rows, phases, scene = b"", list[float](), self.world.scene
             for tick in range(first, to + 1):
                 input_ = controls.take()
                 prediction.file(tick, input_)
                 rows += row(input_, aim=scene.aim)
                 # Delays of a slow program are left out of the phase, because the path did not cause them.
-                self._phases.put(tick, phase - (timeline.tick(now) - tick) if timeline.own else phase)
+                phases.append(phase - (timeline.tick(now) - tick) if timeline.own else phase)
             stats.inputs_sent += to + 1 - first
             stats.lead_ticks = phase - clock.phase
             stats.lead_s = stats.lead_ticks / clock.rate
-            size = scene.input_row_bytes
-            inputs += [
-                Inputs(first + at, confirmed, rows[size * at : size * (at + ROWS_MAX)])
-                for at in range(0, to + 1 - first, ROWS_MAX)
-            ]
+            inputs = self._sent.send(first, rows, phases, confirmed)
         elif self._silent:
             controls.forget()
         while prediction.predicted.tick < self.newest - prediction.ahead:

@@ -67,6 +67,8 @@ TICK_MAX = (1 << 53) - 1
 """Greatest tick in a message."""
 FIRST_MAX = TICK_MAX - INPUT_ROWS_MAX
 """Greatest first tick of an `Inputs` message."""
+AFTER_MAX = INPUT_ROWS_MAX
+"""Limit of the ticks between a `Held` and the message with inputs before it."""
 ENTITY_MAX = (1 << 31) - 1
 """Greatest number of an entity."""
 
@@ -93,6 +95,8 @@ version, code, count, entity = _whole(0, 1 << 31), _whole(0, 4999), _whole(0, CO
 """Checks: version of the protocol, close code, number of a command (or another count), number of an entity."""
 tick, first, index = _whole(-1, TICK_MAX), _whole(0, FIRST_MAX), _whole(0, TICK_MAX)
 """Checks: tick (-1: none), first tick of inputs, number of a game event."""
+after = _whole(1, AFTER_MAX)
+"""Check of the number of ticks from one message with inputs to the next."""
 segment, offset, total = _whole(-(1 << 23), (1 << 23) - 1), _whole(0, PACKED_MAX), _whole(1, PACKED_MAX)
 """Checks: index of a segment along an axis, place within a packed segment, length of a packed segment."""
 name, token, reason = _text(NAME_MAX), _text(TOKEN_MAX), _text(REASON_MAX)

@@ -12,7 +12,7 @@ packed little-endian records in a MessagePack `bin`. docs/protocol.md explains e
       6 Resync                                             21 Happened  tick name payload
       7 Restart  tick                                      22 Shared    values
       8 Beside   version token resume                      23 NextHappened  number
-                                                           24 Announce  tick entity name payload
+      9 Held     after behind                              24 Announce  tick entity name payload
                                                            25 Refusal   number reason
                                                            26 Private   values
                                                            27 Go        path code seats reason
@@ -23,6 +23,8 @@ packed little-endian records in a MessagePack `bin`. docs/protocol.md explains e
 
     Inputs.rows    n * [i8 move_x, i8 move_y, u8 buttons], for the ticks first, first + 1, ...; in a scene with aim
                    n * [i8 move_x, i8 move_y, u8 buttons, i16 aim_x, i16 aim_y, i16 aim_z]
+    Held           the latest input holds for `shared.bounds.REPEATS_S` seconds, until a row replaces it. Its tick comes
+                   `after` ticks after the newest one that was sent; `behind` ticks before it is `acked`.
     Snapshot       the state at the end of `tick`. margins (n * i16, in 1/8192 s): arrival margins of the client's
                    inputs for the ticks up to `newest`. statuses (n * u8): input statuses of the ticks from `first` on.
                    verdicts (n * [u32 number, u8 verdict]): results of commands. drops (n * [i32 x, y, z]): segments
@@ -87,7 +89,7 @@ from shared.game_messages import Refusal as Refusal
 from shared.game_messages import Shared as Shared
 from shared.game_messages import Waiting as Waiting
 
-VERSION = 3
+VERSION = 4
 """Version of the protocol; both sides must have the same one."""
 
 # Input statuses: the server reports one for each tick.
@@ -131,6 +133,17 @@ class Inputs(NamedTuple):
     first: int
     acked: int
     rows: bytes
+
+
+class Held(NamedTuple):
+    """Says that the latest input holds for some ticks (`Bounds.repeats`), until a row replaces it.
+
+    Its tick is `after` ticks after the newest one that was sent: that of the latest row or `Held`. `behind` is the
+    number of ticks from the newest snapshot that the client has applied to this tick.
+    """
+
+    after: int
+    behind: int
 
 
 class Ping(NamedTuple):
@@ -217,6 +230,7 @@ Message = (
     | Edges
     | HandOver
     | Beside
+    | Held
 )
 KINDS: dict[int, tuple[type[Any], tuple[fields.Check, ...]]] = {
     1: (Hello, (fields.version, fields.digests, fields.name, fields.token, fields.resume)),
@@ -227,6 +241,7 @@ KINDS: dict[int, tuple[type[Any], tuple[fields.Check, ...]]] = {
     6: (Resync, ()),
     7: (Restart, (fields.first,)),
     8: (Beside, (fields.version, fields.token, fields.resume)),
+    9: (Held, (fields.after, fields.index)),
     17: (Welcome, (fields.version, fields.tick, fields.entity, fields.table, fields.resume)),
     18: (
         Snapshot,
@@ -247,7 +262,7 @@ KINDS: dict[int, tuple[type[Any], tuple[fields.Check, ...]]] = {
 }
 """Message class and checks of the fields, by the number of the kind. A snapshot's last field has no check here:
 `shared.snapshot` checks the segments."""
-CLIENT_KINDS = frozenset({1, 2, 3, 4, 5, 6, 7, 8})
+CLIENT_KINDS = frozenset({1, 2, 3, 4, 5, 6, 7, 8, 9})
 """Kinds of messages that a client may send."""
 SERVER_KINDS = frozenset({4, 17, 18, 19, 20, 21, 22, 23, 24, 25, 26, 27, 28, 29, 30})
 """Kinds of messages that a server may send."""

@@ -7,7 +7,7 @@ everywhere. `shared.session_rows` describes the rows of the sessions.
 
 from typing import Any
 
-from shared.fields import FIRST_MAX
+from shared.fields import AFTER_MAX, FIRST_MAX
 from shared.jit import decorators
 from shared.session_rows import (
     ACCEPTED,
@@ -18,6 +18,7 @@ from shared.session_rows import (
     FULL_AT,
     HELD,
     HELD_AIM,
+    HELD_TO,
     KEPT,
     LATE,
     MARGINS,
@@ -100,6 +101,63 @@ def ticks_left(now: float, deadline: float, rate: float, catch_up: float) -> flo
 
 
 @inlined
+def message_head(data: Any, at: int, end: int, newest: int) -> tuple[int, int, int]:
+    """Reads the beginning of a message of the kinds `Inputs` and `Held`.
+
+    Args:
+        data, at, end: the bytes, and where the message begins and ends.
+        newest: the newest tick of which the session has sent anything.
+
+    Returns:
+        The first tick, the tick of the acknowledged snapshot, and where the inputs begin; in a `Held`, `end`. -1 stands
+        for this place in all other messages.
+    """
+    if end - at < 4:
+        return 0, 0, -1
+    holds = data[at] == 0x93 and data[at + 1] == 9
+    if not holds and (data[at] != 0x94 or data[at + 1] != 2):
+        return 0, 0, -1
+    at += 2
+    size = number_bytes(data, at)
+    if size == 0 or at + size >= end:
+        return 0, 0, -1
+    first = number_at(data, at, size)
+    at += size
+    size = number_bytes(data, at)
+    if size == 0 or at + size > end or (not holds and at + size + 2 > end):
+        return 0, 0, -1
+    acked = number_at(data, at, size)
+    at += size
+    if not holds:
+        return first, acked, at
+    if not 1 <= first <= AFTER_MAX or acked < 0 or at != end:
+        return 0, 0, -1
+    return newest + first, newest + first - acked, end
+
+
+@inlined
+def put_margin(numbers: Any, base: int, due: int, tick: int, ahead: float, one: float) -> None:
+    """Files the margin of a message for the tick `due`, which becomes the newest one."""
+    margin = floor((due - tick - 1 + ahead) * one)
+    if due <= tick:
+        margin = min(margin, -1)
+    numbers[base + MARGINS + numbers[base + N_MARGINS]] = max(REFUSED_MARGIN + 1, min(margin, -REFUSED_MARGIN - 1))
+    numbers[base + N_MARGINS] += 1
+    numbers[base + NEWEST] = numbers[base + ACCEPTED] = due
+
+
+@inlined
+def hold_input(numbers: Any, base: int, due: int, tick: int, repeats: int, ahead: float, one: float) -> None:
+    """Notes that the latest input of a row holds from `due` on, as `InputQueue.hold` does."""
+    end, held_to = due + repeats, numbers[base + HELD_TO]
+    if due <= tick:
+        numbers[base + LATE] += max(min(tick, end) - max(due, held_to + 1) + 1, 0)
+        numbers[base + MISSING] = 0
+    numbers[base + HELD_TO] = max(held_to, end)
+    put_margin(numbers, base, due, tick, ahead, one)
+
+
+@inlined
 def file_inputs(
     numbers: Any,
     ring: Any,
@@ -129,17 +187,14 @@ def file_inputs(
         for j in range(3, row_bytes):
             aim |= data[at + j] << (8 * (j - 3))
         at += row_bytes
-        margin = floor((due - tick - 1 + ahead) * one)
+        numbers[base + HELD_TO] = min(numbers[base + HELD_TO], due - 1)
         if due > tick:
             slot = (row * slots + due % slots) * SLOT
             ring[slot], ring[slot + 1], ring[slot + 2] = due, head, aim
         else:
             numbers[base + LATE] += 1
             numbers[base + HELD], numbers[base + HELD_AIM], numbers[base + MISSING] = head, aim, 0
-            margin = min(margin, -1)
-        numbers[base + MARGINS + numbers[base + N_MARGINS]] = max(REFUSED_MARGIN + 1, min(margin, -REFUSED_MARGIN - 1))
-        numbers[base + N_MARGINS] += 1
-        numbers[base + NEWEST] = numbers[base + ACCEPTED] = due
+        put_margin(numbers, base, due, tick, ahead, one)
 
 
 @jit
@@ -179,11 +234,12 @@ def take_messages(
         data: the messages, one after the other; those in frames are unmasked.
         rows, sizes, times: row, size in bytes (if negative, of its frame) and time of arrival (s) of each message.
         fates: gets the fate of each message.
-        rules: the latest tick, the most ticks ahead, bytes of an input, most inputs of a message, slots of a row.
+        rules: the latest tick, the most ticks ahead, bytes of an input, most inputs of a message, slots of a row,
+            number of ticks for which an input is repeated.
         clock: deadline of the latest tick in seconds, ticks per second, most ticks to catch up on, a margin of one tick
             on the wire, messages of a burst, `flow_control.RATE_WINDOW_S`, `flow_control.RTT_SPAN_S`.
     """
-    tick, ahead_most, row_bytes, most, slots = rules[0], rules[1], rules[2], rules[3], rules[4]
+    tick, ahead_most, row_bytes, most, slots, repeats = rules[0], rules[1], rules[2], rules[3], rules[4], rules[5]
     deadline, rate, catch_up, one, burst = clock[0], clock[1], clock[2], clock[3], clock[4]
     end = 0
     for i in range(len(fates)):
@@ -194,32 +250,34 @@ def take_messages(
         if numbers[base + STATE] != PLAIN:
             continue
         numbers[base + STATE] = ODD
-        if end - at < 6 or data[at] != 0x94 or data[at + 1] != 2:
-            continue
-        at += 2
-        size = number_bytes(data, at)
-        if size == 0 or at + size + 3 > end:
-            continue
-        first = number_at(data, at, size)
-        at += size
-        size = number_bytes(data, at)
-        if size == 0 or at + size + 2 > end:
-            continue
-        acked = number_at(data, at, size)
-        at += size
-        n = (end - at - 2) // row_bytes
-        if data[at] != 0xC4 or data[at + 1] != end - at - 2 or n * row_bytes != end - at - 2 or n > most:
-            continue
         newest, kept = numbers[base + NEWEST], numbers[base + N_MARGINS]
-        if first != newest + 1 or first <= numbers[base + ACCEPTED] or first + n - 1 > tick + ahead_most:
+        first, acked, at = message_head(data, at, end, newest)
+        if at < 0:
             continue
-        if first + n > FIRST_MAX or kept + n > KEPT or floats[reals + ALLOWANCE] - 1 < -burst:
+        size = end - at - 2
+        n = 1 if at == end else size // row_bytes
+        if at < end and (data[at] != 0xC4 or data[at + 1] != size or n * row_bytes != size or n > most):
+            continue
+        if first <= max(newest, numbers[base + ACCEPTED]) or first > max(newest, numbers[base + HELD_TO]) + 1:
+            continue
+        if at == end and newest != numbers[base + ACCEPTED]:
+            continue
+        left_out = first - newest - 1 if kept > 0 else 0
+        if first + n - 1 > tick + ahead_most or first + n > FIRST_MAX or kept + left_out + n > KEPT:
+            continue
+        if floats[reals + ALLOWANCE] - 1 < -burst:
             continue
         now = times[i]
         floats[reals + RECEIVED_AT] = max(floats[reals + RECEIVED_AT], now)
         floats[reals + ALLOWANCE] -= 1
         ahead = ticks_left(now, deadline, rate, catch_up)
-        file_inputs(numbers, ring, row, data, at + 2, (first, n, tick, row_bytes, slots), ahead, one)
+        for k in range(kept, kept + left_out if n > 0 else kept):
+            numbers[base + MARGINS + k] = REFUSED_MARGIN
+            numbers[base + N_MARGINS] = k + 1
+        if at == end:
+            hold_input(numbers, base, first, tick, repeats, ahead, one)
+        else:
+            file_inputs(numbers, ring, row, data, at + 2, (first, n, tick, row_bytes, slots), ahead, one)
         fates[i] = DONE
         if numbers[base + ACKED] < acked <= numbers[base + TICK]:
             numbers[base + ACKED] = acked
@@ -281,6 +339,9 @@ def take_inputs(
             ring[slot] = -1
             numbers[base + HELD], numbers[base + HELD_AIM] = ring[slot + 1], ring[slot + 2]
             numbers[base + MISSING] = 0
+            numbers[base + USED] += 1
+        elif tick <= numbers[base + HELD_TO]:
+            numbers[base + MISSING] = repeats
             numbers[base + USED] += 1
         else:
             numbers[base + MISSING] += 1

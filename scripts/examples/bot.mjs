@@ -4,9 +4,10 @@
 //     npm ci && node bot.mjs "ws://127.0.0.1:8765/match?kind=arena" [seconds]
 //
 // It goes where the server sends it (`Go`), and reconnects to its world after a lost connection.
-// Its timeline is ahead of the server, and it sends an input per tick. It predicts with the kernel in WebAssembly: the
-// world of the newest snapshot, stepped by the inputs after it. `predicted` in its output has its own states that it
-// had predicted before the server sent them. SOVEREIGN_WEB is the folder of kernel.js (default: that of this checkout).
+// Its timeline is ahead of the server. It has an input per tick, and sends those that change. It predicts with
+// the kernel in WebAssembly: the world of the newest snapshot, stepped by the inputs after it. `predicted` in its output
+// has its own states that it had predicted before the server sent them. SOVEREIGN_WEB is the folder of kernel.js
+// (default: that of this checkout).
 
 import { readFileSync } from "node:fs";
 import { pathToFileURL } from "node:url";
@@ -20,16 +21,17 @@ const { loadKernel } = await import(new URL("kernel.js", WEB));
 const kernel = await loadKernel(readFileSync(new URL("../../shared/prebuilt/kernel.wasm", WEB)));
 
 const [url = "ws://127.0.0.1:8765", seconds = 10] = process.argv.slice(2);
-const HELLO = 1, INPUTS = 2, PING = 3, BYE = 4, WELCOME = 17, SNAPSHOT = 18, TERRAIN = 19, PONG = 20, GOTO = 27, WAITING = 28;
+const HELLO = 1, INPUTS = 2, PING = 3, BYE = 4, HELD = 9, WELCOME = 17, SNAPSHOT = 18, TERRAIN = 19, PONG = 20, GOTO = 27, WAITING = 28;
 const GOING_AWAY = 1001, TRIES = 3, HOPS = 8, NOTHING = new Uint8Array(0);
 const STOP = [1, 2, 4], GO = [8, 16], FALL = 32, LAUNCH = 64, TOLD = 128; // events in an entity's turn
-const BLOCK = 2 ** 24, SIDE = 32 * BLOCK, SPEED = 2 ** 16, KEYFRAME = -1, USED = 0, REFUSED = -32768;
+const BLOCK = 2 ** 24, SIDE = 32 * BLOCK, SPEED = 2 ** 16, KEYFRAME = -1, USED = 0, REPEATED = 1, REFUSED = -32768;
 const SQUARE = [[127, 0], [0, 127], [-127, 0], [0, -127]]; // east, north, west, south
 
 const entities = new Map(); // id -> { tick, template, falls, at: [x, y, z], v: [x, y, z], move: [x, y, buttons] }, as on the wire
 const said = new Map(); // id -> attributes
 let me, scene, acked, sent, used = 0, pongs, margins, phase, lead; // of the world that it plays in
 let world, coming, newer, inputs, fates, ahead, agreed; // the predicted world, terrain on its way, and what is predicted
+let latest, told, due, changes; // the latest row, the newest tick that was sent, that of the next `Held`, ticks with rows: when late ones came
 let socket, path = new URL(url).pathname + new URL(url).search, lobby = path, resume = NOTHING, timers = [];
 let joined, going, leaving, ends, tries = 0, hops = 0, wait = 0; // `wait`: seconds to the next attempt; negative: none
 
@@ -49,7 +51,7 @@ function connect() { // to a path of the server, or to the address of another on
   said.clear();
   const { protocol, host } = new URL(url);
   socket = new WebSocket(path[0] === "/" ? `${protocol}//${host}${path}` : path, { perMessageDeflate: false });
-  socket.on("open", () => send(HELLO, 3, {}, "node", "", resume));
+  socket.on("open", () => send(HELLO, 4, {}, "node", "", resume));
   socket.on("message", data => {
     const [kind, ...fields] = decode(data); // each bin in it is a Buffer, as `data` is
     if (going) return;
@@ -98,7 +100,7 @@ function leave() {
 function welcome(version, tick, entity, rules, key) {
   [me, scene, resume, joined, tries, wait] = [entity, rules, key, true, 0, 0];
   [world, coming, newer, agreed] = [kernel.world(scene), [], [], []];
-  [inputs, fates, ahead] = [new Map(), new Map(), new Map()];
+  [inputs, fates, ahead, changes, latest] = [new Map(), new Map(), new Map(), new Map(), ""];
   path = path.replace(/\?seat=.*/, ""); // the seat counts once
   for (let i = 0; i < 5; i++) timers.push(setTimeout(() => send(PING, now(), 0), 100 * i));
   timers.push(setInterval(() => { send(PING, now(), 0); tell(); hops = 0; }, 1000));
@@ -123,10 +125,17 @@ function pong(at, tick) { // the server's time is tick_rate * now + phase; the q
 
 function walk() { // sends a row for each tick that our timeline has reached; jumps at each corner
   const tick = Math.floor(scene.tick_rate * now() + phase + lead), side = 2 * scene.tick_rate;
-  if (tick - sent > 16) sent = tick - 1; // the first time, or after a pause
+  if (tick - sent > 7) [sent, latest] = [tick - 1, ""]; // the first time, or after a pause
   if (tick <= sent) return;
   const row = [...SQUARE[Math.floor(tick / side) % 4], tick % side === 0];
-  send(INPUTS, sent + 1, acked, Uint8Array.from(Array(tick - sent).fill(row).flat()));
+  if (row.join() !== latest) {
+    send(INPUTS, sent + 1, acked, Uint8Array.from(Array(tick - sent).fill(row).flat()));
+    for (let each = sent + 1; each <= tick; each++) changes.set(each, 0);
+    [latest, told, due] = [row.join(), tick, tick + 1];
+  } else if (tick >= due) {
+    send(HELD, tick - told, tick - acked);
+    [told, due] = [tick, tick + 2];
+  }
   while (sent < tick) inputs.set(++sent, row);
   if (acked >= 0) predict();
 }
@@ -142,7 +151,7 @@ function compare(tick) { // what was predicted for a tick, if the server used ev
   const { base, state } = ahead.get(tick) ?? {};
   const ticks = Array.from({ length: tick - base }, (_, k) => base + 1 + k);
   if (state && ticks.every(each => fates.get(each) === USED)) agreed.push([tick, ...state]);
-  for (const map of [ahead, inputs, fates]) for (const old of map.keys()) if (old <= tick - 64) map.delete(old);
+  for (const map of [ahead, inputs, fates, changes]) for (const old of map.keys()) if (old <= tick - 64) map.delete(old);
 }
 
 function again(tick) { // predicts from a snapshot on
@@ -177,6 +186,17 @@ function turn(entity, events, tail) { // returns the entity after a tick with th
   return { tick: tick + 1, template, falls, at: to, v: v.map((speed, k) => events & STOP[k] ? 0 : speed), move };
 }
 
+function judge(newest, first, statuses, early) { // where a row was late, the one before was used, although the status may be USED
+  [...records(2, early)].map(margin => margin.readInt16LE()).forEach((margin, i, { length }) => {
+    const tick = newest + 1 - length + i;
+    if (margin !== REFUSED && margin < 0 && changes.has(tick)) changes.set(tick, tick - margin * scene.tick_rate / 8192);
+  });
+  statuses.forEach((fate, i) => {
+    const tick = first + i, change = Math.max(...[...changes.keys()].filter(each => each <= tick));
+    fates.set(tick, change > newest || changes.get(change) > tick ? REPEATED : fate);
+  });
+}
+
 function snapshot(tick, newest, early, first, statuses, verdicts, drops, ...parts) {
   const told = new Map(), left = new Set(); // told: entities with a row; left: "segment", or "segment:entity"
   for (const drop of records(12, drops)) left.add(ints(drop, 0, 4, 8).join());
@@ -202,7 +222,7 @@ function snapshot(tick, newest, early, first, statuses, verdicts, drops, ...part
   for (const [, , , , , , , , , , attributes = []] of parts)
     for (let i = 0; i < attributes.length; i += 2) said.set(attributes[i], attributes[i + 1]);
   acked = tick;
-  statuses.forEach((fate, i) => fates.set(first + i, fate));
+  judge(newest, first, statuses, early);
   for (const [x, y, z, , , , , , , edits] of parts)
     for (const edit of records(3, edits)) {
       const at = edit.readUInt16LE(), block = [x * 32 + (at & 31), y * 32 + (at >> 5 & 31), z * 32 + (at >> 10)];

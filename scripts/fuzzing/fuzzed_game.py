@@ -18,6 +18,7 @@ from shared.fields import COMMAND_MAX
 from shared.inputs import clamp
 from shared.messages import (
     Command,
+    Held,
     Hello,
     Inputs,
     Ping,
@@ -225,6 +226,7 @@ class FuzzedGame:
                 (
                     Inputs(max(0, tick + rng.randint(-70, 70)), tick, rng.randbytes(size * rng.randrange(20))),
                     Inputs(tick + 1, tick - rng.randrange(3), rng.randbytes(2 * size)),
+                    Held(rng.randint(1, 64), rng.randrange(70)),
                     Command(
                         rng.randrange(COMMAND_MAX) if rng.random() < 0.01 else self.made,
                         tick + rng.randint(-3, 70),

@@ -7,9 +7,10 @@ stdin     a command per line: "clients N": connect or disconnect until there are
           figures. The end of the pipe: stop
 stdout    a JSON object per line: {"playing", "gone", "clients"} every `REPORT_S`, and the window's figures after "end"
 
-Every client sends a hello, pings once a second, acknowledges, and sends the input of each tick `LEAD_TICKS` ahead of
-the server's time, at its own moment within the tick, whether or not snapshots arrive. It wanders: a new direction about
-once a second, and an occasional jump. It reads only the first bytes of most messages.
+Every client sends a hello, pings once a second, acknowledges, and has an input for each tick, `LEAD_TICKS` ahead of the
+server's time, at its own moment within the tick, whether or not snapshots arrive. Like the SDK, it sends an input that
+has changed, and says 16 times a second that one stays the same. It wanders: a new direction about once a second, and an
+occasional jump. It reads only the first bytes of most messages.
 
 Between the slots the process sleeps instead of waiting for its sockets. Waking another process takes the server's time,
 a tenth of it in a virtual machine. Clients on other machines would not cost that.
@@ -25,10 +26,12 @@ import sys
 import time
 from typing import Any
 
+from client_sdk.sent_inputs import RENEW_S
 from scripts.loadgen.player import PING_S, Player, WorldTime, frame
 from server.observability.histogram import between
 from shared import fields, messages
-from shared.messages import Bye, Hello, Inputs, Ping, decode_from_server, encode
+from shared.bounds import bounds, in_ticks
+from shared.messages import Bye, Held, Hello, Inputs, Message, Ping, decode_from_server, encode
 
 LEAD_TICKS = 2
 """Ticks from sending an input to the deadline of its tick, at most. An input is sent up to a tick later than that.
@@ -50,6 +53,7 @@ class Swarm:
     def __init__(self, order: dict[str, Any]) -> None:
         self.order = order
         self.rate: int = order["rate"]
+        self.repeats, self.renew = bounds(self.rate).repeats, in_ticks(RENEW_S, self.rate, 1)
         self.lead_ticks: int = order.get("lead_ticks", LEAD_TICKS)
         self.jump_share: float = order.get("jump_share", JUMP_SHARE)
         self.slots = max(1, round(1 / self.rate / SLOT_S))
@@ -159,7 +163,16 @@ class Swarm:
             row = row[:2] + b"\1"
         player.sent = due
         self.inputs += n
-        self.out(player, frame(encode(Inputs(due - n + 1, player.acked, row * n))))
+        if row != player.row or n > self.repeats or player.acked > due:
+            message: Message = Inputs(due - n + 1, player.acked, row * n)
+            player.row, player.due = row, due + 1
+        elif due >= player.due:
+            message = Held(due - player.said, due - player.acked)
+            player.due = due + self.renew
+        else:
+            return
+        player.said = due
+        self.out(player, frame(encode(message)))
 
     def out(self, player: Player, data: bytes) -> None:
         try:

@@ -55,7 +55,8 @@ class Player:
     """A player with its connection to a path of the server."""
 
     __slots__ = (
-        "acked", "buffer", "move", "number", "open", "phase", "pinged", "rng", "sent", "snapshots", "sock", "time",
+        "acked", "buffer", "due", "move", "number", "open", "phase", "pinged", "rng", "row", "said", "sent",
+        "snapshots", "sock", "time",
     )  # fmt: skip
 
     def __init__(self, number: int, port: int, seed: int, path: str, time: WorldTime) -> None:
@@ -69,6 +70,10 @@ class Player:
         self.buffer = b""
         self.open = False
         self.acked = self.sent = -1
+        self.said = self.due = -1
+        """Newest tick of a message with inputs, and that of the next one if the input stays the same."""
+        self.row = b""
+        """Input of the newest tick."""
         self.pinged = -math.inf
         self.move = bytes(3)
         self.snapshots = 0

@@ -11,14 +11,14 @@ from server.game.session import Session
 from server.replication import flow_control
 from shared.bounds import bounds
 from shared.kernels import Kernel
-from shared.messages import Inputs, Ping, head_of
+from shared.messages import Held, Inputs, Ping, head_of
 from shared.scene import Scene
 from shared.session_rows import ALLOWANCE, FLOATS, PROBE_AT, PROBE_BYTES, RECEIVED_AT, WIDTH
 from shared.traffic import ANSWERED, FRAME_HEAD_BYTES, LEFT
 
 WAITING_MAX = 4096
 """Maximum number of messages that wait for the next tick."""
-INPUTS, PING = head_of(Inputs), head_of(Ping)
+TAKEN, PING = (head_of(Inputs), head_of(Held)), head_of(Ping)
 """First two bytes of the messages that do not take a session off the fast path."""
 FRAME, MASKED = 0x82, 0x80
 """First byte of a WebSocket frame with a whole binary message, and what is added to its second one, the size."""
@@ -55,7 +55,8 @@ class Arrivals:
         self._newest, self._rows, self._limits, self._clocks = newest, rows, limits, clocks
         self._recall, self._receive, self._kernel = recall, receive, kernel
         ahead, most = min(bounds(rate).ahead, rows.slots), limits.input_rows_max
-        self._rules = Arguments(kernel, "q", values=(0, ahead, scene.input_row_bytes, most, rows.slots))
+        facts = (0, ahead, scene.input_row_bytes, most, rows.slots, bounds(rate).repeats)
+        self._rules = Arguments(kernel, "q", values=facts)
         self._clock = Arguments(
             kernel,
             "d",
@@ -77,7 +78,7 @@ class Arrivals:
     def post(self, session: Session, data: bytes, now: float) -> bool:
         """Handles a message of a session on the fast path. Returns False if it was recalled instead."""
         head, row = data[:2], session.row
-        if head == INPUTS and len(data) <= self._limits.message_bytes_max:
+        if head in TAKEN and len(data) <= self._limits.message_bytes_max:
             self._arrived.append((row, len(data), data, now))
             if len(self._arrived) >= WAITING_MAX:
                 self.flush()
@@ -96,8 +97,7 @@ class Arrivals:
             FRAME_HEAD_BYTES + 2 <= size <= self._frame_max
             and data[0] == FRAME
             and data[1] == MASKED + size - FRAME_HEAD_BYTES
-            and data[2] ^ data[6] == INPUTS[0]
-            and data[3] ^ data[7] == INPUTS[1]
+            and bytes((data[2] ^ data[6], data[3] ^ data[7])) in TAKEN
             and len(self._arrived) < WAITING_MAX
         ):
             self._arrived.append((row, -size, data, now))

@@ -27,6 +27,7 @@ from shared.session_rows import (
     HELD,
     HELD_AIM,
     HELD_SHARE,
+    HELD_TO,
     KEPT,
     LATE,
     LEAST_RTT,
@@ -184,6 +185,7 @@ class Rows:
         values[NEWEST], values[ACCEPTED], values[MISSING] = queue.newest, queue.accepted, queue.missing
         values[HELD], values[HELD_AIM] = self._words(row(queue.held, aim=self._aim))
         values[N_MARGINS], values[N_STATUSES] = len(queue.margins), len(queue.statuses)
+        values[HELD_TO] = queue.held_to
         values[MARGINS : MARGINS + len(queue.margins)] = queue.margins.tolist()
         values[STATUSES : STATUSES + len(queue.statuses)] = queue.statuses
         values[TICK], values[ACKED], values[SNAPSHOT_BYTES] = stream.tick, stream.acked, stream.snapshot_bytes
@@ -245,6 +247,7 @@ class Rows:
         flow = stream.flow
         self.count(at, queue)
         queue.newest, queue.accepted, queue.missing = values[NEWEST], values[ACCEPTED], values[MISSING]
+        queue.held_to = values[HELD_TO]
         queue.held = self.input_of(values[HELD], values[HELD_AIM])
         queue.margins = array("h", values[MARGINS : MARGINS + values[N_MARGINS]])
         queue.statuses = bytearray(values[STATUSES : STATUSES + values[N_STATUSES]])
@@ -310,7 +313,7 @@ class Rows:
         slot, base = (at * self.slots + tick % self.slots) * SLOT, at * WIDTH
         if self.ring[slot] == tick:
             return self.input_of(self.ring[slot + 1], self.ring[slot + 2])
-        if self.numbers[base + MISSING] + 1 > repeats:
+        if tick > self.numbers[base + HELD_TO] and self.numbers[base + MISSING] + 1 > repeats:
             return self.input_of(0, 0)
         return self.input_of(self.numbers[base + HELD], self.numbers[base + HELD_AIM])
 

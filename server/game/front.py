@@ -20,6 +20,7 @@ from shared.messages import (
     Beside,
     Bye,
     Command,
+    Held,
     Hello,
     Inputs,
     Ping,
@@ -145,6 +146,10 @@ class Front:
                 return
             session.inputs.file(message, self.newest, self.clocks.ticks_left(now))
             self.sender.acked(session.stream, message.acked, now)
+        elif isinstance(message, Held) and session.entity:
+            inputs = session.inputs
+            inputs.hold(message, self.newest, self.clocks.ticks_left(now))
+            self.sender.acked(session.stream, inputs.newest - message.behind, now)
         elif isinstance(message, Ping):
             tick = self.newest + 1 - self.clocks.ticks_left(now)
             session.send(encode(Pong(message.sent, tick)))

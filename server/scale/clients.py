@@ -42,6 +42,11 @@ class EdgeInputs(InputQueue):
         self.in_time = self.in_time + 1 if status == USED else 0
         return input_
 
+    def _margin(self, at: int, tick: int, ahead: float) -> int:
+        if at <= tick:
+            self.in_time = 0  # the input before may have held, so that none was missing
+        return super()._margin(at, tick, ahead)
+
     def restart(self, at: int) -> None:
         """Removes the inputs for tick `at` and later.
 

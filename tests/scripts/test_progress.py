@@ -9,7 +9,7 @@ from client_sdk.core import Core
 from scripts.soak_test.progress import Progress
 from scripts.soak_test.walkers import LOOK_S, Walker, walk
 from shared.inputs import Input
-from shared.messages import Inputs, decode_from_client
+from shared.messages import Held, Inputs, decode_from_client
 from shared.scene import load_scene
 from sovereign_netcode.playtest import Link as Line
 from sovereign_netcode.playtest import Match
@@ -80,7 +80,7 @@ class Deaf(Core):
 
     def outgoing(self) -> list[bytes]:
         sent = super().outgoing()
-        return [data for data in sent if self.sends or not isinstance(decode_from_client(data), Inputs)]
+        return [data for data in sent if self.sends or not isinstance(decode_from_client(data), Inputs | Held)]
 
 
 def joined() -> tuple[Match, Deaf]:

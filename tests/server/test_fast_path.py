@@ -21,10 +21,12 @@ from server.net.websocket import _frame_head
 from server.players.player import Player
 from server.rules import Rules
 from shared import kernels, messages
+from shared.fields import AFTER_MAX
 from shared.inputs import JUMP, Input, clamp, row
 from shared.messages import (
     Bye,
     Command,
+    Held,
     Hello,
     Inputs,
     Ping,
@@ -109,6 +111,8 @@ class Peer:
     def __init__(self, crowd: "Crowd", number: int) -> None:
         self.crowd, self.number = crowd, number
         self.rng = random.Random(f"{crowd.seed} {number}")
+        self.holds = number % 2 == 1
+        """Whether it leaves out inputs that stay the same."""
         self.sent: list[tuple[int, bytes]] = []
         self.closings: list[tuple[int, int, str]] = []
         self.resume = b""
@@ -119,6 +123,8 @@ class Peer:
     def open(self) -> None:
         self.acked = self.next = -1
         self.stalled = self.waiting = 0
+        self.said = Input(1)
+        self.latest = self.next
         self.move = Input()
         self.session = self.crowd.game.open(self, self.crowd.now)
         self.say(encode(Hello(messages.VERSION, {}, f"peer {self.number}", resume=self.resume)))
@@ -178,8 +184,15 @@ class Peer:
             self.do_something_else()
 
     def say_inputs(self, n: int) -> None:
-        rows = row(self.move, aim=self.crowd.game.scene.aim) * n
-        self.say(encode(Inputs(self.next, self.acked, rows)))
+        after = self.next - self.latest
+        if self.holds and self.move == self.said and n == 1 and after <= AFTER_MAX:
+            if after > self.rng.randrange(3):
+                self.say(encode(Held(after, max(self.next - self.acked, 0))))
+                self.latest = self.next
+        else:
+            rows = row(self.move, aim=self.crowd.game.scene.aim) * n
+            self.say(encode(Inputs(self.next, self.acked, rows)))
+            self.said, self.latest = self.move if n else self.said, max(self.next + n - 1, self.latest)
         self.next += n
 
     def do_something_else(self) -> None:
@@ -203,7 +216,23 @@ class Peer:
             self.say(encode(Resync()))
         elif kind == 9 and rng.random() < 0.2:
             good = encode(Inputs(max(self.next, 0), self.acked, row(self.move, aim=self.crowd.game.scene.aim)))
-            self.say(rng.choice([good[:-1], good + b"\0", b"", b"\x94\x02", rng.randbytes(9), good[:2] + b"\xff" * 9]))
+            held = encode(Held(rng.randrange(1, 4), rng.randrange(300)))
+            self.say(
+                rng.choice(
+                    [
+                        held,
+                        held[:-1],
+                        held + b"\0",
+                        b"\x93\x09\0\0",
+                        good[:-1],
+                        good + b"\0",
+                        b"",
+                        b"\x94\x02",
+                        rng.randbytes(9),
+                        good[:2] + b"\xff" * 9,
+                    ]
+                )
+            )
         elif kind == 10 and rng.random() < 0.2:
             self.say(encode(Bye(1000, "", -1.0))) if rng.random() < 0.3 else self.lose()
         elif kind == 11:

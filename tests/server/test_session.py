@@ -4,12 +4,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from client_sdk.sent_inputs import SentInputs
 from server.game.session import Session
 from server.players.input_queue import InputQueue
 from shared.bounds import bounds
 from shared.fields import INPUT_ROWS_MAX, TICK_MAX
 from shared.inputs import NEUTRAL, Input, clamp, row
-from shared.messages import IDLE, MARGIN_REFUSED, NEUTRALISED, REPEATED, USED, Inputs
+from shared.messages import IDLE, MARGIN_REFUSED, NEUTRALISED, REPEATED, USED, Held, Inputs
 
 LIMITS = bounds(32)
 AHEAD_MAX, REPEATS_MAX, STATUSES_MAX, MARGIN_ONE = LIMITS.ahead, LIMITS.repeats, LIMITS.statuses, LIMITS.margin_one
@@ -293,3 +294,132 @@ def test_a_session_closes_its_link_once() -> None:
     session.close(4003, "first")
     session.close(4005, "second")
     assert (session.closed, link.closings) == (True, [(4003, "first")])
+
+
+# -- inputs that hold -------------------------------------------------------------------------------------------
+
+
+def test_an_input_that_holds_is_used_without_rows_and_ends_as_one_that_is_repeated() -> None:
+    rows, queue = filed(1, EAST, EAST), filed(1, EAST)
+    queue.hold(Held(1, 0), 0, 1.0)
+    taken = [queue.take(tick) for tick in range(1, 8 + REPEATS_MAX)]
+    assert taken == [rows.take(tick) for tick in range(1, 8 + REPEATS_MAX)]
+    assert taken == [EAST] * (2 + REPEATS_MAX) + [NEUTRAL] * 5
+    assert list(queue.statuses) == [USED] * (2 + REPEATS_MAX) + [NEUTRALISED] * 5
+    assert (queue.used, queue.substituted, queue.late) == (2 + REPEATS_MAX, 5, 0)
+
+
+def test_a_row_replaces_an_input_that_holds_from_its_tick_on() -> None:
+    queue = filed(1, EAST)
+    queue.hold(Held(1, 0), 0, 1.0)
+    queue.file(inputs(4, NORTH), 1, 1.0)
+    assert [queue.take(tick) for tick in range(1, 7)] == [EAST] * 3 + [NORTH] * 3
+    assert list(queue.statuses) == [USED] * 4 + [REPEATED] * 2, "the first input does not hold after the second"
+    queue.hold(Held(1, 0), 6, 1.0)
+    assert queue.late == 2
+
+
+def test_a_late_row_is_what_holds_from_then_on() -> None:
+    queue = filed(1, EAST)
+    queue.hold(Held(1, 0), 0, 1.0)
+    assert [queue.take(tick) for tick in range(1, 5)] == [EAST] * 4
+    queue.file(inputs(3, NORTH), 4, 0.5)
+    queue.hold(Held(1, 0), 4, 0.5)
+    assert [queue.take(tick) for tick in range(5, 13)] == [NORTH] * 8
+    assert list(queue.statuses)[:11] == [USED] * 11, "nothing was missing: the client knows by the margin"
+    assert margins(queue)[3] == round(-1.5 * MARGIN_ONE)
+    assert queue.late == 2, "the row of tick 3, and that it held in tick 4"
+
+
+def test_a_late_message_about_ticks_in_which_the_input_held_anyway_is_not_a_late_input() -> None:
+    queue = filed(1, EAST)
+    queue.hold(Held(1, 0), 0, 1.0)
+    for tick in range(1, 5):
+        queue.take(tick)
+    queue.hold(Held(2, 0), 4, 1.0)
+    assert queue.late == 0
+    assert queue.margins[-1] < 0, "the client steers by it all the same"
+    end = 4 + REPEATS_MAX
+    for tick in range(5, end + 4):
+        queue.take(tick)
+    queue.hold(Held(end - 3, 0), end + 3, 1.0)
+    assert (queue.newest, queue.late, queue.substituted) == (end + 1, 3, 3)
+    assert queue.take(end + 4) == EAST, "it holds again"
+
+
+def test_ticks_without_a_message_get_no_margins_but_between_two() -> None:
+    queue = filed(1, EAST)
+    queue.hold(Held(1, 0), 0, 1.0)
+    assert list(margins(queue)) == [1, 2]
+    queue.take_feedback()
+    queue.hold(Held(2, 0), 1, 1.0)
+    assert list(margins(queue)) == [4]
+    queue.hold(Held(2, 0), 2, 1.0)
+    assert margins(queue)[5] == MARGIN_REFUSED
+    assert margins(queue).keys() == {4, 5, 6}
+
+
+def test_what_holds_goes_on_after_a_restart_until_a_row_replaces_it() -> None:
+    queue = filed(1, EAST, NORTH, NORTH)
+    queue.hold(Held(1, 0), 0, 1.0)
+    queue.restart(2)
+    assert [queue.take(tick) for tick in range(1, 5)] == [EAST] * 4
+    queue.file(inputs(2, WEST, WEST, WEST, WEST), 4, 1.0)
+    assert [queue.take(tick) for tick in range(5, 7)] == [WEST] * 2
+    assert list(queue.statuses) == [USED] * 5 + [REPEATED]
+
+
+def test_an_input_does_not_hold_from_too_far_ahead() -> None:
+    queue = filed(1, EAST)
+    for _ in range(AHEAD_MAX // 64 + 2):
+        queue.hold(Held(64, 0), 0, 1.0)
+    assert queue.margins[-1] == MARGIN_REFUSED
+    assert queue.held_to <= AHEAD_MAX + REPEATS_MAX
+    queue.newest = TICK_MAX
+    queue.hold(Held(1, 0), 0, 1.0)
+    assert queue.newest == TICK_MAX
+
+
+def test_after_an_input_that_was_refused_nothing_holds_until_one_is_accepted() -> None:
+    queue = filed(1, EAST)
+    queue.file(inputs(2, *[NORTH] * AHEAD_MAX), 0, 1.0)
+    refused = AHEAD_MAX + 1
+    assert (queue.accepted, queue.newest, queue.refused) == (AHEAD_MAX, refused, 1)
+    queue.file(inputs(refused, WEST), 0, 1.0)
+    queue.hold(Held(1, 0), 60, 1.0)
+    assert (queue.newest, queue.held_to, queue.refused) == (refused + 1, -1, 3), "the server has WEST from nowhere"
+    assert queue.margins[-1] == MARGIN_REFUSED
+    queue.hold(Held(1, 0), 61, 1.0)
+    assert queue.margins[-1] == MARGIN_REFUSED
+    queue.file(inputs(refused + 3, WEST), 62, 1.0)
+    queue.hold(Held(1, 0), 62, 1.0)
+    assert queue.margins[-1] > 0
+    assert queue.held_to == refused + 4 + REPEATS_MAX
+
+
+def test_nothing_holds_before_the_first_input() -> None:
+    queue = InputQueue(LIMITS)
+    queue.hold(Held(5, 0), 0, 1.0)
+    assert (queue.held_to, queue.refused, margins(queue)) == (-1, 1, {4: MARGIN_REFUSED})
+    assert [queue.take(tick) for tick in range(1, 4)] == [NEUTRAL] * 3
+    queue.file(inputs(5, EAST), 3, 1.0)
+    queue.hold(Held(1, 0), 3, 1.0)
+    assert queue.held_to == 6 + REPEATS_MAX
+
+
+@given(st.lists(st.sampled_from([EAST, NORTH, WEST]), min_size=1, max_size=60), st.integers(1, 240))
+def test_inputs_that_are_left_out_are_the_same_for_the_server(wishes: list[Input], rate: int) -> None:
+    every, some = InputQueue(bounds(rate)), InputQueue(bounds(rate))
+    sent = SentInputs(rate, 3)
+    for tick, wish in enumerate(wishes, 1):
+        every.file(inputs(tick, wish), tick - 1, 1.0)
+        for message in sent.send(tick, row(wish), [0.0], tick - 3):
+            if isinstance(message, Held):
+                assert some.newest + message.after - message.behind == tick - 3
+                some.hold(message, tick - 1, 1.0)
+            else:
+                assert isinstance(message, Inputs)
+                some.file(message, tick - 1, 1.0)
+        assert some.coming(tick) == every.coming(tick) == some.take(tick) == every.take(tick) == wish
+    assert some.statuses == every.statuses
+    assert (some.used, some.late, some.substituted) == (every.used, every.late, every.substituted)

@@ -40,6 +40,10 @@ class Sent(Core):
         for message in map(decode_from_client, sent):
             if isinstance(message, Inputs):
                 self.buttons |= {message.first + i: buttons for i, buttons in enumerate(message.rows[2::3])}
+        if self.buttons and self._worlds.play is not None:  # inputs that stay the same are not sent
+            newest = max(self.buttons)
+            same = range(newest + 1, self._worlds.play.newest + 1)
+            self.buttons |= dict.fromkeys(same, self.buttons[newest])
         return sent
 
     @property

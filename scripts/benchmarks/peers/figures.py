@@ -78,8 +78,8 @@ def played(logs: Logs, begin: float, end: float) -> Figures:
             if tick < 0:
                 lost += 1
                 continue
-            waits.append(logs.ticks[int(tick)] - arrival)
-            if int(number) in sent:
+            if int(number) in sent:  # and not an input that holds without a message of its own
+                waits.append(logs.ticks[int(tick)] - arrival)
                 ways.append(logs.ticks[int(tick)] - sent[int(number)])
         empty += sum(taken[tick] == 0 for tick in within)
         bursts += sum(taken[tick] > 1 for tick in within)

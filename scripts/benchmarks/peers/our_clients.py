@@ -22,11 +22,11 @@ from client_sdk.bots import Bot
 from client_sdk.events import Corrected, Joined, Left
 from server.runtime import event_loop
 from shared.inputs import Input, make_input, row
-from shared.messages import Inputs, decode_from_client, encode
+from shared.messages import Held, Inputs, decode_from_client, encode
 from shared.world import World
 
-INPUTS = encode(Inputs(0, 0, bytes(3)))[1]
-"""Second byte of a message with inputs: its type."""
+INPUTS, HELD = encode(Inputs(0, 0, bytes(3)))[1], encode(Held(1, 0))[1]
+"""Second bytes of messages with inputs: their types."""
 
 
 class Walk:
@@ -57,6 +57,7 @@ class Player:
         self.name = f"p{number}"
         self._greedy = greedy
         self.sent: dict[int, float] = {}
+        self._newest, self._row = -1, b""
         self.corrections: list[tuple[float, float]] = []
         self._joined = asyncio.Event()
 
@@ -82,6 +83,15 @@ class Player:
                     self.sent[tick] = now
                 if self._greedy:
                     sent.append(encode(Inputs(newest + 1, inputs.acked, row(make_input(1.0, 0.0)))))
+                self._newest, self._row = newest, inputs.rows[-3:]
+            elif message[1] == HELD:
+                held = decode_from_client(message)
+                assert isinstance(held, Held)
+                self._newest += held.after
+                self.sent[self._newest] = now
+                if self._greedy:
+                    rows = self._row + row(make_input(1.0, 0.0))  # a later `Held` must not count from the second one
+                    sent[-1] = encode(Inputs(self._newest, self._newest - held.behind, rows))
         return sent
 
     async def _listen(self) -> None:

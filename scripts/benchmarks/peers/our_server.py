@@ -28,12 +28,13 @@ from server.game import Game
 from server.game.session import Session
 from server.runtime import event_loop, log
 from server.runtime.warmup import warm_up
+from shared.bounds import bounds
 from shared.fields import INPUT_ROW_BYTES
-from shared.messages import Inputs, decode_from_client, head_of
+from shared.messages import Held, Inputs, decode_from_client, head_of
 from shared.scene import Scene
 
 RATE = 32
-INPUTS = head_of(Inputs)
+HEADS = head_of(Inputs), head_of(Held)
 
 
 def scene() -> Scene:
@@ -64,7 +65,7 @@ class Measured(Game):
         arrivals.post_frame, self._rows = self._post_frame, arrivals._rows
 
     def receive(self, session: Session, data: bytes, now: float) -> None:
-        if data[:2] == INPUTS and session.player is not None:
+        if data[:2] in HEADS and session.player is not None:
             self.arrived.append((session.player.name, data, now))
         super().receive(session, data, now)
 
@@ -96,11 +97,20 @@ class Measured(Game):
 
     def input_log(self) -> dict[str, Any]:
         logs: dict[str, dict[int, float]] = {}
+        newest: dict[str, int] = {}
         for name, data, now in self.arrived:
-            message = decode_from_client(data if data[:2] == INPUTS else apply_mask(data[6:], data[2:6]))
-            assert isinstance(message, Inputs)
-            for at in range(message.first, message.first + len(message.rows) // INPUT_ROW_BYTES):
-                logs.setdefault(name, {}).setdefault(at, now)
+            message = decode_from_client(data if data[:2] in HEADS else apply_mask(data[6:], data[2:6]))
+            log, before, holds = logs.setdefault(name, {}), newest.get(name, -1), 0
+            if isinstance(message, Held):
+                first, n, holds = before + message.after, 1, bounds(RATE).repeats + 1
+            else:
+                assert isinstance(message, Inputs)
+                first, n = message.first, len(message.rows) // INPUT_ROW_BYTES
+            for at in range(max(first, before + 1), first + n):
+                log[at] = now  # also where an earlier input held
+            for at in range(first + n, first + holds):
+                log.setdefault(at, now)
+            newest[name] = max(before, first + n - 1)
         inputs = {
             name: [[at, arrived, at - self.first if self._used(at, arrived) else -1] for at, arrived in log.items()]
             for name, log in logs.items()

@@ -1,0 +1,169 @@
+"""The inputs that a client has sent, by tick: the messages for new ones, and what a snapshot says about earlier ones.
+
+Theory of operation. A changed input is sent in its tick. One that stays the same is not: in the tick after a change,
+and then every `RENEW_S` seconds, a `Held` of 4 bytes says that it holds for the next `Bounds.repeats` ticks. A later
+input replaces it at once, so nothing is sent later than in a message per tick. The server uses the same input in every
+tick as if it had got one for each. Two things differ. There is an arrival margin per message, not per tick. And where
+an input changes while the one before holds, the server does not miss a late message: the status of the tick is USED
+although the input before was used (`replaced`). The margin says so. It may come in a snapshot after that of the status
+or, from an edge of a cluster, in one before.
+
+TCP detects a lost message by the answer to the next one. So the loss of a `Held` delays it for longer than in a message
+per tick, by the time until the next one is sent. A changed input does not meet that delay: it is itself the next
+message, or a `Held` follows it in the next tick. The lead is for changed inputs, so it does not count (`filled`).
+"""
+
+from collections.abc import Iterator, Sequence
+from struct import iter_unpack
+
+from shared import priced
+from shared.bounds import bounds, in_ticks
+from shared.messages import MARGIN_REFUSED, USED, Held, Inputs, Message, Snapshot
+from shared.ring import Ring
+
+ROWS_MAX = 16
+"""Limit of the inputs in one message."""
+RENEW_S = 0.0625
+"""Seconds after which an input that stays the same is sent again."""
+PRICE_S = 2 * priced.PRICE_S
+"""Price of all inputs being late, in seconds of lead. With half as many messages, half as many are lost. With twice the
+price, the lead covers the same losses as with a message per tick."""
+CHANGED, RENEWED, QUIET = range(3)
+"""Kinds of ticks by what was sent for them: the input; that the input before holds; nothing."""
+
+
+def margins_of(snapshot: Snapshot) -> Iterator[tuple[int, int]]:
+    """Yields the ticks of a snapshot's arrival margins, and the margins in units of the wire."""
+    first = snapshot.newest + 1 - len(snapshot.margins) // 2
+    return ((tick, margin) for tick, (margin,) in enumerate(iter_unpack("<h", snapshot.margins), first))
+
+
+class SentInputs:
+    """The inputs that one client has sent.
+
+    Args:
+        rate: ticks per second.
+        row_bytes: length of one input in a message, `Scene.input_row_bytes`.
+    """
+
+    def __init__(self, rate: int, row_bytes: int) -> None:
+        self._bounds, self._row_bytes = bounds(rate), row_bytes
+        self.renew = in_ticks(RENEW_S, rate, 1)
+        """Number of ticks after which an input that stays the same is sent again."""
+        self._due = self._newest = self._changed = 0
+        self.restart()
+        self.forget()
+
+    def restart(self) -> None:
+        """Makes the next input count as changed, because the server may not have the latest one."""
+        self._latest = b""
+
+    def forget(self) -> None:
+        """Forgets what was sent, because it was withdrawn."""
+        size = self._bounds.predicted
+        self._sent: Ring[tuple[float, int, int]] = Ring(size)
+        """Phase of the timeline, kind, and the tick from which on the input has been the same, by tick."""
+        self._late: list[Ring[float]] = [Ring(size), Ring(size)]
+        """Arrival (in ticks) of changed inputs that were late, by tick; over the connection and over a second one."""
+
+    def change_over(self) -> None:
+        """Notes that the second connection has taken the place of the first."""
+        self._late = [self._late[1], Ring(self._bounds.predicted)]
+
+    def send(self, first: int, rows: bytes, phases: Sequence[float], acked: int) -> list[Message]:
+        """Files the inputs of new ticks. Returns the messages to send.
+
+        Args:
+            first: the first tick.
+            rows: the inputs of this tick and of those after it, packed.
+            phases: phases of the timeline, one per input.
+            acked: tick of the newest snapshot that was applied.
+        """
+        size, to = self._row_bytes, first + len(phases) - 1
+        at = max(first, self._due)
+        if rows != self._latest * len(phases) or to > at + self._bounds.repeats or acked > at:
+            for tick, phase in enumerate(phases, first):
+                self._sent.put(tick, (phase, CHANGED, tick))
+            self._changed = to
+            self._latest, self._newest, self._due = rows[-size:], to, to + 1
+            return [
+                Inputs(first + at, acked, rows[size * at : size * (at + ROWS_MAX)])
+                for at in range(0, len(phases), ROWS_MAX)
+            ]
+        for tick, phase in enumerate(phases, first):
+            self._sent.put(tick, (phase, RENEWED if tick == at else QUIET, self._changed))
+        if at > to:
+            return []
+        after, self._newest, self._due = at - self._newest, at, max(at + self.renew, to + 1)
+        return [Held(after, at - acked)]
+
+    def phase(self, tick: int) -> float | None:
+        """Returns the timeline's phase when a message for a tick was sent; None: there was none."""
+        sent = self._sent.get(tick)
+        return None if sent is None or sent[1] == QUIET else sent[0]
+
+    def has(self, tick: int) -> bool:
+        """Returns whether the server was sent an input for a tick, or that the input before holds."""
+        return self._sent.get(tick) is not None
+
+    def changed(self, tick: int) -> bool:
+        """Returns whether the input of a tick was sent by itself."""
+        sent = self._sent.get(tick)
+        return sent is not None and sent[1] == CHANGED
+
+    def filled(self, needs: Sequence[tuple[int, float]], before: int, last: float) -> Iterator[tuple[int, float]]:
+        """Yields the needs of messages, and of the ticks between them for which nothing was sent.
+
+        Where one snapshot reports several, they have arrived together: then a message per tick would have ended the
+        delay earlier, by the ticks until the next message.
+
+        Args:
+            needs: ticks and needs of the messages that a snapshot reports.
+            before, last: tick and need of the latest message before them.
+        """
+        for i, (tick, need) in enumerate(needs):
+            if i + 1 < len(needs) and self.quiet(tick + 1, needs[i + 1][0]):
+                need = min(need, needs[i + 1][1] + needs[i + 1][0] - tick - 1)
+            gap = tick - before
+            if gap <= self._bounds.repeats and self.quiet(before + 1, tick):
+                for k in range(1, gap):
+                    yield before + k, last + (need - last) * k / gap
+            yield tick, need
+            before, last = tick, need
+
+    def quiet(self, first: int, end: int) -> bool:
+        """Returns whether the input before held in the ticks from `first` to `end` - 1, of which there are any."""
+        return first < end and all(
+            (sent := self._sent.get(tick)) is not None and sent[1] == QUIET for tick in range(first, end)
+        )
+
+    def arrived(self, snapshot: Snapshot, connection: int = 0) -> None:
+        """Notes which changed inputs a snapshot reports as late.
+
+        Args:
+            snapshot: the snapshot.
+            connection: 1 for a second connection, else 0.
+        """
+        late, one = self._late[connection], self._bounds.margin_one
+        for tick, margin in margins_of(snapshot):
+            if MARGIN_REFUSED < margin < 0 and self.changed(tick):
+                late.put(tick, tick - margin / one)
+
+    def replaced(self, snapshot: Snapshot) -> int:
+        """Returns the number of ticks of a snapshot with the status USED in which another input was used.
+
+        In such a tick, the server did not know yet that the input had changed, or the client sent nothing. `arrived`
+        comes first.
+        """
+        return sum(
+            status == USED and self._was_replaced(tick, snapshot.newest)
+            for tick, status in enumerate(snapshot.statuses, snapshot.first)
+        )
+
+    def _was_replaced(self, tick: int, newest: int) -> bool:
+        """Returns whether the server used another input in a tick, while it had those up to the tick `newest`."""
+        sent = self._sent.get(tick)
+        if sent is None or sent[2] > newest:
+            return True
+        arrived = self._late[0].get(sent[2])
+        return arrived is not None and tick < arrived
