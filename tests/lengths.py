@@ -7,7 +7,7 @@ import pytest
 from hypothesis import settings
 
 T = TypeVar("T")
-VARIANTS = 4
+VARIANTS = 3
 """Number of variants of one test in a short run, besides those that are long ones by themselves. A long run has all."""
 EXAMPLES = 100
 """Number of examples of a property test in a long run, unless the test has a number of its own (`examples`)."""

@@ -23,7 +23,7 @@ CHECKS = {
     "language": ("-m", "scripts.checks.language"),
     "import-linter": ("-c", "from importlinter.cli import lint_imports_command as run; run()", "--no-logo"),
 }
-LONG = "(slow or hypothesis)"
+LONG = "(slow or hypothesis) and not contained"
 """Markers of the tests that are longer in a long run."""
 
 

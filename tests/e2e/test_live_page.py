@@ -71,6 +71,7 @@ async def test_a_bot_is_seen_running() -> None:
     assert len({spot[3] for spot in found["spots"]}) == 1, "Bob stands"
 
 
+@pytest.mark.slow
 def test_the_picture_of_the_readme_is_made_by_its_script(tmp_path: Path) -> None:
     picture = tmp_path / "live.png"
     command = [sys.executable, "scripts/live_picture.py", "--seconds", "1", "--out", str(picture)]
