@@ -25,6 +25,8 @@ CHECKS = {
 }
 LONG = "(slow or hypothesis) and not contained"
 """Markers of the tests that are longer in a long run."""
+WORKERS = {"short": "4", "long": "3"}
+"""Number of tests at a time in a short and in a long run. Long tests wait less."""
 
 
 def main(arguments: list[str]) -> int:
@@ -85,8 +87,9 @@ def compiled() -> list[Step]:
 
 
 def together(markers: str, profile: str) -> Step:
-    """Runs tests four at a time, because many of them wait: two cores are busy all the time then."""
-    return run("tests", *pytest(markers, "not paired and not alone", profile), "-n", "4", "--dist", "worksteal")
+    """Runs several tests at a time, because many of them wait: two cores are busy all the time then."""
+    workers = ("-n", WORKERS[profile], "--dist", "worksteal")
+    return run("tests", *pytest(markers, "not paired and not alone", profile), *workers)
 
 
 def in_pairs(profile: str) -> Step:
