@@ -1,6 +1,9 @@
 """The variants of a test that a short run has: a few, evenly spread; a long run has the others."""
 
+import ast
+from collections.abc import Iterator
 from itertools import pairwise
+from pathlib import Path
 
 import pytest
 
@@ -31,3 +34,21 @@ def test_every_worker_begins_with_its_share_of_the_longest(count: int, workers: 
     for number, tests in enumerate(dealt):
         assert [test for test in tests if test in longest] == longest[number::workers]
         assert all(tests.index(test) < 3 * count for test in tests if test in longest)
+
+
+def calls_of_contained(source: str) -> Iterator[str]:
+    """Yields the source of each list of parameters that has `contained`."""
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.List) and any(ast.unparse(each).startswith("*contained(") for each in node.elts):
+            yield ast.unparse(node)
+
+
+def test_a_contained_form_has_a_long_one_beside_it() -> None:
+    files = sorted(Path(__file__).parents[1].rglob("test_*.py"))
+    texts = {file: file.read_text("utf-8") for file in files if file.name != Path(__file__).name}
+    found = {file: list(calls_of_contained(text)) for file, text in texts.items() if "*contained(" in text}
+    assert len(found) > 20
+    for file, lists in found.items():
+        for each in lists:
+            assert "*long(" in each or "mark.slow" in each, (file, each)
+    assert sum(map(len, found.values())) == sum(text.count("*contained(") for text in texts.values())
