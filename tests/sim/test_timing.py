@@ -12,6 +12,7 @@ import pytest
 
 from client_sdk.core import Core
 from client_sdk.netsim.links import PRESETS
+from client_sdk.sent_inputs import PRICE_S
 from client_sdk.timing.lead import PricedLead
 from scripts.experiments import lead_trial, league
 from shared.inputs import Input
@@ -111,18 +112,19 @@ def test_the_curve_joins_its_points() -> None:
     assert league.curve(points[1:], 0.05) is None
 
 
-def hold(core: Core, rng: random.Random) -> Input:
-    return Input(127, 0)
+def changing(core: Core, rng: random.Random) -> Input:
+    """Returns another input in each tick, so that each is sent by itself, as in the league."""
+    return Input(127, rng.randrange(100))
 
 
 def late_shares(preset: str, seconds: float, seed: int) -> Iterator[float]:
     match = Match(load_scene("flat"), seed)
-    player = match.join(hold, PRESETS[preset])
+    player = match.join(changing, PRESETS[preset])
     match.run_until(lambda: player.core.state == "playing", 20)
     match.run(seconds)
     stats = player.core.stats
     yield stats.inputs_late / stats.inputs_sent
-    yield played(preset, seed, seconds / 60)["late_inputs_share"]
+    yield lead_trial.trial(preset, lead_trial.OURS, seconds / 60, seed, (PRICE_S,))["late_inputs_share"]
 
 
 @pytest.mark.parametrize(("preset", "most"), [("typical", 0.012), *long(("regional", 0.005), ("dip", 0.01))])
