@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any, Protocol
 
+from scripts.benchmarks.memory import Sink
 from server.config.limits import Limits
 from server.game import Game
 from server.journal.recorded_world import RecordedWorld
@@ -30,19 +31,6 @@ PARTS = ("game", "edge", "sequencer", "standby")
 SETTLE_TICKS, BLOCK_TICKS = 96, 32
 """Ticks after the joins, in which terrain is delivered. Ticks whose work is one measurement; one of them has a hash of
 the world."""
-
-
-class Sink:
-    """A link that discards all messages."""
-
-    def send(self, message: bytes) -> None:
-        pass
-
-    def outstanding(self) -> int:
-        return 0
-
-    def close(self, code: int, reason: str) -> None:
-        pass
 
 
 class Served(Protocol):

@@ -7,19 +7,21 @@ changed in these ticks. A client that is further behind than changes are kept, o
 keyframe of it. Nothing is computed per entity and client.
 """
 
+import contextlib
 from collections import defaultdict
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from itertools import accumulate
 from typing import Any
 
 from server.observability.errors import FaultReporter
+from server.replication.segment_rows import in_segments
 from shared import messages
 from shared.blocks import offset_of, pack, segment_of
 from shared.bounds import bounds, in_ticks
 from shared.checks import Cell
-from shared.layout import ID, TEMPLATE, X
+from shared.layout import ID, TEMPLATE, Int64s, X
 from shared.ring import Ring
-from shared.snapshot import KEYFRAME, SegmentDelta, TickEncoder, checksum, encode_part, encode_rows, join_part
+from shared.snapshot import KEYFRAME, ROW_BYTES, SegmentDelta, TickEncoder, checksum, encode_rows, join_part
 from shared.states import STATES
 from shared.units import TO_SEGMENT
 from shared.world import World
@@ -280,17 +282,43 @@ class ChangeLog:
             kept = self._packed[segment] = (version, pack(self._world.blocks.segment(segment)))
         return kept[1]
 
+    def keyframes(self, segments: Collection[Cell]) -> DeltaCache:
+        """Returns the keyframes, as `since` does. It encodes those of the given segments together."""
+        known, blocks = self.since(KEYFRAME), self._world.blocks
+        new = [segment for segment in segments if segment not in known and segment in blocks]
+        if len(new) > 1:
+            with contextlib.suppress(Exception):  # each is encoded alone then, and the wrong one is reported
+                known.update(self._keyframes(new))
+        return known
+
     def _keyframe(self, segment: Cell) -> bytes:
         if segment in self._world.blocks:
-            rows = self._world.in_segment(segment)
-        else:
-            strays = [entity for entity, home in self._home.items() if home == segment]
-            rows = self._world.rows(sorted(strays))
-        if not len(rows):
-            return join_part(segment, KEYFRAME, NO_CHANGES)
-        placed, ids = self._placed_lately(), rows[:, ID].tolist()
-        fields = b"".join(map(self._fields_of, ids)) if self._world.extras.count else b""
-        return encode_part(segment, KEYFRAME, rows, placed=placed, attributes=self._of(ids), fields=fields)
+            return self._keyframes([segment])[segment]
+        strays = [entity for entity, home in self._home.items() if home == segment]
+        return self._encoded([segment], self._world.rows(sorted(strays)), [len(strays)])[segment]
+
+    def _keyframes(self, segments: list[Cell]) -> dict[Cell, bytes]:
+        """Returns the keyframes of loaded segments."""
+        return self._encoded(segments, *in_segments(self._world, segments))
+
+    def _encoded(self, segments: list[Cell], rows: Int64s, counts: list[int]) -> dict[Cell, bytes]:
+        """Returns the keyframes of segments.
+
+        Args:
+            segments: the segments.
+            rows: their entities, one segment after the other.
+            counts: number of the entities of each.
+        """
+        ids, packed, at, parts = rows[:, ID].tolist(), encode_rows(rows, placed=self._placed_lately()), 0, {}
+        for segment, count in zip(segments, counts, strict=True):
+            end = at + count
+            fields = b"".join(map(self._fields_of, ids[at:end])) if self._world.extras.count else b""
+            changes = b"", b"", packed[at * ROW_BYTES : end * ROW_BYTES]
+            parts[segment] = join_part(
+                segment, KEYFRAME, changes, attributes=self._of(ids[at:end]) if count else (), extra=fields
+            )
+            at = end
+        return parts
 
     def _placed_lately(self) -> set[int]:
         """Returns the entities placed in the last `history` ticks. A client may still know their former positions."""

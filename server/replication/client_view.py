@@ -121,7 +121,7 @@ class ClientView:
                 return n, plain
         special = self._behind | dict.fromkeys(self._fresh, KEYFRAME)
         due = special | {segment: self.tick for segment in self.sees - special.keys() if deltas[segment]}
-        keyframes = log.since(KEYFRAME) if self._fresh else deltas
+        keyframes = log.keyframes(self._fresh) if self._fresh else deltas
         parts = {
             segment: part
             for segment, since in due.items()

@@ -1,6 +1,8 @@
 """Changes since any tick: a client that applies them has exactly the server's state."""
 
+import contextlib
 import random
+from typing import Any
 
 import msgpack
 import numpy as np
@@ -10,6 +12,7 @@ from server.config.limits import Limits
 from server.game import Game
 from server.game.session import Session
 from server.replication.change_log import PACKS_PER_TICK, ChangeLog
+from server.replication.segment_rows import in_segments
 from shared.blocks import Kinds, unpack
 from shared.bounds import bounds
 from shared.checks import Cell
@@ -21,7 +24,7 @@ from shared.snapshot import ACTED, KEYFRAME, PLACED, decode_parts
 from shared.units import BLOCK, SEGMENT
 from shared.world import OverlapError, World
 from tests.lengths import long_but
-from tests.worlds import scene
+from tests.worlds import build, floor, scene
 
 HOME, EAST, WEST = (0, 0, 0), (1, 0, 0), (-1, 0, 0)
 
@@ -486,3 +489,44 @@ def test_a_client_equals_the_server_with_any_skips_and_any_interest(seed: int) -
     assert recorded.model.turns > 10
     assert not recorded.session.stream.terrain_due
     assert recorded.game.counters.snapshots_skipped > 50
+
+
+def test_keyframes_that_are_encoded_together_are_those_that_are_encoded_alone() -> None:
+    rng = random.Random(11)
+    world = build([floor()], player="person", spawns=((0.0, 0.0, 0.0),))
+    attributes: dict[int, dict[str, Any]] = {}
+    together, alone = ChangeLog(world, attributes), ChangeLog(world, attributes)
+    for _ in range(70):
+        with contextlib.suppress(OverlapError):
+            entity = world.spawn("person", (rng.uniform(-30, 30), rng.uniform(-30, 30), 4.0 * rng.randint(0, 3)))
+            attributes[entity] = {"name": f"player {entity}"}
+    for entity in list(attributes)[::7]:
+        world.remove(entity)
+        del attributes[entity]
+    segments = [*world.blocks, (99, 0, 0)]
+    for _ in range(4):
+        world.step()
+        for entity in attributes:
+            if rng.random() < 0.2:
+                with contextlib.suppress(OverlapError):
+                    world.place(entity, (rng.uniform(-30, 30), rng.uniform(-30, 30), 20.0))
+        together.record()
+        alone.record()
+        rng.shuffle(segments)
+        some = segments[: rng.randint(2, len(segments))]
+        found = together.keyframes(some)
+        assert [found[segment] for segment in segments] == [alone.since(KEYFRAME)[segment] for segment in segments]
+        assert [alone.encode(segment, KEYFRAME) for segment in segments] == [found[segment] for segment in segments]
+        rows, counts = in_segments(world, list(world.blocks))
+        assert rows.tolist() == [row for segment in world.blocks for row in world.in_segment(segment).tolist()]
+        assert sum(counts) == len(rows) == len(world)
+
+
+def test_a_keyframe_that_cannot_be_encoded_leaves_the_others() -> None:
+    world = build([floor()], player="person", spawns=((0.0, 0.0, 0.0),))
+    entity = world.spawn("person", (3.0, 3.0, 0.0))
+    log = ChangeLog(world, {entity: {"wrong": object()}})
+    world.step()
+    log.record()
+    parts = log.keyframes(list(world.blocks))
+    assert {segment for segment in world.blocks if not parts[segment]} == {log.segment(entity)}
