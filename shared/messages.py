@@ -280,8 +280,6 @@ pack: Callable[[Any], bytes] = msgpack.Packer().pack
 """Packer of MessagePack values. It takes half the time of `msgpack.packb`, which creates a packer and a buffer for each
 message."""
 
-_WELCOME_HEAD = head_of(Welcome) + pack(VERSION)
-
 
 def encode(message: Message) -> bytes:
     """Returns a message as bytes."""
@@ -301,16 +299,6 @@ def join_snapshot(header: tuple[int, int, bytes, int, bytes, bytes, bytes], segm
     n = 1 + len(header) + segments
     head = pack(header)[1:]  # without the array's head, which is one byte
     return b"".join((_SNAPSHOT_HEAD, n.to_bytes(2, "big"), _SNAPSHOT_KIND, head, parts))
-
-
-def join_welcome(tick: int, entity: int, scene: bytes, resume: bytes) -> bytes:
-    """Returns an encoded `Welcome` of this version.
-
-    Args:
-        tick, entity, resume: fields of `Welcome`.
-        scene: the field `scene`, packed already; all clients of a world share it.
-    """
-    return b"".join((_WELCOME_HEAD, pack(tick), pack(entity), scene, pack(resume)))
 
 
 def decode(

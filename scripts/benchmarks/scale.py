@@ -85,7 +85,7 @@ def arithmetic(figures: dict[str, Line]) -> list[tuple[int, int, float]]:
     client, rows = per["edge"] - per["standby"], []
     for players in WORLDS:
         left = SHARE * 1e6 / RATE - base["edge"] - per["standby"] * players
-        edges = math.ceil(players * client / left) if left > 0 else 0
+        edges = max(math.ceil(players * client / left), 1) if left > 0 else 0
         rows.append((players, edges, (base["sequencer"] + per["sequencer"] * players) * RATE / 1e6))
     return rows
 
@@ -145,8 +145,10 @@ def show(figures: dict[str, Any], console: Console) -> None:
     for name, title in WHOLE.items():
         table.add_row(f"process: {title}", *map(str, whole[name]))
     console.print(table)
-    rows, kept = figures["live"], calm(figures["live"])
-    console.print(f"process: {len(kept)} of {len(rows)} windows count; in the others, many batches were late")
+    kept, late = calm(figures["live"]), sum(not row["calm"] for row in figures["live"])
+    if late:
+        rest = "count all the same" if len(kept) == len(figures["live"]) else "do not count"
+        console.print(f"{late} of {len(figures['live'])} windows of processes, in which many batches were late, {rest}")
     for players, loss in losses(kept).items():
         console.print(f"loss to the bus with {players} clients, in %: {loss}", soft_wrap=True, highlight=False)
     console.print(bus_table(figures, own))
@@ -156,9 +158,8 @@ def show(figures: dict[str, Any], console: Console) -> None:
 def losses(rows: Rows) -> dict[int, Figure]:
     """Returns what an edge costs more than a server in one process with as many clients, in %, by their number."""
     found = {}
-    for players in sorted(
-        {row["players"] for row in rows if "edge" in row} & {row["players"] for row in rows if "server" in row}
-    ):
+    with_edge, with_server = ({row["players"] for row in rows if name in row} for name in ("edge", "server"))
+    for players in sorted(with_edge & with_server):
         edge, one = (
             mean([row[name] for row in rows if row["players"] == players and name in row])
             for name in ("edge", "server")

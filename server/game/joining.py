@@ -17,7 +17,10 @@ from server.observability.errors import FaultReporter
 from server.players.player import Player
 from server.rules import Rules
 from shared import messages
-from shared.messages import Hello, join_welcome, pack
+from shared.messages import Hello, Welcome, head_of, pack
+
+WELCOME_HEAD = head_of(Welcome) + pack(messages.VERSION)
+"""First bytes of each welcome of this version."""
 
 
 class Door(Protocol):
@@ -195,3 +198,13 @@ def other_version(hello: Hello) -> str:
     """Returns the reason for refusing a client that speaks another version of the protocol."""
     newer = "older" if hello.version < messages.VERSION else "newer"
     return f"the client is {newer}: protocol version {hello.version}, the server speaks {messages.VERSION}"
+
+
+def join_welcome(tick: int, entity: int, scene: bytes, resume: bytes) -> bytes:
+    """Returns an encoded `Welcome` of this version.
+
+    Args:
+        tick, entity, resume: fields of `Welcome`.
+        scene: the field `scene`, packed already; all clients of a world share it.
+    """
+    return b"".join((WELCOME_HEAD, pack(tick), pack(entity), scene, pack(resume)))

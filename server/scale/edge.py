@@ -23,7 +23,7 @@ from server.game.connections import Connections
 from server.game.edge import Edge
 from server.game.fast_path import FastPath
 from server.game.front import Front
-from server.game.joining import Joining
+from server.game.joining import Joining, join_welcome
 from server.game.roster import Roster, digest_of
 from server.game.session import Session
 from server.game_api.input_api import held_input
@@ -40,7 +40,7 @@ from server.scale.wire import COMMAND, GONE, HERE, JOIN, KNOWS, SWITCH, Batch, R
 from shared import fields, messages
 from shared.bounds import bounds, in_ticks
 from shared.inputs import Input
-from shared.messages import Hello, join_welcome, pack
+from shared.messages import Hello, pack
 
 RESEND_TICKS, RESENT_MAX = 8, 64
 """Ticks without a batch in the records after which the unrecorded batches are sent again: one of them was lost on the

@@ -103,3 +103,15 @@ def test_the_work_of_all_parts_is_measured() -> None:
     rows = work(load_scene("meadow"), (2, 4), 1, 1)
     assert [row["players"] for row in rows] == [4, 2]
     assert all(row[name] > 0 for row in rows for name in (*PARTS, "log", "batches"))
+
+
+def test_windows_with_late_batches_do_not_count_if_enough_others_do() -> None:
+    figures = made(random.Random(1), 1.0, {"edge": 30.0, "server": 28.0, "sequencer": 5.0, "standby": 1.0})
+    for row in figures["live"]:
+        if "edge" in row and row["players"] == 150:
+            row["calm"], row["edge"] = False, 2 * row["edge"]
+    assert "6 of 36 windows of processes, in which many batches were late, do not count" in shown(figures)
+    assert scale.costs(figures)[1]["edge"].per.value == pytest.approx(30.0, abs=0.2)
+    for row in figures["live"]:
+        row["calm"] = "server" in row
+    assert "18 of 36 windows of processes, in which many batches were late, count all the same" in shown(figures)

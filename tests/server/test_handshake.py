@@ -3,6 +3,7 @@
 import pytest
 
 from server.config.limits import Limits
+from server.game.joining import join_welcome
 from shared import fields, messages
 from shared.messages import Bye, Command, Hello, Inputs, Message, Ping, Pong, Resync, Snapshot, Terrain, Welcome, encode
 from tests.tables import HELLO, Table
@@ -193,3 +194,10 @@ def test_a_flood_of_messages_is_closed_and_a_burst_is_not() -> None:
         table.tick(64)  # the allowance is back: one second at 64 ticks/s
     link.say(*[Ping(0.0)] * 257)
     assert link.refusal() == (messages.MALFORMED, "too many messages")
+
+
+def test_a_welcome_joined_from_a_packed_scene_has_the_same_bytes() -> None:
+    table = {"name": "flat", "spawns": [[1.0, 2.0, 3.0]] * 99}
+    for tick, entity, token in ((0, 1, b""), (1 << 40, 1 << 31, bytes(16)), (127, 128, bytes(range(16)))):
+        welcome = messages.Welcome(messages.VERSION, tick, entity, table, token)
+        assert join_welcome(tick, entity, messages.pack(table), token) == messages.encode(welcome)

@@ -428,10 +428,3 @@ def test_what_clients_sent_before_there_was_an_aim_is_what_it_was() -> None:
     inputs = bytes.fromhex("9402cd03fdcd03fac4067f00007f0001")
     assert messages.decode_from_client(inputs) == Inputs(1021, 1018, bytes((127, 0, 0, 127, 0, 1)))
     assert encode(Inputs(1021, 1018, b"".join((row(Input(127)), row(Input(127, 0, 1)))))) == inputs
-
-
-def test_a_welcome_joined_from_a_packed_scene_has_the_same_bytes() -> None:
-    table = {"name": "flat", "spawns": [[1.0, 2.0, 3.0]] * 99}
-    for tick, entity, token in ((0, 1, b""), (1 << 40, 1 << 31, bytes(16)), (127, 128, bytes(range(16)))):
-        welcome = messages.Welcome(messages.VERSION, tick, entity, table, token)
-        assert messages.join_welcome(tick, entity, messages.pack(table), token) == messages.encode(welcome)
