@@ -47,11 +47,14 @@ from server.runtime.warmup import warm_up
 from shared.checks import Cell
 from shared.inputs import Input
 from shared.layout import X
-from shared.messages import Hello, Ping, Pong, Welcome, decode_from_client, encode, join_snapshot
+from shared.messages import Held, Hello, Inputs, Ping, Pong, Welcome, decode_from_client, encode, head_of, join_snapshot
 from shared.scene import load_scene
 from shared.terrain import generate
 from shared.units import TO_SEGMENT
 from shared.world import World
+
+INPUTS = head_of(Inputs), head_of(Held)
+"""First two bytes of the messages with inputs."""
 
 
 class Echo:
@@ -74,7 +77,7 @@ class Echo:
         return self._made
 
     def receive(self, session: int, data: bytes, now: float) -> None:
-        if data[1] == 2:  # inputs
+        if data[:2] in INPUTS:
             return
         message, link = decode_from_client(data), self.links[session][0]
         if isinstance(message, Hello):
