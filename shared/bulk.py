@@ -14,15 +14,21 @@ from shared.layout import (
     CELL,
     CELLS_SHIFT,
     CHANGED,
+    EDGE_HIGH,
     EVENT_BITS,
     FLAGS,
     ID,
+    LO_X,
     MOVE_X,
     MOVE_Y,
     N_CHANGED,
+    NEW_BUTTONS,
+    NEW_MOVE,
     NEXT,
+    SIZE_X,
     STOP_X,
     TEMPLATE,
+    TEMPLATE_COLUMNS,
     TOLD,
     TURN,
     VX,
@@ -32,16 +38,30 @@ from shared.layout import (
     Y,
     Z,
 )
-from shared.units import IN_SEGMENT, TO_SEGMENT
+from shared.units import BLOCK, BLOCK_SHIFT, IN_SEGMENT, TO_SEGMENT
 
 jit, inlined = decorators(__name__)
 
-HEAD_BYTES = 5
-"""Length of a packed head, in bytes."""
 ROW_BYTES = 33
 """Length of a packed state, in bytes."""
 ALL_EVENTS = (1 << EVENT_BITS) - 1
 """Mask of the events in `changed`."""
+SENT_EVENTS = WHOLE - 1
+"""Mask of the events that are sent."""
+GAP_BITS = 6
+"""Number of bits of the gap between two ids in the first byte of a packed turn."""
+GAP_MASK, GAP_GOES_ON, HAS_EVENTS = (1 << GAP_BITS) - 1, 1 << GAP_BITS, 0x80
+"""Bits of the first byte of a packed turn: of the gap; the gap has more bytes; the events follow."""
+BLOCK_MASK = EDGE_HIGH - 1
+"""Mask of the block in the first byte of a packed stop."""
+WITHIN = 0x80
+"""Bit of the first byte of a packed stop: the place within the block follows in three bytes."""
+IN_BLOCK = BLOCK - 1
+"""Mask of a position's bits within a block."""
+PART = 7
+"""Number of values for each segment in the result of `news`."""
+ID_MAX = (1 << 31) - 1
+"""Greatest id."""
 ID_BITS = 32
 """Number of bits for an id, or for a place in the array of entities, within a key to sort by."""
 
@@ -56,33 +76,72 @@ def word(data: Any, at: int) -> int:
 
 
 @jit
-def read_turns(heads: bytes, tails: bytes, turns: Any) -> bool:
-    """Unpacks heads and tails (`shared.snapshot`) to `turns` ([n * 8]).
+def read_turns(data: bytes, ends: Any, turns: Any) -> int:
+    """Unpacks turns (`shared.snapshot`).
 
-    Returns whether `tails` has exactly the bytes that the heads need.
+    Args:
+        data: packed turns of all parts of a snapshot.
+        ends: end of each part's turns in `data`.
+        turns: [len(data) // 2 * 8], is written to.
+
+    Returns:
+        The number of turns; -1: a part breaks the format.
     """
     at = 0
-    for i in range(len(turns) // TURN):
-        to = TURN * i
-        events = heads[HEAD_BYTES * i + 4]
-        turns[to] = word(heads, HEAD_BYTES * i)
-        turns[to + 1] = events
-        for k in range(2, TURN):
-            turns[to + k] = 0
-        if events & TOLD != 0:
-            if at + 3 > len(tails):
-                return False
-            turns[to + 2] = (tails[at] ^ 0x80) - 0x80
-            turns[to + 3] = (tails[at + 1] ^ 0x80) - 0x80
-            turns[to + 4] = tails[at + 2]
-            at += 3
-        for k in range(3):
-            if events & (STOP_X << k) != 0:
-                if at + 4 > len(tails):
-                    return False
-                turns[to + 5 + k] = (word(tails, at) ^ 1 << 31) - (1 << 31)
-                at += 4
-    return at == len(tails)
+    to = 0
+    for part in range(len(ends)):
+        end = ends[part]
+        entity = 0
+        while at < end:
+            head = data[at]
+            at += 1
+            gap = head & GAP_MASK
+            shift = GAP_BITS
+            more = head & GAP_GOES_ON
+            while more != 0:
+                if at == end or shift > ID_BITS:
+                    return -1
+                gap |= (data[at] & 0x7F) << shift
+                more = data[at] & 0x80
+                shift += 7
+                at += 1
+            entity += gap + 1
+            events = TOLD | NEW_MOVE
+            if head & HAS_EVENTS != 0:
+                if at == end:
+                    return -1
+                events = data[at] & 0xFF
+                at += 1
+            size = 0
+            if events & TOLD != 0:
+                size = (2 if events & NEW_MOVE != 0 else 0) + (1 if events & NEW_BUTTONS != 0 else 0)
+            if entity > ID_MAX or at + size > end:
+                return -1
+            turns[to] = entity
+            turns[to + 1] = events
+            for k in range(2, TURN):
+                turns[to + k] = 0
+            if size >= 2:
+                turns[to + 2] = (data[at] ^ 0x80) - 0x80
+                turns[to + 3] = (data[at + 1] ^ 0x80) - 0x80
+            at += size
+            if size & 1 != 0:
+                turns[to + 4] = data[at - 1]
+            for k in range(3):
+                if events & (STOP_X << k) != 0:
+                    if at == end:
+                        return -1
+                    place = data[at] & 0xFF
+                    at += 1
+                    turns[to + 5 + k] = -1 - place
+                    if place >= 2 * EDGE_HIGH:
+                        if place & ~BLOCK_MASK != WITHIN or at + 3 > end:
+                            return -1
+                        within = data[at] | data[at + 1] << 8 | data[at + 2] << 16
+                        turns[to + 5 + k] = (place & BLOCK_MASK) << BLOCK_SHIFT | within
+                        at += 3
+            to += TURN
+    return to // TURN
 
 
 @jit
@@ -212,20 +271,63 @@ def wire_state(packed: Any, to: int, e: Any, at: int) -> int:
     return to
 
 
+@inlined
+def wire_turn(packed: Any, to: int, e: Any, at: int, gap: int, t: Any) -> int:
+    """Writes the packed turn of the entity at `at`, whose id is `gap + 1` above the one before.
+
+    Returns the place after it.
+    """
+    events = e[at + CHANGED] & SENT_EVENTS
+    head = gap & GAP_MASK
+    gap >>= GAP_BITS
+    head |= GAP_GOES_ON if gap != 0 else 0
+    head |= HAS_EVENTS if events != TOLD | NEW_MOVE else 0
+    packed[to] = head
+    to += 1
+    while gap != 0:
+        packed[to] = gap & 0x7F | (0x80 if gap > 0x7F else 0)
+        gap >>= 7
+        to += 1
+    if head & HAS_EVENTS != 0:
+        to = wire(packed, to, events, 1)
+    if events & TOLD != 0 and events & NEW_MOVE != 0:
+        to = wire(packed, to, e[at + MOVE_X], 1)
+        to = wire(packed, to, e[at + MOVE_Y], 1)
+    if events & TOLD != 0 and events & NEW_BUTTONS != 0:
+        to = wire(packed, to, e[at + BUTTONS], 1)
+    kind = e[at + TEMPLATE] * TEMPLATE_COLUMNS
+    for k in range(3):
+        if events & STOP_X << k != 0:
+            place = e[at + X + k] & IN_SEGMENT
+            low = place + t[kind + LO_X + k]
+            high = low + t[kind + SIZE_X + k]
+            if low & IN_BLOCK == 0:
+                to = wire(packed, to, low >> BLOCK_SHIFT & BLOCK_MASK, 1)
+            elif high & IN_BLOCK == 0:
+                to = wire(packed, to, high >> BLOCK_SHIFT & BLOCK_MASK | EDGE_HIGH, 1)
+            else:
+                to = wire(packed, to, place >> BLOCK_SHIFT | WITHIN, 1)
+                to = wire(packed, to, place, 3)
+    return to
+
+
 @jit
-def news(e: Any, changed: Any, lengths: Any, tick: int, every: int, ids: Any, parts: Any, due: Any, packed: Any) -> int:
+def news(
+    e: Any, t: Any, changed: Any, lengths: Any, tick: int, every: int, ids: Any, parts: Any, due: Any, packed: Any
+) -> int:
     """Packs the changes of a tick by segment, as `shared.snapshot` describes them.
 
     Args:
         e: array of the entities.
+        t: array of the templates.
         changed: rows of the entities that changed.
         lengths: lengths of the world's lists (`layout.N_CHANGED` ...).
         tick: number of the tick; it decides which segments are due for a checksum.
         every: number of ticks between two checksums of a segment.
         ids: [n] gets the ids of the entities with events, segment by segment; within a segment, those that are sent
             whole come last.
-        parts: [n * 8] gets for each segment: its index (3); where in `ids` the entities that are sent whole begin, and
-            where the segment ends; where in `packed` its heads, its tails and its rows end.
+        parts: [n * 7] gets for each segment: its index (3); where in `ids` the entities that are sent whole begin, and
+            where the segment ends; where in `packed` its turns and its rows end.
         due: [1 + n * 3] gets the number of the values that follow; then the index (3) of each segment that is due, once
             for each entity that has changed there.
         packed: [n * 33] gets the bytes.
@@ -274,30 +376,22 @@ def news(e: Any, changed: Any, lengths: Any, tick: int, every: int, ids: Any, pa
     to = 0
     while start < told:
         first = ids[start]
+        last = 0
         while end < told and e[ids[end] + CHANGED] & WHOLE == 0 and ahead(e, ids[end], first) == 0:
-            to = wire(packed, to, e[ids[end] + ID], 4)
-            to = wire(packed, to, e[ids[end] + CHANGED] & ALL_EVENTS, 1)
+            to = wire_turn(packed, to, e, ids[end], e[ids[end] + ID] - last - 1, t)
+            last = e[ids[end] + ID]
             end += 1
         parts[n_parts] = e[first + X] >> TO_SEGMENT
         parts[n_parts + 1] = e[first + Y] >> TO_SEGMENT
         parts[n_parts + 2] = e[first + Z] >> TO_SEGMENT
         parts[n_parts + 3] = end
         parts[n_parts + 5] = to
-        for i in range(start, end):
-            at = ids[i]
-            if e[at + CHANGED] & TOLD != 0:
-                for k in range(MOVE_X, CELL):
-                    to = wire(packed, to, e[at + k], 1)
-            for k in range(3):
-                if e[at + CHANGED] & STOP_X << k != 0:
-                    to = wire(packed, to, e[at + X + k] & IN_SEGMENT, 4)
-        parts[n_parts + 6] = to
         while end < told and ahead(e, ids[end], first) == 0:
             to = wire_state(packed, to, e, ids[end])
             end += 1
         parts[n_parts + 4] = end
-        parts[n_parts + 7] = to
-        n_parts += 8
+        parts[n_parts + 6] = to
+        n_parts += PART
         for i in range(start, end):
             ids[i] = e[ids[i] + ID]
         start = end

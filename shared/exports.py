@@ -27,10 +27,10 @@ EXPORTS = {
         "relink_range": "wnn",
     },
     "bulk": {
-        "read_turns": "bbQ",
+        "read_turns": "bqQ",
         "read_rows": "bqqqnQ",
         "alike": "qnqnnnq",
-        "news": "qqqnnQQQB",
+        "news": "qqqqnnQQQB",
         "muster": "qiQBn",
         "recall": "qqQQn",
     },
@@ -50,6 +50,8 @@ EXPORTS = {
 whole number that fits into 32 bits."""
 SERVER_SOURCES = frozenset({"traffic", "delivery", "pacing"})
 """Sources that only servers use. The libraries for browsers do not have their functions."""
+SMALL = SERVER_SOURCES | {"news"}
+"""Sources and functions that are compiled to be small rather than fast: they are not the physics."""
 
 FIELDS = {name: {"solid": "u", "heads": "i"}.get(name, "q") for name in Arrays._fields}
 """Kind of each array of a world (`layout.Arrays`), by name."""

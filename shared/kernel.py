@@ -49,6 +49,7 @@ from shared.layout import (
     CELLS,
     CELLS_SHIFT,
     CHANGED,
+    EDGE_HIGH,
     EVENT_BITS,
     EXACT,
     FALL,
@@ -73,6 +74,8 @@ from shared.layout import (
     N_LATER,
     N_STEPPED,
     N_WOKEN,
+    NEW_BUTTONS,
+    NEW_MOVE,
     NEXT,
     NOWHERE,
     OVERSPEED,
@@ -854,7 +857,7 @@ def step(w: Arrays, inputs: Any, n_inputs: int, tick: int) -> None:
                 wish = min(max(wish, -MOVE_MAX), MOVE_MAX)
             if e[wishes + k] != wish:
                 e[wishes + k] = wish
-                mark(w, row, tick, TOLD)
+                mark(w, row, tick, TOLD | (NEW_MOVE if k < 2 else NEW_BUTTONS))
         wake(w, row, -1)
 
     at = 0
@@ -958,6 +961,17 @@ def settle(w: Arrays, rows: Any, states: Any, n: int, tick: int) -> int:
 
 
 @inlined
+def stopped_at(t: Any, kind: int, axis: int, place: int) -> int:
+    """Returns the position within the segment that an explicit turn (`layout.TURN`) gives for an axis."""
+    if place < 0:
+        edge = -1 - place
+        place = ((edge & IN_SEGMENT >> BLOCK_SHIFT) << BLOCK_SHIFT) - t[kind + LO_X + axis]
+        if edge & EDGE_HIGH != 0:
+            place -= t[kind + SIZE_X + axis]
+    return place & IN_SEGMENT
+
+
+@inlined
 def advance(w: Arrays, row: int, events: int, turns: Any, i: int) -> None:
     """Makes the turn of an entity in a world that is written, not stepped: as `turn`, but with given events.
 
@@ -978,9 +992,10 @@ def advance(w: Arrays, row: int, events: int, turns: Any, i: int) -> None:
     vy = e[at + VY]
     vz = e[at + VZ]
     falling = e[at + FLAGS] & FALLING
-    if events & TOLD != 0:
+    if events & TOLD != 0 and events & NEW_MOVE != 0:
         e[at + MOVE_X] = min(max(turns[i + 2], -MOVE_MAX), MOVE_MAX)
         e[at + MOVE_Y] = min(max(turns[i + 3], -MOVE_MAX), MOVE_MAX)
+    if events & TOLD != 0 and events & NEW_BUTTONS != 0:
         e[at + BUTTONS] = turns[i + 4]
     if events & LAUNCH != 0:
         vz = t[kind + JUMP_SPEED]
@@ -1021,17 +1036,17 @@ def advance(w: Arrays, row: int, events: int, turns: Any, i: int) -> None:
     y = e[at + Y]
     z = e[at + Z]
     if events & STOP_X != 0:
-        to_x = x & ~IN_SEGMENT | turns[i + 5] & IN_SEGMENT
+        to_x = x & ~IN_SEGMENT | stopped_at(t, kind, 0, turns[i + 5])
         vx = 0
     else:
         to_x = x + displacement(p, 2 * vx)
     if events & STOP_Y != 0:
-        to_y = y & ~IN_SEGMENT | turns[i + 6] & IN_SEGMENT
+        to_y = y & ~IN_SEGMENT | stopped_at(t, kind, 1, turns[i + 6])
         vy = 0
     else:
         to_y = y + displacement(p, 2 * vy)
     if events & STOP_Z != 0:
-        to_z = z & ~IN_SEGMENT | turns[i + 7] & IN_SEGMENT
+        to_z = z & ~IN_SEGMENT | stopped_at(t, kind, 2, turns[i + 7])
         if from_vz + vz < 0:
             falling = 0
         vz = 0

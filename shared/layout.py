@@ -30,8 +30,14 @@ STOP_X, STOP_Y, STOP_Z, GO_X, GO_Y, FALL, LAUNCH, TOLD, WHOLE, CARRIED = (1 << b
 without a new input, as its input says. FALL: nothing supports it any more. LAUNCH: it jumped. TOLD: it has a new input.
 WHOLE: it was written from outside, or came into another segment, so its whole state is needed. CARRIED: an entity on
 which it stands moved it in this tick."""
+NEW_MOVE, NEW_BUTTONS = GO_X, GO_Y
+"""Meaning of two bits beside TOLD, which includes GO_X and GO_Y: the parts of the input that are new."""
 TURN = 8
-"""Number of columns of an explicit turn: id (for the kernel: row, or -1), events, input (3), position (3)."""
+"""Number of columns of an explicit turn: id (for the kernel: row, or -1), events, input (3), position (3). A position
+from 0 on counts from the low corner of the segment. A negative one is -1 - (block | EDGE_HIGH or 0): the entity's box
+touches the low plane of this block of its segment with its high or its low side."""
+EDGE_HIGH = 32
+"""Bit of a negative position in an explicit turn: the high side of the box touches the block's low plane."""
 
 LO_X, LO_Y, LO_Z, SIZE_X, SIZE_Y, SIZE_Z, SOLID, WALKS, JUMP_SPEED, WEIGHT, TOP_SQUARE, GROUND, AIR, CARRIES = (
     *range(12), 14, 17,

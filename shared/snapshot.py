@@ -1,11 +1,10 @@
 """The parts of a snapshot, one per segment: encoded once per tick, and sent to every client that sees the segment.
 
-    segment   [x, y, z, ago, heads, tails, rows, gone, check, edits, attributes, fields]   an array inside the
-              snapshot's array, without the fields at its end that are empty
+    segment   [x, y, z, ago, turns, rows, gone, check, edits, attributes, fields]   an array inside the snapshot's
+              array, without the fields at its end that are empty
     ago       the number of ticks that this part covers; -1 (`KEYFRAME`): rows are all entities of the segment
-    heads     n * [u32 id, u8 events]: entities that did not go on as before; only if `ago` is 1
-    tails     for each of them: i8 move_x, i8 move_y, u8 buttons if it has the event `TOLD` (a new input); then an i32
-              for each axis along which it stopped, in grid steps from the segment's low corner
+    turns     n * [gap, u8 events, new input, stops], ascending by id: entities that did not go on as before; only if
+              `ago` is 1 (below)
     rows      n * 33 bytes, the whole exact state of an entity:
               u32 id  u8 template  u8 flags  i32 x, y, z (grid steps from the segment's low corner)
               i32 vx, vy, vz  i8 move_x, move_y  u8 buttons
@@ -15,6 +14,16 @@
     attributes  [u32 id, {name: value}, u32 id, ...]: all attributes of an entity (its name, for example), if they
               changed in these ticks, or the entity came into the segment
     fields    the extra columns of entities that changed (`shared.extras`), in scenes that have any
+
+The parts of a turn:
+
+    gap       its id minus the one before it (0 at first) minus 1: the lowest 6 bits in the first byte, then 7 bits in
+              each further byte. Bit 6 of the first byte, and bit 7 of the others: another byte follows
+    events    follow if bit 7 of the first byte is set; otherwise they are `TOLD` and `NEW_MOVE`
+    input     beside `TOLD`: i8 move_x, i8 move_y if it has `NEW_MOVE`; u8 buttons if it has `NEW_BUTTONS`
+    stops     for each axis along which it stopped, a byte with its block b within the segment: 0 | b or 32 | b: the low
+              or high side of the entity's box touches the block's low plane; 128 | b: three more bytes have the place
+              within the block, in grid steps
 
 On the wire the flags have two more bits. `ACTED`: the server's rules acted on the entity (placed it, threw it, changed
 its template). `PLACED`: the rules placed the entity, so it did not move from its old position to the new one.
@@ -31,6 +40,7 @@ import functools
 import hashlib
 import struct
 from collections.abc import Collection, Sequence
+from itertools import accumulate
 from typing import Any, NamedTuple
 
 from shared import bulk, kernels
@@ -58,6 +68,8 @@ ROW = struct.Struct("<IBB6i2bB")
 """Format of a row of `rows`."""
 ROW_BYTES = ROW.size
 """Length of a row, in bytes."""
+TURN_BYTES_MIN = 2
+"""Least length of a packed turn, in bytes: one without a new input and without a stop."""
 FLAGS_AT = 5
 """Place of the flags within a row, in bytes."""
 COLUMNS_BY_SIZE = (
@@ -65,8 +77,6 @@ COLUMNS_BY_SIZE = (
     (BUTTONS, "buttons"),
 )  # fmt: skip
 """Columns of a state for each field of `row_by_size`."""
-HEAD = struct.Struct("<IB")
-"""Format of an entry of `heads`: id and events."""
 VERDICT = struct.Struct("<IB")
 """Format of an entry of `Snapshot.verdicts`: the number of a command, and its verdict."""
 EDIT = struct.Struct("<HB")
@@ -75,15 +85,15 @@ DROP = struct.Struct("<3i")
 """Format of an entry of `Snapshot.drops`: the index of a segment."""
 NO_STATES = np.zeros((0, CELL), np.int64)
 NO_TURNS = np.zeros((0, TURN), np.int64)
-NO_FIELDS: list[Any] = [b"", b"", b"", b"", 0, b"", [], b""]
-"""Values of the fields from `heads` on that a part leaves out."""
+NO_FIELDS: list[Any] = [b"", b"", b"", 0, b"", [], b""]
+"""Values of the fields from `turns` on that a part leaves out."""
 SIDE = SEGMENT * BLOCK
 """Length of a segment's side, in grid steps."""
 FIELDS = ("id", "template", "flags", "x", "y", "z", "vx", "vy", "vz", "move_x", "move_y", "buttons")
 """Names of the columns of a state."""
 assert len(FIELDS) == CELL == BUTTONS + 1
 assert SIDE & (SIDE - 1) == 0
-assert (HEAD.size, ROW_BYTES) == (bulk.HEAD_BYTES, bulk.ROW_BYTES)
+assert (ROW_BYTES, ENTITY_MAX) == (bulk.ROW_BYTES, bulk.ID_MAX)
 FAR = 1 << 23
 """Bound of a segment's index along each axis, in segments: from `-FAR` to `FAR - 1`."""
 
@@ -155,13 +165,13 @@ class SegmentDelta(NamedTuple):
     """The changes of one segment in a tick: its segment delta.
 
     `ids` are the entities that something happened to, `whole` those of them that are sent as rows, and `packed` has the
-    fields `heads`, `tails` and `rows`.
+    fields `turns` and `rows`.
     """
 
     segment: Cell
     ids: list[int]
     whole: list[int]
-    packed: tuple[bytes, bytes, bytes]
+    packed: tuple[bytes, bytes]
 
 
 class TickEncoder:
@@ -190,22 +200,22 @@ class TickEncoder:
         if len(w.changed) >= len(self._ids):
             self._allocate(len(w.changed))
         mine = self._ids, self._parts, self._due, self._packed
-        n_parts = self._world.kernel.news(w.entities, w.changed, w.lengths, tick, self._check_ticks, *mine)
+        n_parts = self._world.kernel.news(w.entities, w.templates, w.changed, w.lengths, tick, self._check_ticks, *mine)
         if not n_parts and not self._due[0]:
             return [], set()
         deltas: list[SegmentDelta] = []
         start = at = 0
         parts = self._parts[:n_parts].tolist()
-        for i in range(0, n_parts, 8):
-            x, y, z, whole, end, heads, tails, stop = parts[i : i + 8]
+        for i in range(0, n_parts, bulk.PART):
+            x, y, z, whole, end, turns, stop = parts[i : i + bulk.PART]
             ids = self._ids[start:end].tolist()
             for row, entity in enumerate(ids[whole - start :] if acted or placed else ()):
                 if entity in placed:
-                    self._packed[tails + row * ROW_BYTES + FLAGS_AT] |= ACTED | PLACED
+                    self._packed[turns + row * ROW_BYTES + FLAGS_AT] |= ACTED | PLACED
                 elif entity in acted:
-                    self._packed[tails + row * ROW_BYTES + FLAGS_AT] |= ACTED
+                    self._packed[turns + row * ROW_BYTES + FLAGS_AT] |= ACTED
             packed = self._packed[at:stop].tobytes()
-            fields = packed[: heads - at], packed[heads - at : tails - at], packed[tails - at :]
+            fields = packed[: turns - at], packed[turns - at :]
             deltas.append(SegmentDelta((x, y, z), ids, ids[whole - start :], fields))
             start, at = end, stop
         due = self._due[1 : 1 + self._due[0]].tolist()
@@ -215,7 +225,7 @@ class TickEncoder:
         """Makes room for `room` entities."""
         self._ids, self._parts, self._due, self._packed = (
             self._world.kernel.lent(np.empty(1 + room * numbers, kind))
-            for numbers, kind in ((1, np.int64), (8, np.int64), (3, np.int64), (ROW_BYTES, np.uint8))
+            for numbers, kind in ((1, np.int64), (bulk.PART, np.int64), (3, np.int64), (ROW_BYTES, np.uint8))
         )
 
 
@@ -246,21 +256,21 @@ def encode_part(
         attributes: id, attributes, id, attributes, ...
         fields: records of extra columns (`shared.extras`).
     """
-    packed = b"", b"", encode_rows(rows, acted, placed)
+    packed = b"", encode_rows(rows, acted, placed)
     return join_part(segment, ago, packed, gone, edits, check, attributes, fields)
 
 
 def join_part(
     segment: Cell,
     ago: int,
-    packed: tuple[bytes, bytes, bytes],
+    packed: tuple[bytes, bytes],
     gone: Sequence[int] = (),
     edits: Sequence[tuple[int, int]] = (),
     check: int = 0,
     attributes: Sequence[Any] = (),
     extra: bytes = b"",
 ) -> bytes:
-    """Returns a segment's part like `encode_part`, from `packed`: its heads, tails and rows."""
+    """Returns a segment's part like `encode_part`, from `packed`: its turns and rows."""
     packed_gone = struct.pack(f"<{len(gone)}I", *gone) if gone else b""
     packed_edits = b"".join(EDIT.pack(*edit) for edit in edits) if edits else b""
     fields = [*packed, packed_gone, check, packed_edits, attributes, extra]
@@ -307,12 +317,12 @@ def decode_parts(
     if not segments:
         return [], NO_STATES, NO_TURNS
     corners: list[int] = []
-    packed: tuple[list[bytes], list[bytes], list[bytes]] = ([], [], [])
+    packed: tuple[list[bytes], list[bytes]] = ([], [])
     parts = [_decode_part(segment, corners, packed) for segment in segments]
-    heads, tails, rows = map(b"".join, packed)
+    turns, rows = map(b"".join, packed)
     kernel = kernel or kernels.get(False)
     states = _decode_rows(rows, corners, templates, kernel) if rows else NO_STATES
-    return parts, states, _decode_turns(heads, tails, kernel) if heads or tails else NO_TURNS
+    return parts, states, _decode_turns(turns, packed[0], kernel) if turns else NO_TURNS
 
 
 def _decode_rows(rows: bytes, corners: list[int], templates: int, kernel: Kernel) -> Int64s:
@@ -323,21 +333,23 @@ def _decode_rows(rows: bytes, corners: list[int], templates: int, kernel: Kernel
     return states
 
 
-def _decode_turns(heads: bytes, tails: bytes, kernel: Kernel) -> Int64s:
-    turns = np.empty((len(heads) // HEAD.size, TURN), np.int64)
-    if not kernel.read_turns(heads, tails, kernel.lent(turns)):
-        raise ProtocolError("segment.tails: too many or too few bytes for the heads")
-    return turns
+def _decode_turns(packed: bytes, parts: list[bytes], kernel: Kernel) -> Int64s:
+    ends = np.array(list(accumulate(map(len, parts))), np.int64)
+    turns = np.empty((len(packed) // TURN_BYTES_MIN, TURN), np.int64)
+    n = kernel.read_turns(packed, kernel.lent(ends), kernel.lent(turns))
+    if n < 0:
+        raise ProtocolError("segment.turns: too few bytes, an id that is too large, or an unknown kind of stop")
+    return turns[:n]
 
 
 def _decode_part(part: Any, corners: list[int], packed: tuple[list[bytes], ...]) -> DecodedDelta:
     """Checks and returns one part.
 
-    Appends its low corner (grid steps) and its number of rows to `corners`, and its heads, tails and rows to `packed`.
+    Appends its low corner (grid steps) and its number of rows to `corners`, and its turns and rows to `packed`.
     """
-    if type(part) is not list or not 4 <= len(part) <= 12:
-        raise ProtocolError("segment: must be a list of 4 to 12 fields")
-    x, y, z, ago, heads, tails, rows, gone, check, edits, attributes, fields = part + NO_FIELDS[len(part) - 4 :]
+    if type(part) is not list or not 4 <= len(part) <= 11:
+        raise ProtocolError("segment: must be a list of 4 to 11 fields")
+    x, y, z, ago, turns, rows, gone, check, edits, attributes, fields = part + NO_FIELDS[len(part) - 4 :]
     if not (type(x) is type(y) is type(z) is int and -FAR <= x < FAR and -FAR <= y < FAR and -FAR <= z < FAR):
         raise ProtocolError(f"segment {shown(x)} {shown(y)} {shown(z)}: not allowed")
     if type(check) is not int or not 0 <= check < 1 << 32:
@@ -345,18 +357,15 @@ def _decode_part(part: Any, corners: list[int], packed: tuple[list[bytes], ...])
     if type(ago) is not int or not -1 <= ago < 1 << 53:
         raise ProtocolError(f"segment.ago = {shown(ago)}: not allowed")
     if not (
-        type(heads) is type(tails) is type(rows) is type(gone) is type(edits) is type(fields) is bytes
-        and max(len(heads), len(tails), len(rows), len(gone), len(edits), len(fields)) <= PART_MAX
-        and len(heads) % HEAD.size == len(rows) % ROW_BYTES == len(gone) % 4 == len(edits) % EDIT.size == 0
+        type(turns) is type(rows) is type(gone) is type(edits) is type(fields) is bytes
+        and max(len(turns), len(rows), len(gone), len(edits), len(fields)) <= PART_MAX
+        and len(rows) % ROW_BYTES == len(gone) % 4 == len(edits) % EDIT.size == 0
     ):
-        raise ProtocolError(
-            "segment: heads, tails, rows, gone, edits or fields are not bytes, too long, or of a wrong length"
-        )
-    if heads and ago != 1:
-        raise ProtocolError(f"segment.heads: not allowed with ago = {ago}, only with 1")
-    all_heads, all_tails, all_rows = packed
-    all_heads.append(heads)
-    all_tails.append(tails)
+        raise ProtocolError("segment: turns, rows, gone, edits or fields are not bytes, too long, or of a wrong length")
+    if turns and ago != 1:
+        raise ProtocolError(f"segment.turns: not allowed with ago = {ago}, only with 1")
+    all_turns, all_rows = packed
+    all_turns.append(turns)
     all_rows.append(rows)
     edited = list(EDIT.iter_unpack(edits)) if edits else []
     if edits and max(edited)[0] >= SEGMENT**3:

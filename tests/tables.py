@@ -11,7 +11,8 @@ from server.rules import Rules
 from shared import edits, fields, messages
 from shared.edits import Edit
 from shared.messages import Bye, Command, Hello, Message, Snapshot, decode_from_server, encode
-from shared.snapshot import HEAD, NO_FIELDS, ROW
+from shared.snapshot import NO_FIELDS, ROW
+from tests.packed_turns import unpack_turns
 from tests.worlds import scene
 
 HELLO = Hello(messages.VERSION, {}, "")
@@ -119,12 +120,12 @@ def ids(snapshot: Snapshot) -> list[int]:
     """Returns the numbers of all entities in a snapshot."""
     found: list[int] = []
     for part in map(whole, snapshot.segments):
-        found += [entry[0] for form, at in ((HEAD, 4), (ROW, 6)) for entry in form.iter_unpack(part[at])]
+        found += [turn[0] for turn in unpack_turns(part[4])] + [row[0] for row in ROW.iter_unpack(part[5])]
     return found
 
 
 def gone(snapshot: Snapshot) -> list[int]:
-    packed = b"".join(whole(part)[7] for part in snapshot.segments)
+    packed = b"".join(whole(part)[6] for part in snapshot.segments)
     return [int.from_bytes(packed[at : at + 4], "little") for at in range(0, len(packed), 4)]
 
 

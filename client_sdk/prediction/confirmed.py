@@ -76,7 +76,7 @@ class Confirmed:
         parts, states, turns = decode_parts(snapshot.segments, self._templates, world.kernel)
         ticks = snapshot.tick - world.tick
         if len(turns) and ticks != 1:
-            raise ProtocolError("segment.heads: turns without a snapshot of the tick before")
+            raise ProtocolError("segment.turns: not allowed without a snapshot of the tick before")
         drops: set[Cell] = set()
         if snapshot.drops:
             drops = {(x, y, z) for x, y, z in DROP.iter_unpack(snapshot.drops)}

@@ -24,6 +24,7 @@ const [url = "ws://127.0.0.1:8765", seconds = 10] = process.argv.slice(2);
 const HELLO = 1, INPUTS = 2, PING = 3, BYE = 4, HELD = 9, WELCOME = 17, SNAPSHOT = 18, TERRAIN = 19, PONG = 20, GOTO = 27, WAITING = 28;
 const GOING_AWAY = 1001, TRIES = 3, HOPS = 8, NOTHING = new Uint8Array(0);
 const STOP = [1, 2, 4], GO = [8, 16], FALL = 32, LAUNCH = 64, TOLD = 128; // events in an entity's turn
+const NEW_MOVE = 8, NEW_BUTTONS = 16; // beside TOLD: the parts of its input that are new
 const BLOCK = 2 ** 24, SIDE = 32 * BLOCK, SPEED = 2 ** 16, KEYFRAME = -1, USED = 0, REPEATED = 1, REFUSED = -32768;
 const SQUARE = [[127, 0], [0, 127], [-127, 0], [0, -127]]; // east, north, west, south
 
@@ -40,8 +41,8 @@ const now = () => performance.now() / 1000;
 const rounded = value => Math.sign(value) * Math.round(Math.abs(value)); // halves away from zero
 const home = at => at.map(part => Math.floor(part / SIDE)).join(); // a position's segment, as text
 const ints = (bin, ...offsets) => offsets.map(offset => bin.readInt32LE(offset));
-const reader = (bin, at = 0) => ({
-  i8: () => bin.readInt8(at++), u8: () => bin.readUInt8(at++), i32: () => bin.readInt32LE((at += 4) - 4),
+const reader = (bin = NOTHING, at = 0) => ({
+  more: () => at < bin.length, i8: () => bin.readInt8(at++), u8: () => bin.readUInt8(at++), u24: () => bin.readUIntLE((at += 3) - 3, 3),
 });
 function* records(size, bin = []) { for (let at = 0; at < bin.length; at += size) yield bin.subarray(at, at + size); }
 
@@ -169,10 +170,34 @@ function terrain(x, y, z, offset, total, chunk) {
   if (acked >= 0) again(acked);
 }
 
-function turn(entity, events, tail) { // returns the entity after a tick with these events
+function* turns(bytes) { // yields the id and the events of each turn; the rest of its bytes is for `turn`
+  for (let id = 0; bytes.more();) {
+    const head = bytes.u8();
+    let gap = head & 63;
+    for (let more = head & 64, factor = 64; more; factor *= 128) {
+      const part = bytes.u8();
+      [gap, more] = [gap + (part & 127) * factor, part & 128];
+    }
+    id += gap + 1;
+    yield [id, head & 128 ? bytes.u8() : TOLD | NEW_MOVE];
+  }
+}
+
+function stop(bytes, template, k) { // returns where an entity stopped along an axis, from the low corner of its segment
+  const first = bytes.u8(), block = (first & 31) * BLOCK;
+  if (first & 128) return block + bytes.u24();
+  const { box_offset = [-0.3, -0.3, 0], box_size = [0.6, 0.6, 1.8] } = scene.templates[template];
+  const from = rounded(box_offset[k] * BLOCK), to = from + rounded(box_size[k] * BLOCK);
+  const place = block - (first & 32 ? Math.max(from, to) : Math.min(from, to)); // this side of its box is at the block
+  return ((place % SIDE) + SIDE) % SIDE;
+}
+
+function turn(entity, events, bytes) { // returns the entity after a tick with these events
   const { tick, template, at } = entity, { walk_speed, jump_speed } = scene.templates[template];
   const { gravity, terminal_speed, tick_rate, integrator } = scene;
-  const move = events & TOLD ? [tail.i8(), tail.i8(), tail.u8()] : entity.move;
+  const told = events & TOLD ? events : 0;
+  const move = [...told & NEW_MOVE ? [bytes.i8(), bytes.i8()] : entity.move.slice(0, 2)];
+  move.push(told & NEW_BUTTONS ? bytes.u8() : entity.move[2]);
   const v = entity.v.map((old, k) =>
     k < 2 && walk_speed && events & (TOLD | GO[k]) ? rounded(walk_speed * SPEED * move[k] / 127) : old);
   if (events & LAUNCH) v[2] = rounded(jump_speed * SPEED);
@@ -180,7 +205,7 @@ function turn(entity, events, tail) { // returns the entity after a tick with th
   if (falls) v[2] = Math.max(v[2] - rounded(gravity * SPEED / tick_rate), -rounded(terminal_speed * SPEED));
   if (integrator === "semi") before = v[2];
   const way = [2 * v[0], 2 * v[1], before + v[2]].map(sum => rounded(sum * 128 / tick_rate));
-  const to = at.map((from, k) => events & STOP[k] ? Math.floor(from / SIDE) * SIDE + tail.i32() : from + way[k]);
+  const to = at.map((from, k) => events & STOP[k] ? Math.floor(from / SIDE) * SIDE + stop(bytes, template, k) : from + way[k]);
   if (events & STOP[2] && before + v[2] < 0) falls = 0;
   if (home(to) !== home(at)) return { ...entity, tick: tick + 1, move }; // a row has the new state
   return { tick: tick + 1, template, falls, at: to, v: v.map((speed, k) => events & STOP[k] ? 0 : speed), move };
@@ -200,12 +225,9 @@ function judge(newest, first, statuses, early) { // where a row was late, the on
 function snapshot(tick, newest, early, first, statuses, verdicts, drops, ...parts) {
   const told = new Map(), left = new Set(); // told: entities with a row; left: "segment", or "segment:entity"
   for (const drop of records(12, drops)) left.add(ints(drop, 0, 4, 8).join());
-  for (const [x, y, z, ago, heads, tails, rows, gone] of parts) {
-    const segment = [x, y, z], tail = reader(tails);
-    for (const head of records(5, heads)) {
-      const id = head.readUInt32LE();
-      entities.set(id, turn(entities.get(id), head[4], tail));
-    }
+  for (const [x, y, z, ago, packed, rows, gone] of parts) {
+    const segment = [x, y, z], bytes = reader(packed);
+    for (const [id, events] of turns(bytes)) entities.set(id, turn(entities.get(id), events, bytes));
     if (ago === KEYFRAME) left.add(segment.join());
     for (const id of records(4, gone)) left.add(`${segment}:${id.readUInt32LE()}`);
     for (const row of records(33, rows)) told.set(row.readUInt32LE(), {
@@ -219,11 +241,11 @@ function snapshot(tick, newest, early, first, statuses, verdicts, drops, ...part
     if (left.has(home(entity.at)) || left.has(`${home(entity.at)}:${id}`)) entities.delete(id);
   }
   for (const [id, entity] of told) entities.set(id, entity);
-  for (const [, , , , , , , , , , attributes = []] of parts)
+  for (const [, , , , , , , , , attributes = []] of parts)
     for (let i = 0; i < attributes.length; i += 2) said.set(attributes[i], attributes[i + 1]);
   acked = tick;
   judge(newest, first, statuses, early);
-  for (const [x, y, z, , , , , , , edits] of parts)
+  for (const [x, y, z, , , , , , edits] of parts)
     for (const edit of records(3, edits)) {
       const at = edit.readUInt16LE(), block = [x * 32 + (at & 31), y * 32 + (at >> 5 & 31), z * 32 + (at >> 10)];
       if (coming.length) newer.push({ segment: [x, y, z].join(), block, kind: edit[2] });

@@ -16,6 +16,7 @@ from scripts.fuzzing.fuzzed_game import FuzzedGame, fuzzed_scene
 from server.config.options import SettingsError
 from server.config.settings import KINDS, Settings, parse
 from shared import edits
+from shared.bulk import GAP_GOES_ON, HAS_EVENTS, WITHIN
 from shared.fields import (
     AIM_ROW_BYTES,
     CLIENT_LIST_MAX,
@@ -24,7 +25,7 @@ from shared.fields import (
     INPUT_ROW_BYTES,
     TICK_MAX,
 )
-from shared.layout import STOP_X, TOLD, WHOLE
+from shared.layout import EDGE_HIGH, NEW_BUTTONS, NEW_MOVE, STOP_X, STOP_Z, TOLD, WHOLE
 from shared.messages import (
     CLIENT_KINDS,
     VERSION,
@@ -59,8 +60,9 @@ WORDS = re.compile(r"[A-Za-z_.]* ?[A-Za-z]*")
 TEMPLATES = 3
 EXTRAS = fuzzed_scene(aim=True, behaviours=True).extras
 
-HEADS = b"\2\0\0\0" + bytes([TOLD | STOP_X])
-PART = [0, -1, 2, 1, HEADS, bytes(7), b"\1" + bytes(32), bytes(4), 0, bytes(3), [1, {"name": "Ann"}]]
+TURNS = bytes([HAS_EVENTS | GAP_GOES_ON | 2, 3, TOLD | NEW_MOVE | NEW_BUTTONS | STOP_X | STOP_Z])
+TURNS += bytes([127, 0, 1, EDGE_HIGH | 3, WITHIN | 4, 5, 6, 7]) + bytes([1, 0, 127])
+PART = [0, -1, 2, 1, TURNS, b"\1" + bytes(32), bytes(4), 0, bytes(3), [1, {"name": "Ann"}]]
 FIELDS = EXTRAS.record(2, 0b10100111, [each.high for each in EXTRAS.columns])
 FROM_CLIENT: tuple[Message, ...] = (
     Hello(VERSION, {}, "Ann"),
@@ -80,7 +82,7 @@ FROM_SERVER: tuple[Message, ...] = (
     Welcome(VERSION, 7, 1, {"name": "flat"}, bytes(16)),
     Snapshot(9, 8, bytes(4), 7, bytes(2), bytes(5), bytes(12), (PART, PART)),
     Snapshot(9, -1, b"", 0, b"", b"", b"", ()),
-    Snapshot(9, 8, b"", 0, b"", b"", b"", ([0, 0, 0, 1, b"", b"", b"", b"", 0, b"", [], FIELDS * 2],)),
+    Snapshot(9, 8, b"", 0, b"", b"", b"", ([0, 0, 0, 1, b"", b"", b"", 0, b"", [], FIELDS * 2],)),
     Terrain(0, -1, 2, 0, 4, b"\1\2\3\4"),
     Pong(1.5, 17.25),
     Happened(3, "goal", b"\xc0"),

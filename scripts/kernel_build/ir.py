@@ -249,8 +249,8 @@ def linked(
     for value in (*whole.functions, *whole.global_variables):
         if not value.is_declaration and value.name not in keep:
             value.linkage = "internal"
-    for function in whole.functions:  # those for servers are not the physics: they may be small
-        if not function.is_declaration and any(source in function.name for source in exports.SERVER_SOURCES):
+    for function in whole.functions:
+        if not function.is_declaration and any(name in function.name for name in exports.SMALL):
             function.add_function_attribute("optsize")
     whole.verify()
     builder = llvm.create_pass_builder(target_machine, llvm.create_pipeline_tuning_options(speed_level=machine.speed))

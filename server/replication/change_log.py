@@ -36,7 +36,7 @@ FEW_ENTITIES, ENTITY_BYTES = 3, 9
 entity. The latter is more than a number takes, which bounds the length of the list, too."""
 CHECK_S = 1.0
 """Seconds between two checksums of a segment in which something changes."""
-NO_CHANGES = (b"", b"", b"")
+NO_CHANGES = (b"", b"")
 """Packed changes of a segment without any."""
 
 
@@ -147,7 +147,7 @@ class ChangeLog:
         self._encoder = TickEncoder(world, self._check_ticks)
         self._latest_fields: dict[Cell, bytes] = {}
         """Records of extra columns of the newest tick, by segment."""
-        self._latest: dict[Cell, tuple[bytes, bytes, bytes]] | None = None
+        self._latest: dict[Cell, tuple[bytes, bytes]] | None = None
         """Entity changes of the newest tick, packed, by segment; None after a removal."""
         self._placed_at = -self.history
         """Newest tick in which an entity was placed."""
@@ -375,8 +375,8 @@ class ChangeLog:
             del tables[fits:]
         return [part for pair in tables for part in pair]
 
-    def _packed_since(self, segment: Cell, since: int, ticks: list[_Tick]) -> tuple[bytes, bytes, bytes]:
-        """Returns the packed changes (heads, tails, rows) of the entities that changed and are still in the segment."""
+    def _packed_since(self, segment: Cell, since: int, ticks: list[_Tick]) -> tuple[bytes, bytes]:
+        """Returns the packed changes (turns, rows) of the entities that changed and are still in the segment."""
         if self._latest is not None and since == self._world.tick - 1:
             return self._latest.get(segment, NO_CHANGES)
         changed = {entity for tick in ticks for entity in tick.changed.get(segment, ())}
@@ -385,7 +385,7 @@ class ChangeLog:
             {entity for ids in sets for entity in ids if entity in here}
             for sets in ([tick.acted for tick in ticks], [tick.placed for tick in ticks])
         )
-        return b"", b"", encode_rows(self._world.rows(sorted(here)), acted, placed)
+        return b"", encode_rows(self._world.rows(sorted(here)), acted, placed)
 
     def _kinds(self, segment: Cell, offsets: list[int]) -> list[tuple[int, int]]:
         if not offsets:

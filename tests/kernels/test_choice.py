@@ -157,7 +157,7 @@ def test_invalid_arguments_are_refused_and_no_buffer_is_kept() -> None:
         ("recall", (numbers, numbers, memoryview(frozen.data), numbers, 0), BufferError),
         ("recall", (numbers, numbers.data[::2], numbers, numbers, 0), BufferError),
         ("step", (numbers, numbers, 0, 1), TypeError),  # not the table of a world
-        ("read_turns", (b"", b"", b"12345678"), BufferError),
+        ("read_turns", (b"", numbers, b"12345678"), BufferError),
     ]
     before = [sys.getrefcount(array) for array in (numbers, small, frozen)]
     for name, arguments, error in wrong * 50:

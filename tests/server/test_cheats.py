@@ -261,7 +261,7 @@ def test_no_message_of_any_kind_moves_anybody() -> None:
 def test_each_message_of_the_server_ends_the_client_that_sends_it() -> None:
     for message in (
         Welcome(messages.VERSION, 1, 1, {}),
-        messages.Snapshot(1, 1, b"", 1, b"", b"", b"", ([0, 0, 0, -1, bytes(33), b"", b"", 0, []],)),
+        messages.Snapshot(1, 1, b"", 1, b"", b"", b"", ([0, 0, 0, -1, b"", bytes(33), b"", 0, b"", []],)),
         messages.Terrain(0, 0, 0, 0, 1, b"\1"),
         messages.Pong(0.0, 1e9),
         messages.Happened(1, "x", b""),

@@ -76,7 +76,7 @@ def test_an_entity_that_falls_out_returns_to_a_spawn_and_is_flagged_as_placed(ta
     table.tick()
     assert table.game.world.position(1) == (16.0, 16.0, 1.0)
     assert table.game.world.velocity(1) == (0.0, 0.0, 0.0)
-    (rows,) = (part[6] for part in link.got(Snapshot)[-1].segments if any(part[6:7]))
+    (rows,) = (part[5] for part in link.got(Snapshot)[-1].segments if any(part[5:6]))
     assert rows[5] & 4
 
 

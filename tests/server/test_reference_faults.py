@@ -102,9 +102,9 @@ def test_a_state_with_a_template_that_does_not_exist_is_refused(table: Table) ->
     link = table.join()
     table.tick()
     snapshot = link.got(Snapshot)[0]
-    rows = bytearray(snapshot.segments[0][6])
+    rows = bytearray(snapshot.segments[0][5])
     rows[4] = 200
     part = list(snapshot.segments[0])
-    part[6] = bytes(rows)
+    part[5] = bytes(rows)
     with pytest.raises(ProtocolError, match="out of range"):
         decode_parts([part], len(table.game.scene.templates))

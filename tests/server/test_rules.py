@@ -64,7 +64,7 @@ def attributes(link: FakeLink) -> dict[int, Any]:
     known: dict[int, Any] = {}
     for snapshot in link.got(Snapshot):
         for part in snapshot.segments:
-            said = whole(part)[10]
+            said = whole(part)[9]
             known.update(zip(said[::2], said[1::2], strict=True))
     return known
 
@@ -178,7 +178,7 @@ def test_attributes_reach_all_clients_that_see_the_entity_and_change(table: Tabl
     count = len(early.got(Snapshot))
     game.set(npc, "mood", "calm")  # no change
     table.tick()
-    assert not any(whole(part)[10] for snapshot in early.got(Snapshot)[count:] for part in snapshot.segments)
+    assert not any(whole(part)[9] for snapshot in early.got(Snapshot)[count:] for part in snapshot.segments)
     game.set(npc, "mood", None)
     game.set(npc, "hunger", 0.5)
     table.tick()

@@ -1,7 +1,6 @@
 """An entity that goes on as before is not sent. A world that receives only turns equals the stepped one bit by bit."""
 
 import random
-import struct
 from itertools import product
 from types import SimpleNamespace
 from typing import Any
@@ -17,6 +16,7 @@ from shared.layout import (
     CELL,
     CHANGED,
     COLUMNS,
+    EDGE_HIGH,
     EVENT_BITS,
     FALL,
     FLAGS,
@@ -24,24 +24,30 @@ from shared.layout import (
     ID,
     LAUNCH,
     LENGTHS,
+    LO_X,
     MOVE_X,
     N_CHANGED,
+    NEW_BUTTONS,
+    NEW_MOVE,
+    SIZE_X,
     STOP_X,
     STOP_Z,
     TEMPLATE,
+    TEMPLATE_COLUMNS,
     TOLD,
     VX,
     WHOLE,
     Int64s,
     X,
 )
-from shared.scene import Scene, load_scene
+from shared.scene import Scene, Template, load_scene
 from shared.snapshot import TickEncoder, encode_rows
 from shared.units import BLOCK, SEGMENT
 from shared.world import OverlapError, World
 from tests.lengths import long_but
 from tests.mirrored import Mirrored
-from tests.worlds import EAST, JUMP, WEST, build, floor, steps
+from tests.packed_turns import pack_turns, stop_of
+from tests.worlds import EAST, JUMP, WEST, build, floor, scene, steps
 
 SIDE = SEGMENT * BLOCK
 
@@ -133,10 +139,10 @@ def test_each_event_of_an_entity_is_sent_once(compiled: bool) -> None:
         mirrored.send()
         mirrored.check()
     assert [what for what in found if what][:7] == [
-        TOLD,  # walks
+        TOLD | NEW_MOVE,  # walks
         STOP_X,  # reaches the wall
-        TOLD | LAUNCH | STOP_X,  # jumps, still at the wall
-        TOLD | STOP_X,  # the jump key is released
+        TOLD | NEW_BUTTONS | LAUNCH | STOP_X,  # jumps, still at the wall
+        TOLD | NEW_BUTTONS | STOP_X,  # the jump key is released
         GO_X,  # is above the wall
         STOP_Z,  # lands
         FALL | WHOLE,  # falls off the edge, into the segment below
@@ -154,8 +160,51 @@ def test_holding_a_course_costs_nothing(compiled: bool) -> None:
     assert (mirrored.turns, mirrored.sent_turns, mirrored.bytes) == (200, 0, 0)
     world.step({me: JUMP})
     mirrored.send()
-    assert mirrored.bytes == 17, "5 for the part, 7 for the head, 5 for the tail"
+    assert mirrored.bytes == 12, "5 for the part, 2 for the field, 2 for id and events, 3 for the input"
     mirrored.check()
+
+
+def test_what_each_kind_of_change_costs(compiled: bool) -> None:
+    """The part of a segment with turns takes 7 bytes without them."""
+    world = build([floor(0, 8), [3, -9, 0, 4, 9, 1, 1]], compiled=compiled)
+    me = world.spawn("box", (0, 0, 0))
+    steps(world, 3)
+    mirrored, costs = Mirrored(world), []
+    for tick in range(200):
+        input_ = {0: EAST, 80: Input(127, 1), 81: Input(127, 1, 2), 82: Input(0, 1, 0), 83: NEUTRAL}.get(tick)
+        world.step(None if input_ is None else {me: input_})
+        before = mirrored.bytes
+        mirrored.send()
+        mirrored.check()
+        if mirrored.bytes > before:
+            costs.append((events(world, me), mirrored.bytes - before - 7))
+    assert costs == [
+        (TOLD | NEW_MOVE, 3),
+        (STOP_X, 3),  # at the wall
+        (TOLD | NEW_MOVE | STOP_X, 5),
+        (TOLD | NEW_BUTTONS | STOP_X, 4),
+        (TOLD | NEW_MOVE | NEW_BUTTONS, 5),
+        (TOLD | NEW_MOVE, 3),
+    ]
+
+
+@pytest.mark.parametrize(("offset", "size"), [((-0.3, 0.1, 0.7), (0.6, -1.7, 1.8)), ((-5.2, 3.1, -8), (9.9, 0.01, 7))])
+def test_a_stop_at_a_block_is_exact_for_any_box(
+    offset: tuple[float, ...], size: tuple[float, ...], compiled: bool
+) -> None:
+    made = scene([], templates=(Template("odd", offset, size),), player="odd", gravity=0.0)
+    world = World(made, compiled=compiled)
+    world.load_terrain()
+    world.spawn("odd", (-13.3, 10.7, -16.2))
+    world.step()
+    row, home = made.templates[0].row(), [part // SIDE for part in world.state(1)[X:VX]]
+    for block, axis, side in product(range(SEGMENT), range(3), range(2)):
+        stops = [0, 0, 0]
+        stops[axis] = -1 - (block | side * EDGE_HIGH)
+        assert world.follow(np.array([[1, STOP_X << axis, 0, 0, 0, *stops]], np.int64), 1, world.tick + 1)
+        place = world.state(1)[X + axis]
+        edge = place + row[axis] + side * row[3 + axis]
+        assert (edge % BLOCK, edge // BLOCK % SEGMENT, place // SIDE) == (0, block, home[axis])
 
 
 @pytest.mark.parametrize("n", [0, 1, 2, 40, 1500])
@@ -174,7 +223,15 @@ def test_changes_are_packed_in_the_order_of_ids_segment_by_segment(n: int, compi
     acted = set(matrix[rows[::3], ID].tolist())
     lengths = np.zeros(LENGTHS, np.int64)
     lengths[N_CHANGED] = len(changed)
-    lists = {"entities": matrix, "changed": np.append(changed, 0), "lengths": lengths}
+    rows_of_templates = np.zeros((3, TEMPLATE_COLUMNS), np.int64)
+    rows_of_templates[:, LO_X : LO_X + 3] = rng.integers(-3 * BLOCK, BLOCK, (3, 3))
+    rows_of_templates[:, SIZE_X : SIZE_X + 3] = rng.integers(1, 3 * BLOCK, (3, 3))
+    for at, row in enumerate(matrix[rows]):  # half of the positions are at a block's face
+        if at % 2:
+            low, size = (rows_of_templates[row[TEMPLATE], k + at // 2 % 3] for k in (LO_X, SIZE_X))
+            place = matrix[rows[at], X + at // 2 % 3] // BLOCK * BLOCK - low - (size if at % 4 == 1 else 0)
+            matrix[rows[at], X + at // 2 % 3] = place
+    lists = {"templates": rows_of_templates, "entities": matrix, "changed": np.append(changed, 0), "lengths": lengths}
     kernel = kernels.get(compiled)
     arrays = SimpleNamespace(**{name: kernel.lent(each) for name, each in lists.items()})
     world = SimpleNamespace(arrays=arrays, tick=7, kernel=kernel)
@@ -190,16 +247,15 @@ def test_changes_are_packed_in_the_order_of_ids_segment_by_segment(n: int, compi
     assert {share.segment for share in shares} == sent.keys()
     assert len(shares) == len(sent)
     for segment, ids, whole, packed in shares:
-        heads = tails = b""
+        turns: list[list[int]] = []
         sent_whole = [row for row in sent[segment] if row[CHANGED] & WHOLE]
         for row in sent[segment]:
             events = int(row[CHANGED]) & 2 * WHOLE - 1
             if events < WHOLE:
-                heads += struct.pack("<IB", row[ID], events)
-                tails += struct.pack("<bbB", *row[MOVE_X:CELL]) if events & TOLD else b""
-                for axis in range(3):
-                    tails += struct.pack("<i", row[X + axis] % SIDE) if events & STOP_X << axis else b""
-        assert packed == (heads, tails, encode_rows(np.array(sent_whole).reshape(-1, len(COLUMNS)), acted))
+                low, size = (rows_of_templates[row[TEMPLATE], k : k + 3] for k in (LO_X, SIZE_X))
+                stops = map(stop_of, (row[X:VX] % SIDE).tolist(), low.tolist(), (low + size).tolist())
+                turns.append([int(row[ID]), events, *row[MOVE_X:CELL].tolist(), *stops])
+        assert packed == (pack_turns(turns), encode_rows(np.array(sent_whole).reshape(-1, len(COLUMNS)), acted))
         assert whole == [row[ID] for row in sent_whole]
         assert sorted(ids) == [row[ID] for row in sent[segment]]
 

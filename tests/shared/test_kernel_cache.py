@@ -14,7 +14,9 @@ READ = """
 import numpy as np
 from shared import bulk, layout, numba_kernel
 turns = np.zeros(8, np.int64)
-assert numba_kernel.jitted(bulk).read_turns(bytes((1, 0, 0, 0, layout.TOLD)), b"\\1\\2\\3", turns)
+told = layout.TOLD | layout.NEW_MOVE | layout.NEW_BUTTONS
+ends = np.array([5], np.int64)
+assert numba_kernel.jitted(bulk).read_turns(bytes((bulk.HAS_EVENTS, told, 1, 2, 3)), ends, turns) == 1
 print(turns[2:5].tolist())
 """
 

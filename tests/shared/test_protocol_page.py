@@ -13,14 +13,15 @@ import numpy as np
 import pytest
 
 from shared import bounds as bounds_module
-from shared import edits, fields, layout, messages, payloads
+from shared import bulk, edits, fields, layout, messages, payloads
 from shared.blocks import offset_of, pack, unpack
 from shared.bounds import bounds
 from shared.messages import KINDS, Message, Snapshot, decode_from_client, decode_from_server, encode, join_snapshot
 from shared.snapshot import FIELDS, ROW, decode_parts
+from tests.packed_turns import pack_turns
 
 PAGE = (Path(__file__).resolve().parents[2] / "docs" / "protocol.md").read_text("utf-8")
-SEGMENT = ("segment", "x", "y", "z", "ago", "heads", "tails", "rows", "gone", "check", "edits", "attributes", "fields")
+SEGMENT = ("segment", "x", "y", "z", "ago", "turns", "rows", "gone", "check", "edits", "attributes", "fields")
 DECODE = {"client": decode_from_client, "server": decode_from_server}
 
 
@@ -108,12 +109,17 @@ def test_the_snapshot_example_is_as_described() -> None:
     assert snapshot.newest == 1021
     assert list(snapshot.statuses) == [messages.USED, messages.REPEATED]
     (part,), states, turns = decode_parts(snapshot.segments, 1)
-    assert turns.tolist() == [[12, layout.TOLD | layout.STOP_X, 0, 127, 0, 10 << 24, 0, 0]]
+    told, stops = layout.TOLD | layout.NEW_MOVE, layout.STOP_X | layout.STOP_Z
+    assert turns.tolist() == [[12, told, 0, 127, 0, 0, 0, 0], [15, told | stops, 127, 0, 0, 21 << 23, 0, -1 - 12]]
+    said = [bytes.fromhex(raw.strip("`")) for raw, _ in table("bytes", "of the example")]
+    assert b"".join(said) == snapshot.segments[0][4] == pack_turns(turns.tolist())
+    kinds = [int(bits) << 5 for bits, _ in table("bits 5 to 7", "the entity stops")]
+    assert kinds == [0, layout.EDGE_HIGH, bulk.WITHIN]
     assert (part.gone, [block for block, _ in part.edits]) == ([9], [0x33E3])
     assert offset_of(3, 31, 12) == 0x33E3
     ((_, text),) = blocks("row")
     packed = b"".join(raw for raw, _ in lines(text))
-    assert packed == snapshot.segments[0][6]
+    assert packed == snapshot.segments[0][5]
     told = [note.split(" = ") for _, note in lines(text)]
     assert [len(raw) for raw, _ in lines(text)] == [struct.calcsize(kind) for kind in "IBBiiiiiibbB"]
     assert [(name, int(value)) for name, value in told] == list(zip(FIELDS, ROW.unpack(packed), strict=True))

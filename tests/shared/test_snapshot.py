@@ -3,6 +3,7 @@
 import hashlib
 import random
 import zlib
+from itertools import pairwise
 from typing import Any
 
 import msgpack
@@ -16,7 +17,24 @@ from shared.blocks import BLOCKS, pack, unpack
 from shared.checks import Cell
 from shared.fields import ENTITY_MAX, PACKED_MAX, TICK_MAX
 from shared.inputs import Input
-from shared.layout import CELL, FALLING, FLAGS, ID, MOVE_X, STOP_Y, TEMPLATE, TOLD, TURN, VX, X
+from shared.layout import (
+    CELL,
+    EDGE_HIGH,
+    FALLING,
+    FLAGS,
+    ID,
+    MOVE_X,
+    NEW_BUTTONS,
+    NEW_MOVE,
+    STOP_X,
+    STOP_Y,
+    TEMPLATE,
+    TOLD,
+    TURN,
+    VX,
+    WHOLE,
+    X,
+)
 from shared.messages import ProtocolError
 from shared.snapshot import (
     ACTED,
@@ -29,13 +47,15 @@ from shared.snapshot import (
     encode_part,
     encode_rows,
 )
+from tests.packed_turns import pack_turns, unpack_turns
 from tests.worlds import build
 
 FAR = (1 << 23) - 1
 SPEED_EXTREME = 1 << 30
 State = tuple[int, ...]
-HEADS = b"\x01\0\0\0" + bytes([TOLD | STOP_Y])
-"""Part of an entity that got another input and stopped: 7 bytes of tails."""
+FORMS = [kernels.get(False), *([kernels.get(True)] if kernels.available() else [])]
+TURNS = pack_turns([[1, TOLD | NEW_MOVE | STOP_Y, 127, 0, 0, 0, 5, 0]])
+"""The turn of an entity that got another direction and stopped: 8 bytes."""
 
 
 def sent(
@@ -64,14 +84,14 @@ def state_in(segment: Cell, inside: int, velocity: int, move: int, entity: int =
 def part_of(**fields: Any) -> list[Any]:
     """Returns a legal part with some fields changed."""
     row = encode_rows(np.array([state_in((0, 0, 0), 5, 6, 7)], np.int64))
-    values: dict[str, Any] = {"x": 0, "y": 0, "z": 0, "ago": 1, "heads": HEADS, "tails": bytes(7), "rows": row}
+    values: dict[str, Any] = {"x": 0, "y": 0, "z": 0, "ago": 1, "turns": TURNS, "rows": row}
     values |= {"gone": b"\x01\0\0\0", "check": 0, "edits": b"\0\0\x01", "attributes": [1, {"name": "Ann"}]}
     return list((values | fields).values())
 
 
 def row_with(column: int, value: int) -> bytes:
     """Returns a packed row in which one field has a value that no state has."""
-    values = list(ROW.unpack(part_of()[6]))
+    values = list(ROW.unpack(part_of()[5]))
     values[column] = value
     return ROW.pack(*values)
 
@@ -191,8 +211,7 @@ def test_a_checksum_is_of_all_a_segment_holds_and_of_nothing_else() -> None:
     [
         {"x": FAR + 1}, {"y": -FAR - 2}, {"z": 1 << 63}, {"x": True}, {"y": 0.0}, {"z": None}, {"x": "0"},
         {"ago": -2}, {"ago": 1 << 53}, {"ago": False}, {"ago": None}, {"ago": 2},
-        {"heads": bytes(4)}, {"heads": b""}, {"heads": "heads"}, {"heads": HEADS + HEADS}, {"heads": [1]},
-        {"tails": bytes(6)}, {"tails": bytes(8)}, {"tails": ""}, {"tails": 7},
+        {"turns": "turns"}, {"turns": [1]}, {"turns": 7}, {"turns": None}, {"turns": bytes(200 * 1024 + 1)},
         {"rows": bytes(32)}, {"rows": ""}, {"rows": None}, {"rows": []}, {"rows": bytes(33 * 7000)},
         {"gone": bytes(3)}, {"gone": "gone"}, {"gone": [1]}, {"gone": bytes(4 * 60_000)},
         {"check": -1}, {"check": 1 << 32}, {"check": True}, {"check": None},
@@ -219,7 +238,7 @@ def test_a_part_beyond_its_bounds_is_refused(fields: dict[str, Any]) -> None:
 )  # fmt: skip
 def test_a_state_that_no_world_has_is_refused(column: int, value: int, compiled: bool) -> None:
     with pytest.raises(ProtocolError, match=r"segment\.rows"):
-        decode_parts([part_of(), part_of(rows=part_of()[6] + row_with(column, value))], 255, kernels.get(compiled))
+        decode_parts([part_of(), part_of(rows=part_of()[5] + row_with(column, value))], 255, kernels.get(compiled))
 
 
 def test_a_template_is_one_of_the_scene(compiled: bool) -> None:
@@ -228,11 +247,78 @@ def test_a_template_is_one_of_the_scene(compiled: bool) -> None:
         decode_parts([part_of(rows=row_with(TEMPLATE, 3))], 3, kernels.get(compiled))
 
 
+@pytest.mark.parametrize(
+    "packed",
+    [
+        *[TURNS[:n] for n in range(1, len(TURNS))],  # cut off
+        b"\x40",  # the gap goes on
+        b"\x7f\x80\x80\x80\x80\x01\x01\x01",  # a gap of too many bytes
+        b"\x7f\xff\xff\xff\x7f\x01\x01",  # an id beyond the greatest one
+        b"\x80",  # no events
+        *[bytes((0x80, STOP_X, first, 0, 0, 0)) for first in (64, 127, 160, 255)],  # an unknown kind of stop
+        *[bytes((0x80, STOP_X << axis, 128, 0, 0)) for axis in range(3)],  # a place of two bytes
+        bytes((0x80, TOLD | NEW_BUTTONS)),
+        bytes((0x80, TOLD | NEW_MOVE | NEW_BUTTONS, 1, 2)),
+    ],
+    ids=bytes.hex,
+)
+def test_malformed_turns_are_refused_wherever_they_stand(packed: bytes, compiled: bool) -> None:
+    kernel = kernels.get(compiled)
+    for turns in (packed, TURNS + packed):
+        for parts in ([turns], [TURNS, turns], [turns, TURNS], [turns, b"", turns]):
+            with pytest.raises(ProtocolError, match=r"segment\.turns"):
+                decode_parts([part_of(turns=each) for each in parts], 255, kernel)
+
+
+places = st.integers(0, SIDE - 1) | st.integers(-2 * EDGE_HIGH, -1)
+turn_lists = st.dictionaries(
+    st.integers(1, ENTITY_MAX) | st.integers(1, 200),
+    st.tuples(st.integers(0, WHOLE - 1), *[st.integers(-128, 127)] * 2, st.integers(0, 255), *[places] * 3),
+    max_size=9,
+).map(lambda found: [[entity, *rest] for entity, rest in sorted(found.items())])
+
+
+def sent_of(turn: list[int]) -> list[int]:
+    """Returns a turn with the numbers that its events need."""
+    entity, events, move_x, move_y, buttons, *stops = turn
+    new = events if events & TOLD else 0
+    moves = [move_x, move_y] if new & NEW_MOVE else [0, 0]
+    found = [place if events & STOP_X << axis else 0 for axis, place in enumerate(stops)]
+    return [entity, events, *moves, buttons if new & NEW_BUTTONS else 0, *found]
+
+
+@given(st.lists(turn_lists, min_size=1, max_size=4))
+def test_any_turns_are_lossless(lists: list[list[list[int]]]) -> None:
+    told = [sent_of(turn) for turns in lists for turn in turns]
+    parts = [part_of(turns=pack_turns(turns), rows=b"") for turns in lists]
+    for kernel in FORMS:
+        _, _, turns = decode_parts(parts, 255, kernel)
+        assert turns.tolist() == told
+    assert [turn for part in parts for turn in unpack_turns(part[4])] == told
+
+
+@given(turn_lists, st.integers(0, 200), st.binary(max_size=3))
+def test_cut_or_changed_turns_give_turns_or_a_protocol_error(found: list[list[int]], at: int, instead: bytes) -> None:
+    """All forms of the kernel agree. The ids ascend, and a hostile server gets no other value through."""
+    packed = pack_turns(found)
+    packed = packed[:at] + instead + packed[at + 3 :]
+    results = []
+    for kernel in FORMS:
+        try:
+            results.append(decode_parts([part_of(turns=packed, rows=b"")], 255, kernel)[2].tolist())
+        except ProtocolError:
+            results.append(None)
+    assert all(result == results[0] for result in results)
+    ids = [0] + [turn[0] for turn in results[0] or ()]
+    assert all(low < high <= ENTITY_MAX for low, high in pairwise(ids))
+    assert all(-2 * EDGE_HIGH <= place < SIDE for turn in results[0] or () for place in turn[5:])
+
+
 def test_nesting_a_thousand_deep_is_refused_like_anything_else() -> None:
     deep: Any = None
     for _ in range(1000):
         deep = [deep]
-    for name in ("x", "ago", "heads", "tails", "rows", "gone", "edits", "check"):
+    for name in ("x", "ago", "turns", "rows", "gone", "edits", "check"):
         with pytest.raises(ProtocolError):
             decode_parts([part_of(**{name: deep})], 255)
 
@@ -242,7 +328,7 @@ anything = st.recursive(
     lambda inner: st.lists(inner, max_size=8) | st.dictionaries(st.text(max_size=4), inner, max_size=2),
     max_leaves=9,
 )
-field = st.sampled_from(["x", "y", "z", "ago", "heads", "tails", "rows", "gone", "edits", "check"])
+field = st.sampled_from(["x", "y", "z", "ago", "turns", "rows", "gone", "edits", "check"])
 
 
 @given(st.lists(st.one_of(anything, st.dictionaries(field, anything, max_size=2).map(lambda f: part_of(**f)))))
