@@ -321,9 +321,8 @@ class World(TurnWorld):
         segment.
 
         Args:
-            turns: explicit turns, [n, 8]: id, events (`layout.STOP_X` ...), input (3), position (3). The position
-                counts from the segment's low corner, and only along the axes where the entity stopped. Empty unless
-                `ticks` is 1. The array is written to.
+            turns: explicit turns, [n, 8] (`layout.TURN`), with the id in the first column. Empty unless `ticks` is 1.
+                The array is written to.
             ticks: number of ticks to advance.
             tick: the tick that the world has then reached.
 

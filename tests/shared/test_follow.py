@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from shared import kernels
-from shared.checks import Cell, SceneError
+from shared.checks import Cell, SceneError, Vec
 from shared.inputs import NEUTRAL, Input
 from shared.layout import (
     BUTTONS,
@@ -189,9 +189,7 @@ def test_what_each_kind_of_change_costs(compiled: bool) -> None:
 
 
 @pytest.mark.parametrize(("offset", "size"), [((-0.3, 0.1, 0.7), (0.6, -1.7, 1.8)), ((-5.2, 3.1, -8), (9.9, 0.01, 7))])
-def test_a_stop_at_a_block_is_exact_for_any_box(
-    offset: tuple[float, ...], size: tuple[float, ...], compiled: bool
-) -> None:
+def test_a_stop_at_a_block_is_exact_for_any_box(offset: Vec, size: Vec, compiled: bool) -> None:
     made = scene([], templates=(Template("odd", offset, size),), player="odd", gravity=0.0)
     world = World(made, compiled=compiled)
     world.load_terrain()

@@ -109,8 +109,8 @@ def test_the_snapshot_example_is_as_described() -> None:
     assert snapshot.newest == 1021
     assert list(snapshot.statuses) == [messages.USED, messages.REPEATED]
     (part,), states, turns = decode_parts(snapshot.segments, 1)
-    told, stops = layout.TOLD | layout.NEW_MOVE, layout.STOP_X | layout.STOP_Z
-    assert turns.tolist() == [[12, told, 0, 127, 0, 0, 0, 0], [15, told | stops, 127, 0, 0, 21 << 23, 0, -1 - 12]]
+    plain, stops = layout.TOLD | layout.NEW_MOVE, layout.STOP_X | layout.STOP_Z
+    assert turns.tolist() == [[12, plain, 0, 127, 0, 0, 0, 0], [15, plain | stops, 127, 0, 0, 21 << 23, 0, -1 - 12]]
     said = [bytes.fromhex(raw.strip("`")) for raw, _ in table("bytes", "of the example")]
     assert b"".join(said) == snapshot.segments[0][4] == pack_turns(turns.tolist())
     kinds = [int(bits) << 5 for bits, _ in table("bits 5 to 7", "the entity stops")]
