@@ -50,13 +50,13 @@ class Hold:
 
 
 class Fidget:
-    """A policy that chooses another input in every tick, so each must be sent."""
+    """A policy that chooses another input and other buttons in every tick, so each must be sent."""
 
     def __init__(self, seed: int) -> None:
         self._rng = random.Random(seed)
 
     def __call__(self, world: World, me: int) -> Input:
-        return Input(self._rng.randint(-127, 127), self._rng.randint(-127, 127), 0)
+        return Input(self._rng.randint(-127, 127), self._rng.randint(-127, 127), self._rng.randint(0, 255))
 
 
 @dataclass(frozen=True)
@@ -64,6 +64,7 @@ class Case:
     path: Link
     seconds: float
     policy: Callable[[int], Policy]
+    clients: int = CLIENTS
 
 
 DIP_S, DIP_RATE = (4.0, 9.0), 25e3
@@ -74,6 +75,7 @@ LINKS = {
         replace(path(50, 2), rate=2e6, dip=(DIP_S[1], DIP_S[1] - DIP_S[0], DIP_RATE)),
         11.0,
         Fidget,
+        8,
     ),
     # Outages begin at 3.8, 5.8 and 7.8 s. They are just shorter than the time for which missing inputs are repeated.
     "outage": Case(replace(path(50, 2), outage=(2.0, 0.2)), 9.0, Hold),
@@ -145,7 +147,7 @@ class Figures:
 
 def simulated(link: Case) -> Figures:
     match = Match(load_scene("flat"), 5)
-    seen = [Seen(Bot(link.policy(turn)), now=lambda: match.now) for turn in range(CLIENTS)]
+    seen = [Seen(Bot(link.policy(turn)), now=lambda: match.now) for turn in range(link.clients)]
 
     def policy(each: Seen) -> Callable[[Core, random.Random], Input]:
         def look(core: Core, _: random.Random) -> Input:
@@ -168,7 +170,7 @@ def simulated(link: Case) -> Figures:
 async def measured(link: Case, url: str) -> Figures:
     host, _, port = url.removeprefix("ws://").rpartition(":")
     async with Proxy((host, int(port)), link.path) as proxy:
-        seen = [Seen(Bot(link.policy(turn)), now=lambda: proxy.now) for turn in range(CLIENTS)]
+        seen = [Seen(Bot(link.policy(turn)), now=lambda: proxy.now) for turn in range(link.clients)]
         clients = await asyncio.gather(*(AsyncClient.connect(proxy.url, before_update=each) for each in seen))
 
         async def listen(client: AsyncClient, each: Seen) -> None:
