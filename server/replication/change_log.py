@@ -313,7 +313,7 @@ class ChangeLog:
         for segment, count in zip(segments, counts, strict=True):
             end = at + count
             fields = b"".join(map(self._fields_of, ids[at:end])) if self._world.extras.count else b""
-            changes = b"", b"", packed[at * ROW_BYTES : end * ROW_BYTES]
+            changes = b"", packed[at * ROW_BYTES : end * ROW_BYTES]
             parts[segment] = join_part(
                 segment, KEYFRAME, changes, attributes=self._of(ids[at:end]) if count else (), extra=fields
             )
