@@ -246,7 +246,6 @@ def test_an_outage_delays_snapshots_and_held_keys_survive_it(both: dict[str, tup
     simulated, measured = both["outage"]
     for figures in (simulated, measured):
         assert figures.age_ms(1) >= 200
-        assert figures.substituted > 0
     assert not simulated.corrections
     assert simulated.moving_share == 1
     # A busy machine may make one outage longer than inputs are repeated. Only then do players stand for a moment.
