@@ -232,10 +232,8 @@ def take_messages(
     Args:
         numbers, floats, ring: the rows. Those with a message that is left become `ODD`; their later ones are left, too.
         data: the messages, one after the other; those in frames are unmasked.
-        rows, sizes, times: row, size in bytes (if negative, of its frame) and time of arrival (s) of each message.
-        fates: gets the fate of each message.
-        rules: the latest tick, the most ticks ahead, bytes of an input, most inputs of a message, slots of a row,
-            number of ticks for which an input is repeated.
+        rows, sizes, times: row, bytes (negative: of its frame) and time (s) of each message; `fates` gets its fate.
+        rules: latest tick, most ticks ahead, bytes of an input, inputs of a message, slots of a row, ticks of repeats.
         clock: deadline of the latest tick in seconds, ticks per second, most ticks to catch up on, a margin of one tick
             on the wire, messages of a burst, `flow_control.RATE_WINDOW_S`, `flow_control.RTT_SPAN_S`.
     """
