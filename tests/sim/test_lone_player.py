@@ -90,7 +90,7 @@ def heavy(tick_rate: int = 32) -> Scene:
     ("preset", "tick_rate", "ticks"),
     [
         ("lan", 32, 400), ("far", 20, 300),
-        *long(*((preset, 32, ticks) for preset in PRESETS for ticks in (400, 5_000)), ("typical", 60, 1_000)),
+        *long(*((preset, 32, ticks) for preset in PRESETS for ticks in (400, 5_000)), ("typical", 60, 2_000)),
     ],
 )  # fmt: skip
 def test_a_player_with_acceleration_is_corrected_for_late_inputs_only(preset: str, tick_rate: int, ticks: int) -> None:
