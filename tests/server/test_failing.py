@@ -35,7 +35,7 @@ def fails(*args: Any, **given: Any) -> Any:
     [
         (GameApi, "set", []),  # before `on_join`
         (Roster, "issue", ["join", "leave"]),
-        (joining, "Welcome", ["join", "leave"]),
+        (joining, "join_welcome", ["join", "leave"]),
     ],
 )
 def test_a_join_that_fails_leaves_nothing_behind(

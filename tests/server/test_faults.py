@@ -7,6 +7,7 @@ import pytest
 
 from server.config.limits import Limits
 from server.observability.errors import FaultReporter
+from server.replication import change_log
 from server.replication.flow_control import SAMPLE_S
 from shared import edits, messages
 from shared.checks import Cell
@@ -130,14 +131,14 @@ def test_a_command_that_fails_is_answered_and_those_after_it_are_carried_out(
 
 def test_a_segment_that_cannot_be_encoded_is_left_out_and_comes_when_it_can(monkeypatch: pytest.MonkeyPatch) -> None:
     table = Table(size=(2, 1, 1), spawns=((30.0, 16.0, 1.0), (34.0, 16.0, 1.0)))
-    real, broken = table.game.log.encode, True
+    real, broken = change_log.join_part, True
 
-    def fails(segment: Cell, since: int) -> bytes:
+    def fails(segment: Cell, *arguments: Any, **options: Any) -> bytes:
         if broken and segment == (1, 0, 0):
             raise ZeroDivisionError
-        return real(segment, since)
+        return real(segment, *arguments, **options)
 
-    monkeypatch.setattr(table.game.log, "encode", fails)
+    monkeypatch.setattr(change_log, "join_part", fails)
     links = [connect(table) for _ in range(2)]
     table.tick(5)
     assert all(link.closings == [] for link in links)
