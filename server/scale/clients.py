@@ -62,6 +62,7 @@ class EdgeInputs(InputQueue):
     def skip(self, tick: int) -> None:
         """Drops the status of a tick for which another edge had the input."""
         self.unrecorded.pop(tick, None)
+        self._pass(tick)
 
     def confirm(self, tick: int, missing: int, given: Input | None = None) -> None:
         """Files the status of a tick whose record has come.
@@ -71,6 +72,7 @@ class EdgeInputs(InputQueue):
             missing: ticks from the newest batch in the record to the tick; 0: the input was used.
             given: the input that the sequencer used, if it may be another one; None: it is not.
         """
+        self._pass(tick)
         status, input_ = self.unrecorded.pop(tick, (IDLE, NEUTRAL))
         if status == IDLE:
             status = self._idle
@@ -81,6 +83,11 @@ class EdgeInputs(InputQueue):
         self.statuses.append(status)
         if len(self.statuses) > self._bounds.statuses:
             del self.statuses[0]
+
+    def _pass(self, tick: int) -> None:
+        """Takes an input like a late one if the record of its tick came before the edge took inputs for that tick."""
+        if tick in self.waiting:
+            self.held, self.missing = self.waiting.pop(tick), 0
 
 
 class EdgeRoster:

@@ -12,7 +12,7 @@ from shared.bounds import bounds
 from shared.fields import INPUT_ROW_BYTES
 from shared.inputs import NEUTRAL, make_input, row
 from shared.layout import MOVE_X
-from shared.messages import REPEATED, USED, Inputs
+from shared.messages import REPEATED, USED, Held, Inputs
 from shared.scene import load_scene
 from sovereign_netcode.playtest.log import FAILURES, Failure
 from sovereign_netcode.playtest.scaled import ScaledMatch, Seat
@@ -144,6 +144,23 @@ def test_inputs_that_are_withdrawn_after_their_batch_count_as_late() -> None:
         inputs.confirm(tick, 0)
     assert list(inputs.statuses) == [USED, USED, REPEATED, REPEATED]
     assert (inputs.used, inputs.substituted) == (2, 2)
+
+
+@pytest.mark.parametrize("beside", [False, True])
+def test_an_input_whose_record_comes_before_its_tick_is_taken_holds_from_then_on(beside: bool) -> None:
+    inputs, east = EdgeInputs(bounds(32), INPUT_ROW_BYTES, NEUTRAL, resumed=True), make_input(1, 0)
+    inputs.file(Inputs(5, 0, row(NEUTRAL) + row(east)), 4, 0.5)
+    inputs.hold(Held(1, 0), 4, 0.5)
+    assert inputs.take(5) == NEUTRAL
+    for tick in (5, 6):
+        if beside:
+            inputs.skip(tick)
+        else:
+            inputs.confirm(tick, tick - 5)
+    assert inputs.take(7) == east
+    if not beside:
+        inputs.confirm(7, 0)
+        assert list(inputs.statuses) == [REPEATED, USED, REPEATED, USED]
 
 
 def test_a_command_is_carried_out_once_also_by_a_replica_that_takes_over() -> None:
