@@ -70,6 +70,7 @@ def test_it_takes_a_server_that_runs_already(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.paired
 def test_a_game_is_played_with_its_behaviours_and_its_bots(tmp_path: Path) -> None:
     out = tmp_path / "out.json"
     game = "sovereign_netcode.examples.dodge:Dodge"
