@@ -30,11 +30,11 @@ from server.runtime import event_loop, log
 from server.runtime.warmup import warm_up
 from shared.bounds import bounds
 from shared.fields import INPUT_ROW_BYTES
-from shared.messages import Held, Inputs, decode_from_client, head_of
+from shared.messages import Held, Inputs, Restart, decode_from_client, head_of
 from shared.scene import Scene
 
 RATE = 32
-HEADS = head_of(Inputs), head_of(Held)
+HEADS = head_of(Inputs), head_of(Held), head_of(Restart)
 
 
 def scene() -> Scene:
@@ -101,6 +101,10 @@ class Measured(Game):
         for name, data, now in self.arrived:
             message = decode_from_client(data if data[:2] in HEADS else apply_mask(data[6:], data[2:6]))
             log, before, holds = logs.setdefault(name, {}), newest.get(name, -1), 0
+            if isinstance(message, Restart):  # it sends the inputs from that tick on again
+                newest[name] = min(before, message.tick - 1)
+                logs[name] = {at: arrived for at, arrived in log.items() if at < message.tick}
+                continue
             if isinstance(message, Held):
                 first, n, holds = before + message.after, 1, bounds(RATE).repeats + 1
             else:
