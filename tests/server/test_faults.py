@@ -12,6 +12,7 @@ from server.replication.flow_control import SAMPLE_S
 from shared import edits, messages
 from shared.checks import Cell
 from shared.messages import Bye, Inputs, Ping, Pong, Snapshot
+from shared.snapshot import join_part
 from tests.tables import HELLO, FakeLink, Table, order
 
 
@@ -131,12 +132,12 @@ def test_a_command_that_fails_is_answered_and_those_after_it_are_carried_out(
 
 def test_a_segment_that_cannot_be_encoded_is_left_out_and_comes_when_it_can(monkeypatch: pytest.MonkeyPatch) -> None:
     table = Table(size=(2, 1, 1), spawns=((30.0, 16.0, 1.0), (34.0, 16.0, 1.0)))
-    real, broken = change_log.join_part, True
+    broken = True
 
     def fails(segment: Cell, *arguments: Any, **options: Any) -> bytes:
         if broken and segment == (1, 0, 0):
             raise ZeroDivisionError
-        return real(segment, *arguments, **options)
+        return join_part(segment, *arguments, **options)
 
     monkeypatch.setattr(change_log, "join_part", fails)
     links = [connect(table) for _ in range(2)]
