@@ -6,9 +6,9 @@ through measurements with several numbers of players that take turns:
 - `scale_work`: the own work of a game, an edge, a sequencer and a standby, without sockets and bus, in one process.
 - `scale_live`: the CPU time of whole processes, with sockets and a NATS server on the same machine.
 
-A cost that does not grow with the players is the value of that line at no players. Each figure is given with two standard
-errors as its scatter. A figure that is not above its scatter is not shown as a result. Takeovers are measured by killing
-the sequencer.
+A cost that does not grow with the players is the value of that line at no players. Each figure is given with two
+standard errors as its scatter. A figure that is not above its scatter is not shown as a result. Takeovers are measured
+by killing the sequencer.
 """
 
 import argparse
