@@ -5,7 +5,8 @@ accepts a record only behind the one that its header names (`Nats-Expected-Last-
 accepted to `world.name.told`, which a part subscribes to: a subscription of the stream's own subject would also show
 what was refused. A part finds missing records by their sequence numbers, and fetches them. Batches go over
 `world.name.in` without the stream. Checkpoints are in the object store `CHECKPOINTS_name`; the key `name.checkpoint`
-names the newest, `name.checkpoints` all that were begun since. Keys of all worlds are in the bucket `worlds`.
+names the newest, `name.checkpoints` all that were begun since. Keys of all worlds are in the bucket `worlds`, whose
+server republishes each stored change of a key to `worlds.told.key` for those who watch it.
 """
 
 import asyncio
@@ -14,7 +15,7 @@ import json
 import re
 import secrets
 import time
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator, Callable, Iterator
 from typing import Any
 
 import nats
@@ -46,12 +47,13 @@ ONE_BY_ONE = 16
 ATTEMPTS = 20
 """Attempts to fetch a record that the stream has, and that did not come."""
 WRONG_LAST_ID, NAME_IN_USE, WRONG_LAST_SEQUENCE = 10070, 10058, 10071
-"""Error codes of JetStream: the newest message has another id; a stream of that name has another configuration; the
-newest message of the subject has another sequence number."""
+"""Error codes of JetStream: another newest id; a stream of that name is set up otherwise; another newest revision."""
 WORLD = re.compile("[A-Za-z0-9_-]{1,32}")
 """Pattern of the name of a world on the bus."""
 BUCKET = "worlds"
 """Name of the bucket of keys."""
+TOLD = RePublish(src=f"$KV.{BUCKET}.>", dest=f"{BUCKET}.told.>")
+"""Subjects under which changes of keys are told, after they are stored."""
 
 
 class NatsBus:
@@ -109,7 +111,11 @@ class NatsBus:
 
     async def _prepare(self, replicas: int, log: bool) -> None:
         with _unless(NAME_IN_USE):
-            await self._js.create_key_value(bucket=BUCKET, history=1, replicas=replicas)
+            await self._js.create_key_value(bucket=BUCKET, history=1, replicas=replicas, republish=TOLD)
+        bucket = (await self._js.stream_info(f"KV_{BUCKET}")).config
+        if bucket.republish is None:  # an earlier version made it
+            bucket.republish = TOLD
+            await self._js.update_stream(bucket)
         self._kv = await self._js.key_value(BUCKET)
         if not log:
             return
@@ -307,26 +313,23 @@ class NatsBus:
             raise BusError(said(error)) from error
 
     async def delete(self, key: str, revision: int | None = None) -> None:
-        assert self._kv is not None
+        headers = {"KV-Operation": "DEL"}
+        if revision is not None:
+            headers[Header.EXPECTED_LAST_SUBJECT_SEQUENCE.value] = str(revision)
         try:
-            if revision is None:
-                await self._kv.delete(key)
-                return
-            headers = {"KV-Operation": "DEL", Header.EXPECTED_LAST_SUBJECT_SEQUENCE.value: str(revision)}
             await self._js.publish(f"$KV.{BUCKET}.{key}", headers=headers)
-        except APIError as error:
-            if error.err_code == WRONG_LAST_SEQUENCE:
-                raise ConflictError(f"{key}: has another revision than {revision}") from error
-            raise BusError(said(error)) from error
         except (NatsError, OSError, TimeoutError) as error:
+            if isinstance(error, APIError) and error.err_code == WRONG_LAST_SEQUENCE:
+                raise ConflictError(f"{key}: has another revision than {revision}") from error
             raise BusError(said(error)) from error
 
     async def watch(self, prefix: str) -> AsyncIterator[tuple[str, Revised | None]]:
-        head, changed = f"$KV.{BUCKET}.", asyncio.Queue[str]()
+        head, changed = f"{BUCKET}.told.", asyncio.Queue[str]()
         known: dict[str, Revised] = {}
 
-        async def note(message: Msg) -> None:  # also of a change that was refused, so the value is read
-            changed.put_nowait(message.subject.removeprefix(head))
+        async def note(message: Msg) -> None:
+            if (key := message.subject.removeprefix(head)).startswith(prefix):
+                changed.put_nowait(key)
 
         subscription = await self._client.subscribe(f"{head}{prefix}>" if prefix.endswith(".") else f"{head}>", cb=note)
         try:
@@ -340,10 +343,15 @@ class NatsBus:
                         listed_at, listed_after = time.monotonic(), times
                 try:
                     key = await asyncio.wait_for(changed.get(), ANSWER_S)
-                    found = await self.get(key) if key.startswith(prefix) else None
-                except (TimeoutError, BusError):
+                except TimeoutError:
                     continue
-                if key.startswith(prefix) and known.get(key) != found:
+                try:
+                    found = await self.get(key)
+                except BusError:
+                    changed.put_nowait(key)
+                    await asyncio.sleep(RECONNECT_S)
+                    continue
+                if known.get(key) != found:
                     known.pop(key, None)
                     if found is not None:
                         known[key] = found
@@ -378,14 +386,14 @@ class NatsBus:
         task.add_done_callback(self._tasks.discard)
 
 
-class _unless(contextlib.AbstractContextManager[None]):  # noqa: N801 - reads as a word
+@contextlib.contextmanager
+def _unless(code: int) -> Iterator[None]:
     """Ignores an error of JetStream by its code."""
-
-    def __init__(self, code: int) -> None:
-        self._code = code
-
-    def __exit__(self, kind: Any, error: BaseException | None, trace: Any) -> bool:
-        return isinstance(error, APIError) and error.err_code == self._code
+    try:
+        yield
+    except APIError as error:
+        if error.err_code != code:
+            raise
 
 
 def _id_of(headers: Any) -> str:

@@ -5,6 +5,7 @@ import contextlib
 from collections.abc import AsyncIterator
 from pathlib import Path
 
+import nats
 import pytest
 
 from scripts.scale_lab.nats_server import NatsServer, binary
@@ -191,6 +192,51 @@ async def test_keys(server: NatsServer) -> None:
         assert await bus.get("arena.edge.two") is None
         await bus.put("arena.edge.two", b"5", 0)
         watching.cancel()
+
+
+async def test_keys_are_read_after_a_change_is_stored(server: NatsServer, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(nats_bus, "LIST_S", 600.0)
+    async with connected(server) as bus, connected(server, "other") as other:
+        read: list[str] = []
+        get, seen = other.get, list[bytes]()
+
+        async def counted(key: str) -> Revised | None:
+            read.append(key)
+            if read.count(key) == 2:
+                raise BusError("no answer")
+            return await get(key)
+
+        async def watch() -> None:
+            async for _, found in other.watch("arena."):
+                seen.append(found.value if found else b"")
+
+        monkeypatch.setattr(other, "get", counted)
+        await bus.put("arena.key", b"0")
+        watching = asyncio.create_task(watch())
+        await until(lambda: seen == [b"0"])
+        with pytest.raises(ConflictError):
+            await bus.put("arena.key", b"refused", 77)
+        await bus.put("arenas.key", b"of another prefix")
+        for number in range(1, 20):
+            await bus.put("arena.key", b"%d" % number)
+            await until(lambda number=number: seen[-1] == b"%d" % number)  # type: ignore[misc]
+        assert read == ["arena.key"] * 21, "one reading per stored change, and one again after an error"
+        watching.cancel()
+
+
+async def test_a_bucket_of_an_earlier_version(server: NatsServer) -> None:
+    client = await nats.connect(server.url)
+    await client.jetstream().create_key_value(bucket=nats_bus.BUCKET)
+    await client.close()
+    async with connected(server) as bus, connected(server, "other") as other:
+        changes = other.watch("arena.")
+        first = asyncio.ensure_future(anext(changes))
+        await until(lambda: other._client.stats["out_msgs"] > 0 and not first.done())
+        revision = await bus.put("arena.key", b"1")
+        assert await first == ("arena.key", Revised(b"1", revision))
+        revision = await bus.put("arena.key", b"2")
+        assert await anext(changes) == ("arena.key", Revised(b"2", revision))
+        await changes.aclose()  # type: ignore[attr-defined]
 
 
 async def check_compare_and_set(bus: Bus, other: Bus) -> None:
