@@ -11,13 +11,14 @@ begins.
 
 import math
 import traceback
+from collections.abc import Sequence
 
 from client_sdk.controls import Controls
 from client_sdk.events import BehaviourFailed, Diverged, Resynchronised
 from client_sdk.pending_events import PendingEvents
 from client_sdk.prediction.prediction import NONDETERMINISM, NOTHING
 from client_sdk.replica import Replica
-from client_sdk.sent_inputs import PRICE_S, ROWS_MAX, SentInputs, margins_of
+from client_sdk.sent_inputs import PRICE_S, ROWS_MAX, Arrival, SentInputs
 from client_sdk.stats import Stats
 from client_sdk.timing.lead import PricedLead, jump_ticks
 from client_sdk.timing.timeline import Timeline
@@ -26,7 +27,6 @@ from shared.bounds import AHEAD_S, bounds
 from shared.inputs import row
 from shared.messages import (
     IDLE,
-    MARGIN_REFUSED,
     NEUTRALISED,
     REPEATED,
     USED,
@@ -130,18 +130,8 @@ class InputLoop:
 
     def prepare(self, snapshot: Snapshot, now: float) -> None:
         """Learns arrival margins from a second connection, so that inputs are in time over it, too."""
-        self._sent.arrived(snapshot, 1)
-        one = self._bounds.margin_one
-        needs = list[tuple[int, float]]()
-        for tick, margin in margins_of(snapshot):
-            phase = self._sent.phase(tick)
-            if phase is None:
-                continue
-            if margin == MARGIN_REFUSED:
-                self._sent.restart()
-            elif self._settling is None:
-                needs.append((tick, phase - margin / one))
-        self._observe(needs, now, 1)
+        # A margin of an input from before the second connection looks like one of an input that was refused.
+        self._observe([each for each in self._sent.arrived(snapshot, 1) if not each.refused], now, 1)
 
     def begin_copies(self) -> None:
         """Notes that messages go over a second connection, too, from now on: it has not got the latest input."""
@@ -221,21 +211,11 @@ class InputLoop:
         becomes the cause of a correction.
         """
         stats, sent, statuses = self._stats, self._sent, snapshot.statuses
-        one, needs = self._bounds.margin_one, list[tuple[int, float]]()
-        sent.arrived(snapshot)
-        for tick, margin in margins_of(snapshot):
-            phase = sent.phase(tick)
-            if phase is None:
-                continue  # nothing was sent for this tick
-            if margin == MARGIN_REFUSED:  # the input was too early, by at least `ahead` ticks
-                stats.inputs_refused += 1
-                sent.restart()
-                margin = math.floor(self._bounds.ahead * one)
-            if margin < 0 and sent.changed(tick):
-                stats.inputs_late += 1
-            needs.append((tick, phase - margin / one))
-        if self._settling is None:
-            self._observe(needs, now)
+        arrivals = sent.arrived(snapshot)
+        for arrival in arrivals:
+            stats.inputs_refused += arrival.refused
+            stats.inputs_late += arrival.late
+        self._observe(arrivals, now)
         if self._settling is not None or self._settled:  # the server may have used inputs that were withdrawn
             self._late, self._settled = True, False
         used, missing = statuses.count(USED), sent.replaced(snapshot)
@@ -251,19 +231,21 @@ class InputLoop:
         stats.inputs_substituted += missing
         self._late |= missing > 0
 
-    def _observe(self, needs: list[tuple[int, float]], now: float, connection: int = 0) -> None:
+    def _observe(self, arrivals: Sequence[Arrival], now: float, connection: int = 0) -> None:
         """Passes the needs of messages (`client_sdk.timing.lead`) to the lead, and needs for the ticks between them.
 
         Args:
-            needs: ticks and needs, as phases, of the messages that a snapshot reports.
+            arrivals: the messages that a snapshot reports.
             now: local time in seconds.
             connection: 1 for a second connection, else 0.
         """
+        if not arrivals or self._settling is not None:
+            return
+        needs = [(arrival.tick, arrival.need) for arrival in arrivals]
         before, last = self._observed[connection]
         for tick, need in self._sent.filled(needs, before, last):
             self._lead.observe(tick, 0.0, need, now)
-        if needs:
-            self._observed[connection] = needs[-1]
+        self._observed[connection] = needs[-1]
 
     def unreceived(self) -> list[Message]:
         """Returns the inputs to send again after a reconnect: those that the server may not have received yet."""
@@ -338,7 +320,8 @@ class InputLoop:
         if to >= first:
             clock, phase = self.world.clock, timeline.phase
             timeline.made(timeline.tick(now) - first, now)
-            rows, phases, scene = b"", list[float](), self.world.scene
+            phases: list[float] = []
+            rows, scene = b"", self.world.scene
             for tick in range(first, to + 1):
                 input_ = controls.take()
                 prediction.file(tick, input_)

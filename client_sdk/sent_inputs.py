@@ -13,8 +13,10 @@ per tick, by the time until the next one is sent. A changed input does not meet 
 message, or a `Held` follows it in the next tick. The lead is for changed inputs, so it does not count (`filled`).
 """
 
+import math
 from collections.abc import Iterator, Sequence
 from struct import iter_unpack
+from typing import NamedTuple
 
 from shared import priced
 from shared.bounds import bounds, in_ticks
@@ -36,6 +38,19 @@ def margins_of(snapshot: Snapshot) -> Iterator[tuple[int, int]]:
     """Yields the ticks of a snapshot's arrival margins, and the margins in units of the wire."""
     first = snapshot.newest + 1 - len(snapshot.margins) // 2
     return ((tick, margin) for tick, (margin,) in enumerate(iter_unpack("<h", snapshot.margins), first))
+
+
+class Arrival(NamedTuple):
+    """The arrival of a message with an input at the server.
+
+    `tick` is the tick of the input. `need` is the phase that would just have been enough (`client_sdk.timing.lead`). An
+    input that was `refused` was too early, by at least `Bounds.ahead` ticks. `late`: it was late, and had changed.
+    """
+
+    tick: int
+    need: float
+    late: bool
+    refused: bool
 
 
 class SentInputs:
@@ -97,11 +112,6 @@ class SentInputs:
         after, self._newest, self._due = at - self._newest, at, max(at + self.renew, to + 1)
         return [Held(after, at - acked)]
 
-    def phase(self, tick: int) -> float | None:
-        """Returns the timeline's phase when a message for a tick was sent; None: there was none."""
-        sent = self._sent.get(tick)
-        return None if sent is None or sent[1] == QUIET else sent[0]
-
     def has(self, tick: int) -> bool:
         """Returns whether the server was sent an input for a tick, or that the input before holds."""
         return self._sent.get(tick) is not None
@@ -137,17 +147,30 @@ class SentInputs:
             (sent := self._sent.get(tick)) is not None and sent[1] == QUIET for tick in range(first, end)
         )
 
-    def arrived(self, snapshot: Snapshot, connection: int = 0) -> None:
-        """Notes which changed inputs a snapshot reports as late.
+    def arrived(self, snapshot: Snapshot, connection: int = 0) -> list[Arrival]:
+        """Takes the arrival margins of a snapshot: notes which changed inputs were late, or that one was refused.
 
         Args:
             snapshot: the snapshot.
             connection: 1 for a second connection, else 0.
+
+        Returns:
+            The arrivals of messages that were sent.
         """
-        late, one = self._late[connection], self._bounds.margin_one
+        arrivals, one = [], self._bounds.margin_one
         for tick, margin in margins_of(snapshot):
-            if MARGIN_REFUSED < margin < 0 and self.changed(tick):
-                late.put(tick, tick - margin / one)
+            sent = self._sent.get(tick)
+            if sent is None or sent[1] == QUIET:
+                continue
+            late = MARGIN_REFUSED < margin < 0 and sent[1] == CHANGED
+            if late:
+                self._late[connection].put(tick, tick - margin / one)
+            refused = margin == MARGIN_REFUSED
+            if refused:
+                self.restart()
+                margin = math.floor(self._bounds.ahead * one)
+            arrivals.append(Arrival(tick, sent[0] - margin / one, late, refused))
+        return arrivals
 
     def replaced(self, snapshot: Snapshot) -> int:
         """Returns the number of ticks of a snapshot with the status USED in which another input was used.

@@ -4,34 +4,27 @@ Other entities are drawn as predicted, too, if their template is shown so (`show
 """
 
 import math
-from bisect import bisect_left, bisect_right
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple, cast
+from itertools import compress
 
 from client_sdk.interpolation import Interpolation
+from client_sdk.interpolation.interpolation import Way, changes, place_of
 from client_sdk.interpolation.smoothing import Smoothing
 from client_sdk.prediction.prediction import Prediction, Reconciled
 from client_sdk.timing.server_clock import ServerClock
 from client_sdk.timing.timeline import Timeline
 from client_sdk.view import NO_VALUES, EntityView, View
-from shared.arrays import PLAIN, np
 from shared.checks import Vec
-from shared.layout import CELL, ID, MOVE_X, TEMPLATE, VX, X
+from shared.layout import CELL, ID, MOVE_X, TEMPLATE, VX
 from shared.scene import Scene
-from shared.units import BLOCK, SPEED
+from shared.units import SPEED
 
+Facing = tuple[float, float]
+"""A direction of length 1: east and north."""
+EAST: Facing = (1.0, 0.0)
+"""The facing of an entity that has not moved yet."""
 FACINGS_MIN = 64
 """Number of kept directions up to which those of entities out of view are not dropped."""
-
-
-class _Still(NamedTuple):
-    """The part of an entity view that depends on the entity's state alone, but not on its position."""
-
-    entity: int
-    template: str
-    velocity: Vec
-    fields: Mapping[str, int]
-    facing: tuple[float, float]
 
 
 class ViewBuilder:
@@ -44,13 +37,12 @@ class ViewBuilder:
         self._predicted = {i for i, template in enumerate(scene.templates) if template.shown == "predicted"}
         self._smoothing: dict[int, Smoothing] = {}
         self._extras = scene.extras
-        self._facings: dict[int, tuple[float, float]] = {}
-        self._states: Any = None  # the latest drawn ones, and what was made of them
-        self._own = slice(0)  # the rows of the own entities
-        self._parts: list[_Still | None] = []  # of all rows; None: an own one, or it may be drawn as predicted
-        self._others: list[_Still | None] = []  # of all rows but the own ones
-        self._rows: list[list[int]] = []  # the states of these, if one may be drawn as predicted
-        self._seldom: dict[int, _Still] = {}  # parts by row of those that were not drawn as predicted after all
+        self._facings: dict[int, Facing] = {}
+        self._way: Way | None = None  # the latest drawn one
+        self._layout: tuple[list[int], list[int]] = [], []  # numbers and templates of the entities where it begins
+        self._figures: dict[int, EntityView] = {}  # these entities there, without the own ones
+        self._unsure: dict[int, list[int]] = {}  # states of those that may be drawn as predicted
+        self._labelled = -1  # state of the attributes in `_figures`
         self._delay = 0.0  # the input delay of the latest view, in ticks
         self._viewed = -math.inf  # the timeline's tick of the latest view
 
@@ -80,62 +72,67 @@ class ViewBuilder:
         # for as many ticks, and is never drawn further back than before.
         self._delay = min(prediction.ahead, self._delay + max(tick - self._viewed, 0.0))
         self._viewed = tick
-        states, places = self.interpolation.drawn(server_tick)
-        if states is not self._states:
-            self._take(states)
-        del places[self._own]
-        if self._rows:
-            others = [self._other(i, place, tick, now) for i, place in enumerate(places)]
-        else:
-            attributes, new = prediction.attributes.get, tuple.__new__  # half the time of a call of the class
-            others = [
-                new(EntityView, (entity, template, (x, y, z), velocity, attributes(entity, NO_VALUES), fields, facing))
-                for (entity, template, velocity, fields, facing), (x, y, z) in zip(
-                    cast("list[_Still]", self._others), places, strict=True
-                )
-            ]
+        seen = self.interpolation.shown(server_tick)
+        way = self.interpolation.way(seen)
+        if way is not self._way:
+            self._follow(way)
+        if self._labelled != prediction.confirmed_copy.attribute_changes:
+            self._label()
+        figures, share = self._figures.copy(), way.share(seen)
+        for entity, x, y, z, u, v, w in way.moving:
+            if figure := figures.get(entity):
+                figures[entity] = _at((x + u * share, y + v * share, z + w * share), figure)
+        for entity, state in self._unsure.items():
+            ahead = self._ahead(entity, tick, now)
+            figures[entity] = ahead or figures[entity]._replace(facing=self._facing(state))
+        others = list(figures.values())
         if prediction.last_own > prediction.entity:  # what the own entity has spawned: predicted, like itself
             own = (self._ahead(entity, tick, now) for entity in prediction.spawned())
             others = sorted([*others, *(each for each in own if each is not None)], key=lambda each: each.entity)
-        return View(tick, self._ahead(prediction.entity, tick, now), others, self.interpolation.shown(server_tick))
+        return View(tick, self._ahead(prediction.entity, tick, now), others, seen)
 
-    def _take(self, states: Any) -> None:
-        """Takes the states of another snapshot.
-
-        An entity whose state differs in its position only has the same part as before. Of an own one, and of one that
-        may be drawn as predicted, a part is made only if it is not, because that changes its facing.
-        """
-        ids, templates = states[:, ID].tolist(), states[:, TEMPLATE].tolist()
+    def _follow(self, way: Way) -> None:
+        """Takes the states at the beginning of another way."""
+        former, self._way = self._way, way
+        if former is not None and former.before is way.before:
+            return
+        if former is None:
+            changed = changes(way.states[:0], way.states)
+        elif former.after is way.before:
+            changed = former.changed
+        else:
+            changed = changes(former.states, way.states)
+        ids, templates = layout = way.states[:, ID].tolist(), way.states[:, TEMPLATE].tolist()
         if len(self._facings) > 2 * len(ids) + FACINGS_MIN:
             there = set(ids)
             self._facings = {entity: facing for entity, facing in self._facings.items() if entity in there}
-        first, end = bisect_left(ids, self._prediction.entity), bisect_right(ids, self._prediction.last_own)
-        own, former, parts = slice(first, end), self._parts, list[_Still | None]()
-        for row, same in enumerate(_unchanged(self._states, states)):
-            part = former[same] if same >= 0 else None
-            if part is None and templates[row] not in self._predicted and not first <= row < end:
-                part = self._part(states[row].tolist())
-            parts.append(part)
-        others = parts.copy()
-        del others[own]
-        rows = []
-        if None in others:
-            rows = states.tolist()
-            del rows[own]
-        self._states, self._own, self._parts = states, own, parts
-        self._others, self._rows, self._seldom = others, rows, {}
+        own = range(self._prediction.entity, self._prediction.last_own + 1)
+        for old, new in changed:
+            if new[ID] not in own:
+                self._put(old, new)
+        if layout != self._layout:
+            self._layout = layout
+            self._figures = {entity: self._figures[entity] for entity in ids if entity not in own}
+            unsure = compress(ids, (template in self._predicted for template in templates))
+            self._unsure = {entity: self._unsure[entity] for entity in unsure if entity not in own}
 
-    def _other(self, row: int, place: list[float], tick: float, now: float) -> EntityView:
-        """Returns the view of the entity of a row, as predicted or at `place` (in blocks)."""
-        state, part = self._rows[row], self._others[row]
-        if part is None:
-            ahead = self._ahead(state[ID], tick, now)
-            if ahead is not None:
-                return ahead
-            part = self._seldom.get(row)
-            if part is None:
-                part = self._seldom[row] = self._part(state)
-        return self._figure_of(part, place)
+    def _put(self, old: list[int] | None, new: list[int]) -> None:
+        """Takes the state of an entity that differs from its earlier one."""
+        entity, template, place = new[ID], new[TEMPLATE], place_of(new)
+        if template in self._predicted:
+            self._unsure[entity] = new
+            self._figures[entity] = self._figure(new, place, EAST)
+        elif old is None or old[TEMPLATE] != template or old[VX:] != new[VX:]:
+            self._figures[entity] = self._figure(new, place, self._facing(new))
+        else:
+            self._figures[entity] = _at(place, self._figures[entity])
+
+    def _label(self) -> None:
+        """Takes the attributes of all entities."""
+        self._labelled = self._prediction.confirmed_copy.attribute_changes
+        attributes = self._prediction.attributes
+        for entity, figure in self._figures.items():
+            self._figures[entity] = figure._replace(attributes=attributes.get(entity, NO_VALUES))
 
     def _ahead(self, entity: int, tick: float, now: float) -> EntityView | None:
         """Returns a predicted entity to draw, one tick before `tick` and with smoothing; None if it is not predicted.
@@ -148,32 +145,23 @@ class ViewBuilder:
         before, after, share = prediction.around(entity, tick - self._delay - 1)
         smoothing = self._smoothing.get(entity)
         offset = smoothing.offset(now) if smoothing else (0.0, 0.0, 0.0)
-        place = []
-        for a, b, more in zip(before[X : X + 3], after[X : X + 3], offset, strict=True):
-            old = a / BLOCK
-            place.append(old + (b / BLOCK - old) * share + more)
-        return self._figure(after, place)
+        x, y, z = (
+            old + (new - old) * share + more
+            for old, new, more in zip(place_of(before), place_of(after), offset, strict=True)
+        )
+        return self._figure(after, (x, y, z), self._facing(after))
 
-    def _figure(self, state: Sequence[int], place: list[float]) -> EntityView:
-        """Returns the entity view of a state, drawn at `place` (in blocks)."""
-        return self._figure_of(self._part(state), place)
-
-    def _figure_of(self, part: _Still, place: list[float]) -> EntityView:
-        entity, template, velocity, fields, facing = part
-        x, y, z = place
-        attributes = self._prediction.attributes.get(entity, NO_VALUES)
-        return EntityView(entity, template, (x, y, z), velocity, attributes, fields, facing)
-
-    def _part(self, state: Sequence[int]) -> _Still:
-        """Returns the part of an entity view that depends on the state alone."""
+    def _figure(self, state: Sequence[int], place: Vec, facing: Facing) -> EntityView:
+        """Returns the view of an entity that is drawn at `place` (in blocks)."""
+        template = state[TEMPLATE]
         velocity = (state[VX] / SPEED, state[VX + 1] / SPEED, state[VX + 2] / SPEED)
-        template = self._templates[state[TEMPLATE]]
+        attributes = self._prediction.attributes.get(state[ID], NO_VALUES)
         fields: Mapping[str, int] = NO_VALUES
         if self._extras.count:
-            fields = self._prediction.predicted.fields_of(state[TEMPLATE], list(state[CELL:]))
-        return _Still(state[ID], template, velocity, fields, self._facing(state))
+            fields = self._prediction.predicted.fields_of(template, list(state[CELL:]))
+        return EntityView(state[ID], self._templates[template], place, velocity, attributes, fields, facing)
 
-    def _facing(self, state: Sequence[int]) -> tuple[float, float]:
+    def _facing(self, state: Sequence[int]) -> Facing:
         """Returns the direction in which an entity looks, and keeps it for when it stands still."""
         aims = self._extras.aims and (state[CELL] or state[CELL + 1])
         for part in (CELL if aims else MOVE_X, VX):
@@ -182,27 +170,10 @@ class ViewBuilder:
                 length = math.hypot(east, north)
                 self._facings[state[ID]] = east / length, north / length
                 break
-        return self._facings.get(state[ID], (1.0, 0.0))
+        return self._facings.get(state[ID], EAST)
 
 
-def _unchanged(before: Any, after: Any) -> list[int]:
-    """Returns for each state, [n, 12], the row of an earlier state that differs in its position at most; -1: none.
-
-    Both are ascending by id. `before` may be None.
-    """
-    if before is None or not len(before):
-        return [-1] * len(after)
-    if PLAIN:
-        rows = {state[ID]: (row, state) for row, state in enumerate(before.tolist())}
-        found = [(rows.get(state[ID], (-1, state)), state) for state in after.tolist()]
-        return [row if old[VX:] == new[VX:] and old[TEMPLATE] == new[TEMPLATE] else -1 for (row, old), new in found]
-    if len(before) == len(after) and (before[:, ID] == after[:, ID]).all():  # mostly
-        at, changed = np.arange(len(after)), before != after
-    else:
-        at = np.searchsorted(before[:, ID], after[:, ID])
-        at[at == len(before)] = 0
-        changed = before[at] != after
-    changed[:, TEMPLATE + 1 : VX] = False
-    at[changed.any(axis=1)] = -1
-    same: list[int] = at.tolist()
-    return same
+def _at(place: Vec, figure: EntityView) -> EntityView:
+    """Returns the view of an entity at another position. (`_replace` takes several times as long.)"""
+    entity, template, _, velocity, attributes, fields, facing = figure
+    return tuple.__new__(EntityView, (entity, template, place, velocity, attributes, fields, facing))

@@ -12,9 +12,11 @@ their velocities for less than a tick, because the next snapshot may change anyt
 
 import math
 from collections import deque
+from collections.abc import Sequence
 
 from shared.arrays import PLAIN, Float64s, np
-from shared.layout import ID, VX, Int64s, X
+from shared.checks import Vec
+from shared.layout import CELL, ID, VX, Int64s, X
 from shared.units import BLOCK, SPEED
 
 KEPT_S, KEPT_MIN = 3.0, 16
@@ -36,6 +38,10 @@ Positions = Float64s
 Entry = tuple[int, Int64s, frozenset[int]]
 """An entry of the history: the tick of a snapshot, the states at its end, and the entities that the rules placed since
 the snapshot before."""
+Change = tuple[list[int] | None, list[int]]
+"""The states of an entity in two snapshots; None: it was not in the first one."""
+NO_ENTRY: Entry = (0, np.zeros((0, CELL), np.int64), frozenset())
+"""An entry without entities."""
 
 
 class Interpolation:
@@ -46,7 +52,7 @@ class Interpolation:
         self._states: deque[Entry] = deque(maxlen=max(math.ceil(KEPT_S * rate), KEPT_MIN))
         self.delay_ticks = 2.0
         self._calm_since = self._at = -math.inf
-        self._way: _Way | None = None
+        self._way: Way | None = None
 
     def push(self, tick: int, states: Int64s, placed: frozenset[int] = frozenset()) -> None:
         """Adds a snapshot to the history.
@@ -100,71 +106,78 @@ class Interpolation:
 
     def sample(self, server_tick: float) -> tuple[Int64s, Positions]:
         """Returns states ([n, 12]) and positions (blocks, [n, 3]) of all entities at the tick `shown(server_tick)`."""
-        states, places = self.drawn(server_tick)
-        return states, np.array(places, np.float64).reshape(-1, 3)
-
-    def drawn(self, server_tick: float) -> tuple[Int64s, list[list[float]]]:
-        """Returns states and positions like `sample`, the latter as lists."""
-        if not self._states:
-            return np.zeros((0, 12), np.int64), []
         at = self.shown(server_tick)
-        before = after = self._states[-1]
+        way = self.way(at)
+        share, places = way.share(at), {state[ID]: place_of(state) for state in way.states.tolist()}
+        for entity, x, y, z, u, v, w in way.moving:
+            places[entity] = (x + u * share, y + v * share, z + w * share)
+        return way.states, np.array(list(places.values()), np.float64).reshape(-1, 3)
+
+    def way(self, at: float) -> "Way":
+        """Returns the way on which the entities are drawn at the tick `at`."""
+        before = after = self._states[-1] if self._states else NO_ENTRY
         for entry in reversed(self._states):
             before = entry
             if entry[0] <= at:
                 break
             after = entry
-        tick, states, _ = before
-        if at > tick and after is not before:
-            if self._way is None or self._way.before is not before or self._way.after is not after:
-                self._way = _Way(before, after)
-            return states, self._way.at((at - tick) / (after[0] - tick))
-        places = states[:, X : X + 3] / BLOCK + states[:, VX : VX + 3] / SPEED * ((at - tick) / self._rate)
-        return states, places.tolist()
+        if self._way is None or self._way.before is not before or self._way.after is not after:
+            self._way = Way(before, after, self._rate)
+        return self._way
 
 
-class _Way:
-    """The ways of the entities between two snapshots. Two or more frames are drawn of each.
+class Way:
+    """The ways of the entities from one snapshot to the next, or after the newest one. Frames share it.
 
     An entity that the rules placed or removed meanwhile stays at its earlier position. The positions have the floats of
     `shared.between`.
+
+    Args:
+        before, after: the two snapshots; the same one twice: entities move on by their velocities.
+        rate: ticks per second.
     """
 
-    def __init__(self, before: Entry, after: Entry) -> None:
+    def __init__(self, before: Entry, after: Entry, rate: float) -> None:
         self.before, self.after = before, after
-        (_, states, _), (_, new, placed) = before, after
-        if PLAIN:
-            self._lists = _ways(states.tolist(), new.tolist(), placed)
+        self.tick, self.states, _ = before
+        self.ticks = after[0] - before[0] or rate
+        """The time in ticks after which the entities have gone the whole way."""
+        self.changed: list[Change] = []
+        """The entities whose states differ between the two snapshots."""
+        self.moving: list[tuple[int, float, float, float, float, float, float]] = []
+        """Numbers, positions and ways of those that move, in blocks."""
+        if after is before:
+            for state in self.states.tolist():
+                u, v, w = state[VX : VX + 3]
+                if u or v or w:
+                    self.moving.append((state[ID], *place_of(state), u / SPEED, v / SPEED, w / SPEED))
             return
-        self._start, ids = states[:, X : X + 3] / BLOCK, states[:, ID]
-        if len(new) == len(ids) and (new[:, ID] == ids).all():  # mostly
-            self._span = new[:, X : X + 3] / BLOCK - self._start
-        else:
-            self._span = np.zeros_like(self._start)
-            if len(new):
-                row = np.searchsorted(new[:, ID], ids)
-                row[row == len(new)] = 0
-                moves = new[row, ID] == ids
-                self._span[moves] = new[row[moves], X : X + 3] / BLOCK - self._start[moves]
-        if placed:
-            self._span[np.isin(ids, list(placed))] = 0.0
+        self.changed = changes(before[1], after[1])
+        for old, new in self.changed:
+            if old is not None and new[ID] not in after[2]:
+                (x, y, z), (u, v, w) = place_of(old), place_of(new)
+                self.moving.append((new[ID], x, y, z, u - x, v - y, w - z))
 
-    def at(self, share: float) -> list[list[float]]:
-        """Returns the positions at a moment, from 0 (the first snapshot) to 1 (the second)."""
-        if PLAIN:
-            return [[x + u * share, y + v * share, z + w * share] for x, y, z, u, v, w in self._lists]
-        places: list[list[float]] = (self._start + self._span * share).tolist()
-        return places
+    def share(self, at: float) -> float:
+        """Returns the share of the way that the entities have gone at the tick `at`."""
+        return (at - self.tick) / self.ticks
 
 
-def _ways(
-    states: list[list[int]], new: list[list[int]], placed: frozenset[int]
-) -> list[tuple[float, float, float, float, float, float]]:
-    """Returns the position and the way of each entity in `states` to its state in `new`, in plain Python."""
-    newer = {state[ID]: state for state in new if state[ID] not in placed}
-    ways = []
-    for state in states:
-        then = newer.get(state[ID], state)
-        x, y, z = state[X] / BLOCK, state[X + 1] / BLOCK, state[X + 2] / BLOCK
-        ways.append((x, y, z, then[X] / BLOCK - x, then[X + 1] / BLOCK - y, then[X + 2] / BLOCK - z))
-    return ways
+def changes(before: Int64s, after: Int64s) -> list[Change]:
+    """Returns the entities in `after` whose states differ from those in `before`, or were not there.
+
+    Both are ascending by id.
+    """
+    if PLAIN or not len(before):
+        earlier = {state[ID]: state for state in before.tolist()}
+        return [(earlier.get(state[ID]), state) for state in after.tolist() if earlier.get(state[ID]) != state]
+    rows = np.minimum(before[:, ID].searchsorted(after[:, ID]), len(before) - 1)
+    former = before.take(rows, 0)
+    differ = (former != after).any(axis=1).nonzero()[0]
+    pairs = zip(former.take(differ, 0).tolist(), after.take(differ, 0).tolist(), strict=True)
+    return [(old if old[ID] == new[ID] else None, new) for old, new in pairs]
+
+
+def place_of(state: Sequence[int]) -> Vec:
+    """Returns the position in a state, in blocks."""
+    return state[X] / BLOCK, state[X + 1] / BLOCK, state[X + 2] / BLOCK

@@ -33,6 +33,8 @@ class Confirmed:
         """States of the world, [n, 12], ascending by id. Do not write to them."""
         self.attributes: dict[int, dict[str, Any]] = {}
         """Attributes of the entities that the client sees, by entity and name."""
+        self.attribute_changes = 0
+        """Number of times that attributes have changed."""
         self.terrain_changed = self.edited_near = False
         """Whether blocks have changed, and whether any near the own entity has, since the last replay (it resets
         both)."""
@@ -93,6 +95,7 @@ class Confirmed:
             if part.edits:
                 self._edit(part)
             if part.attributes:
+                self.attribute_changes += 1
                 self.attributes.update((entity, values) for entity, values in part.attributes if entity in world)
         for segment in drops:
             if segment == self._coming:
@@ -166,4 +169,4 @@ class Confirmed:
             home = (x, y, z)
             if entity not in here and (home in whole or (home, entity) in gone):
                 self.world.forget(entity)
-                self.attributes.pop(entity, None)
+                self.attribute_changes += self.attributes.pop(entity, None) is not None

@@ -19,6 +19,7 @@ never corrected as long as inputs arrive in time.
 """
 
 import math
+from bisect import bisect_left
 from dataclasses import dataclass
 
 from client_sdk.controls import Controls
@@ -267,8 +268,11 @@ class Prediction:
 
     def _placed(self, since: int, to: int) -> frozenset[int]:
         """Returns the entities that the server's rules placed after the tick `since`, up to `to`."""
-        ticks = range(max(since, to - self.confirmed_copy.follow_max) + 1, to + 1)
-        return frozenset().union(*(ids for tick in ticks if (ids := self.confirmed_copy.placed.get(tick))))
+        found: frozenset[int] = frozenset()
+        for tick in range(max(since, to - self.confirmed_copy.follow_max) + 1, to + 1):
+            if placed := self.confirmed_copy.placed.get(tick):
+                found |= placed
+        return found
 
     def _state(self, entity: int, tick: int) -> State | None:
         """Returns the kept state of an entity at the end of a tick; None if none is kept."""
@@ -276,7 +280,8 @@ class Prediction:
         if states is None:
             return None
         ids = states[:, ID].tolist()
-        return tuple(states[ids.index(entity)].tolist()) if entity in ids else None
+        row = bisect_left(ids, entity)
+        return tuple(states[row].tolist()) if row < len(ids) and ids[row] == entity else None
 
     def sync_test(self) -> tuple[int, Int64s, Int64s] | None:
         """Runs the sync test: replays everything since the confirmed world. Changes nothing unless state is hidden.
