@@ -53,7 +53,7 @@ WORLD = re.compile("[A-Za-z0-9_-]{1,32}")
 BUCKET = "worlds"
 """Name of the bucket of keys."""
 TOLD = RePublish(src=f"$KV.{BUCKET}.>", dest=f"{BUCKET}.told.>")
-"""Subjects under which changes of keys are told, after they are stored."""
+"""Subjects under which changes of keys are sent again once they are stored."""
 
 
 class NatsBus:
