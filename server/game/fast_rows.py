@@ -70,8 +70,9 @@ from shared.session_rows import (
 
 ROWS_MIN = 4
 """Number of rows at first. It grows by half when all are in use."""
-WAITING_S, SLOTS_MIN = 0.5, 16
-"""Seconds for which inputs can wait in a row, and the minimum in ticks. Clients are not further ahead by themselves."""
+WAITING_S, SLOTS_MIN = 0.5, 48
+"""Seconds for which inputs can wait in a row, and the minimum in ticks. By themselves, clients are less far ahead. A
+server that skips ticks falls behind them, until their next measurement of its time."""
 INPUTS_KEPT = 4096
 """Maximum number of decoded inputs that are kept."""
 

@@ -359,3 +359,27 @@ def test_every_byte_is_the_same(form: str, kind: type[Peer], aim: bool, rate: in
     assert slow.on_fast_path == 0
     if kind is FramedPeer:
         assert sum(peer.in_frames for peer in fast.peers if isinstance(peer, FramedPeer)) > 0
+
+
+class Steady(Peer):
+    """A client that stands still, and sends one input in each tick of its own time."""
+
+    def act(self, busy: float) -> None:
+        if self.next >= 0:
+            self.say_inputs(1)
+
+
+def test_sessions_stay_on_the_fast_path_while_the_server_skips_ticks() -> None:
+    crowd = Crowd(4, crowd_scene(), with_fast_path(), busy=0.0, rules=Rules(), kind=Steady)
+    game, ticks = crowd.game, 40
+    assert all(session.row >= 0 for session in game.sessions)
+    before = game.world.tick
+    for _ in range(ticks):  # it does every other one, so inputs come for ticks further and further ahead
+        for peer in crowd.peers:
+            peer.act(0.0)
+            peer.act(0.0)
+        crowd.now += 2 / game.scene.tick_rate
+        game.tick(crowd.now, crowd.now)
+    assert game.world.tick == before + ticks
+    assert min(peer.next for peer in crowd.peers) > game.world.tick + ticks
+    assert all(session.row >= 0 for session in game.sessions)
