@@ -17,9 +17,10 @@ MARGINS, STATUSES, KEPT = 23, 31, 8
 """Columns of the margins and of the statuses that are not sent yet, and how many of each there can be."""
 SAMPLE_BYTES, SAMPLES = 39, 6
 """Columns of the acknowledged bytes (`FlowControl.samples`), and how many there can be."""
-HELD_TO = 45
-"""Column of the last tick for which the latest input holds, as in `InputQueue`."""
-WIDTH = 46
+HELD_TO, REFUSED = 45, 46
+"""Columns of the last tick for which the latest input holds, and of the refused inputs since the row was written, as in
+`InputQueue`."""
+WIDTH = 47
 """Columns of whole numbers in a row."""
 RECEIVED_AT, ALLOWANCE, SENT_AT, MEASURE_AT, HELD_SHARE, PROBE_AT, FULL_AT, LEAST_RTT, RTT, RTT_AT = range(10)
 """Columns of the floats, as in `Session`, `ClientStream` and `FlowControl`. LEAST_RTT, RTT, RTT_AT: the first round

@@ -31,6 +31,7 @@ from shared.session_rows import (
     PROBE_AT,
     PROBE_TICK,
     RECEIVED_AT,
+    REFUSED,
     RTT,
     RTT_AT,
     SLOT,
@@ -109,8 +110,7 @@ def message_head(data: Any, at: int, end: int, newest: int) -> tuple[int, int, i
         newest: the newest tick of which the session has sent anything.
 
     Returns:
-        The first tick, the tick of the acknowledged snapshot, and where the inputs begin; in a `Held`, `end`. -1 stands
-        for this place in all other messages.
+        First tick, acknowledged tick, and where the inputs begin (in a `Held`: `end`; in all other messages: -1).
     """
     if end - at < 4:
         return 0, 0, -1
@@ -197,6 +197,23 @@ def file_inputs(
         put_margin(numbers, base, due, tick, ahead, one)
 
 
+@inlined
+def put_refused(numbers: Any, base: int, n: int) -> None:
+    """Files the margins of `n` ticks whose inputs are refused or left out."""
+    for _ in range(n):
+        numbers[base + MARGINS + numbers[base + N_MARGINS]] = REFUSED_MARGIN
+        numbers[base + N_MARGINS] += 1
+
+
+@inlined
+def refuse_inputs(numbers: Any, base: int, first: int, n: int) -> None:
+    """Refuses the inputs of `n` ticks from `first` on, the last of which becomes the newest one."""
+    put_refused(numbers, base, n)
+    numbers[base + REFUSED] += n
+    if n > 0:
+        numbers[base + NEWEST] = first + n - 1
+
+
 @jit
 def unmask(data: Any, sizes: Any) -> None:
     """Unmasks the messages in WebSocket frames.
@@ -233,11 +250,12 @@ def take_messages(
         numbers, floats, ring: the rows. Those with a message that is left become `ODD`; their later ones are left, too.
         data: the messages, one after the other; those in frames are unmasked.
         rows, sizes, times: row, bytes (negative: of its frame) and time (s) of each message; `fates` gets its fate.
-        rules: latest tick, most ticks ahead, bytes of an input, inputs of a message, slots of a row, ticks of repeats.
+        rules: latest tick, most ticks ahead, bytes of an input, inputs of a message, slots of a row, ticks of repeats,
+            most ticks ahead for which there is room.
         clock: deadline of the latest tick in seconds, ticks per second, most ticks to catch up on, a margin of one tick
             on the wire, messages of a burst, `flow_control.RATE_WINDOW_S`, `flow_control.RTT_SPAN_S`.
     """
-    tick, ahead_most, row_bytes, most, slots, repeats = rules[0], rules[1], rules[2], rules[3], rules[4], rules[5]
+    tick, ahead_most, row_bytes, slots, repeats, room = rules[0], rules[1], rules[2], rules[4], rules[5], rules[6]
     deadline, rate, catch_up, one, burst = clock[0], clock[1], clock[2], clock[3], clock[4]
     end = 0
     for i in range(len(fates)):
@@ -254,14 +272,13 @@ def take_messages(
             continue
         size = end - at - 2
         n = 1 if at == end else size // row_bytes
-        if at < end and (data[at] != 0xC4 or data[at + 1] != size or n * row_bytes != size or n > most):
+        if at < end and (data[at] != 0xC4 or data[at + 1] != size or n * row_bytes != size or n > rules[3]):
             continue
-        if first <= max(newest, numbers[base + ACCEPTED]) or first > max(newest, numbers[base + HELD_TO]) + 1:
+        refused = first > tick + ahead_most or (at == end and newest != numbers[base + ACCEPTED])
+        if first <= max(newest, numbers[base + ACCEPTED]) or (not refused and first + n - 1 > tick + room):
             continue
-        if at == end and newest != numbers[base + ACCEPTED]:
-            continue
-        left_out = first - newest - 1 if kept > 0 else 0
-        if first + n - 1 > tick + ahead_most or first + n > FIRST_MAX or kept + left_out + n > KEPT:
+        left_out = first - newest - 1 if kept > 0 or first > numbers[base + HELD_TO] + 1 else 0
+        if first + n > FIRST_MAX or kept + left_out + n > KEPT:
             continue
         if floats[reals + ALLOWANCE] - 1 < -burst:
             continue
@@ -269,10 +286,10 @@ def take_messages(
         floats[reals + RECEIVED_AT] = max(floats[reals + RECEIVED_AT], now)
         floats[reals + ALLOWANCE] -= 1
         ahead = ticks_left(now, deadline, rate, catch_up)
-        for k in range(kept, kept + left_out if n > 0 else kept):
-            numbers[base + MARGINS + k] = REFUSED_MARGIN
-            numbers[base + N_MARGINS] = k + 1
-        if at == end:
+        put_refused(numbers, base, left_out if n > 0 else 0)
+        if refused:
+            refuse_inputs(numbers, base, first, n)
+        elif at == end:
             hold_input(numbers, base, first, tick, repeats, ahead, one)
         else:
             file_inputs(numbers, ring, row, data, at + 2, (first, n, tick, row_bytes, slots), ahead, one)

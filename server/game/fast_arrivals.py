@@ -54,8 +54,9 @@ class Arrivals:
         rate = scene.tick_rate
         self._newest, self._rows, self._limits, self._clocks = newest, rows, limits, clocks
         self._recall, self._receive, self._kernel = recall, receive, kernel
-        ahead, most = min(bounds(rate).ahead, rows.slots), limits.input_rows_max
-        facts = (0, ahead, scene.input_row_bytes, most, rows.slots, bounds(rate).repeats)
+        ahead, most = bounds(rate).ahead, limits.input_rows_max
+        room = min(ahead, rows.slots)
+        facts = (0, ahead, scene.input_row_bytes, most, rows.slots, bounds(rate).repeats, room)
         self._rules = Arguments(kernel, "q", values=facts)
         self._clock = Arguments(
             kernel,

@@ -48,6 +48,7 @@ from shared.session_rows import (
     RATE_AT,
     RATES,
     RECEIVED_AT,
+    REFUSED,
     RTT,
     RTT_AT,
     SAMPLE_AT,
@@ -70,7 +71,7 @@ from shared.session_rows import (
 
 ROWS_MIN = 4
 """Number of rows at first. It grows by half when all are in use."""
-WAITING_S, SLOTS_MIN = 0.5, 48
+WAITING_S, SLOTS_MIN = 0.5, 60
 """Seconds for which inputs can wait in a row, and the minimum in ticks. By themselves, clients are less far ahead. A
 server that skips ticks falls behind them, until their next measurement of its time."""
 INPUTS_KEPT = 4096
@@ -298,7 +299,9 @@ class Rows:
         queue.late += self.numbers[base + LATE]
         queue.used += self.numbers[base + USED]
         queue.substituted += self.numbers[base + SUBSTITUTED]
-        self.numbers[base + LATE] = self.numbers[base + USED] = self.numbers[base + SUBSTITUTED] = 0
+        queue.refused += self.numbers[base + REFUSED]
+        for column in (LATE, USED, SUBSTITUTED, REFUSED):
+            self.numbers[base + column] = 0
 
     def taken_by(self, rows: Iterable[int]) -> dict[int, Input]:
         """Returns the inputs that `traffic.take_inputs` has taken for these rows, by entity."""

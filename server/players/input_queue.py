@@ -63,8 +63,7 @@ class InputQueue:
         `bounds.statuses` of them."""
         self.statuses = bytearray()
         """Input statuses of the ticks that are not sent yet, as on the wire. At most `bounds.statuses` of them."""
-        self.refused = 0
-        self._used = self._late = self._substituted = 0
+        self._used = self._late = self._substituted = self._refused = 0
         self.settle: Callable[[], None] | None = None
         """Adds the counts of the fast path to those here; None: the queue is not on it."""
         self.override: Input | None = None
@@ -100,6 +99,16 @@ class InputQueue:
     def substituted(self, n: int) -> None:
         self._substituted = n
 
+    @property
+    def refused(self) -> int:
+        """Number of inputs that were not accepted."""
+        self._settle()
+        return self._refused
+
+    @refused.setter
+    def refused(self, n: int) -> None:
+        self._refused = n
+
     def _settle(self) -> None:
         if self.settle is not None:
             self.settle()
@@ -116,7 +125,7 @@ class InputQueue:
         row_bytes = self._row_bytes
         for start in range(0, len(rows), row_bytes):
             if at <= self.accepted:  # a duplicate, or an order that TCP cannot produce
-                self.refused += 1
+                self._refused += 1
             else:
                 self._reach(at)
                 self.margins.append(self._filed(at, rows[start : start + row_bytes], tick, ahead))
@@ -136,12 +145,12 @@ class InputQueue:
         """
         at = self.newest + message.after
         if at > FIRST_MAX:
-            self.refused += 1
+            self._refused += 1
             return
         known = 0 <= self.accepted == self.newest
         self._reach(at)
         if not known or at > tick + self._bounds.ahead:
-            self.refused += 1
+            self._refused += 1
             self.margins.append(MARGIN_REFUSED)
             return
         self.accepted, end = at, at + self._bounds.repeats
@@ -177,7 +186,7 @@ class InputQueue:
     def _filed(self, at: int, row: bytes, tick: int, ahead: float) -> int:
         """Queues the input for the tick `at` if that is not too far ahead. Returns its margin in units of the wire."""
         if at > tick + self._bounds.ahead:
-            self.refused += 1
+            self._refused += 1
             return MARGIN_REFUSED
         self.accepted = at
         self.held_to = min(self.held_to, at - 1)

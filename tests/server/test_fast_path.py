@@ -369,17 +369,23 @@ class Steady(Peer):
             self.say_inputs(1)
 
 
-def test_sessions_stay_on_the_fast_path_while_the_server_skips_ticks() -> None:
-    crowd = Crowd(4, crowd_scene(), with_fast_path(), busy=0.0, rules=Rules(), kind=Steady)
-    game, ticks = crowd.game, 40
-    assert all(session.row >= 0 for session in game.sessions)
-    before = game.world.tick
-    for _ in range(ticks):  # it does every other one, so inputs come for ticks further and further ahead
-        for peer in crowd.peers:
-            peer.act(0.0)
-            peer.act(0.0)
-        crowd.now += 2 / game.scene.tick_rate
-        game.tick(crowd.now, crowd.now)
-    assert game.world.tick == before + ticks
-    assert min(peer.next for peer in crowd.peers) > game.world.tick + ticks
-    assert all(session.row >= 0 for session in game.sessions)
+@pytest.mark.parametrize("times", [2, 6])
+def test_sessions_stay_on_the_fast_path_while_the_server_skips_ticks(times: int) -> None:
+    crowds = [
+        Crowd(4, crowd_scene(), attach, busy=0.0, rules=Rules(), kind=Steady) for attach in (with_fast_path(), without)
+    ]
+    for crowd in crowds:
+        game, ticks = crowd.game, 40
+        before = game.world.tick
+        for _ in range(ticks):  # inputs come for ticks further and further ahead, beyond those that are accepted
+            for _ in range(times):
+                for peer in crowd.peers:
+                    peer.act(0.0)
+            crowd.now += times / game.scene.tick_rate
+            game.tick(crowd.now, crowd.now)
+        assert game.world.tick == before + ticks
+        assert min(peer.next for peer in crowd.peers) > game.world.tick + (times - 1) * ticks
+    fast, slow = crowds
+    assert all(session.row >= 0 for session in fast.game.sessions)
+    assert fast.record() == slow.record()
+    assert (fast.game.stats()["inputs_refused"] > 0) == (times > 2)
