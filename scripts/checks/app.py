@@ -25,8 +25,8 @@ CHECKS = {
 }
 LONG = "(slow or hypothesis) and not contained"
 """Markers of the tests that are longer in a long run."""
-WORKERS = {"short": "4", "long": "3"}
-"""Number of tests at a time in a short and in a long run. Long tests wait less."""
+AT_A_TIME = ("-n", "4", "--dist", "worksteal")
+"""Options of pytest that run four tests at a time."""
 
 
 def main(arguments: list[str]) -> int:
@@ -37,7 +37,7 @@ def main(arguments: list[str]) -> int:
         run("browsers", "-m", "scripts.browser_build.app", "--tests")  # without it, tests in browsers are skipped
         os.environ["PATH"] = tools.path()
     if arguments == ["--long"]:
-        steps = [*compiled(), together(LONG, "long"), in_pairs("long"), alone(LONG, "long")]
+        steps = [*compiled(), together(LONG, "long"), waiting("long"), alone(LONG, "long")]
     elif arguments == ["--all"]:
         steps = everything("not contained", "long")
     elif arguments:
@@ -46,7 +46,7 @@ def main(arguments: list[str]) -> int:
         steps = everything("not slow", "short")
     print()
     for step in steps:
-        print(f"{step.title:<14} {'failed' if step.status else 'ok':<6} {step.seconds:6.1f} s")
+        print(f"{step.title:<15} {'failed' if step.status else 'ok':<6} {step.seconds:6.1f} s")
     return int(any(step.status for step in steps))
 
 
@@ -59,8 +59,8 @@ def everything(markers: str, profile: str) -> list[Step]:
         steps += [*compiled(), together(markers, profile)]
         step, output = types.result()
     print(f"\n== {step.title}\n{output}", end="", flush=True)
-    pairs = [in_pairs(profile)] if profile == "long" else []
-    return [*steps, step, *pairs, alone(markers, profile)]
+    more = [waiting(profile)] if profile == "long" else []
+    return [*steps, step, *more, alone(markers, profile)]
 
 
 def mypy() -> tuple[Step, str]:
@@ -88,13 +88,15 @@ def compiled() -> list[Step]:
 
 def together(markers: str, profile: str) -> Step:
     """Runs several tests at a time, because many of them wait: two cores are busy all the time then."""
-    workers = ("-n", WORKERS[profile], "--dist", "worksteal")
-    return run("tests", *pytest(markers, "not paired and not alone", profile), *workers)
+    return run("tests", *pytest(markers, "not waiting and not alone", profile), *AT_A_TIME)
 
 
-def in_pairs(profile: str) -> Step:
-    """Runs tests two at a time that a busy machine disturbs. All are long ones. Many wait, so two leave enough time."""
-    return run("tests in pairs", *pytest("", "paired", profile), "-n", "2", "--dist", "worksteal", *files("paired"))
+def waiting(profile: str) -> Step:
+    """Runs tests that wait most of the time, and that a busy machine disturbs. All are long ones.
+
+    They take the processor for a third of their time, so four of them leave it enough.
+    """
+    return run("tests that wait", *pytest("", "waiting", profile), *AT_A_TIME, *files("waiting"))
 
 
 def alone(markers: str, profile: str) -> Step:

@@ -9,6 +9,7 @@ and needs nothing from outside.
 
 from __future__ import annotations
 
+import gc
 import re
 from dataclasses import dataclass
 from pathlib import Path
@@ -79,6 +80,7 @@ def numba_sources(root: Path, *, bounds: bool = False) -> list[Source]:
     scope: dict[str, Any] = {"Arrays": layout.Arrays, "int32": numba.int32, "table_at": of_word}
     scope |= {f"array_{kind}": of_array(getattr(types, name)) for kind, (name, _) in exports.ARRAYS.items()}
     made: list[Source] = []
+    gc.disable()  # Numba makes objects by the million, and a tenth of the time would go into looking at them
     for module, functions in exports.EXPORTS.items():
         compiled = jit.second_instance(root / "shared" / f"{module}.py", module + jit.COMPILED)
         for name, kinds in functions.items():
@@ -87,6 +89,7 @@ def numba_sources(root: Path, *, bounds: bool = False) -> list[Source]:
             jitted: Any = numba.njit((_words_type(),), **options)(local[name])
             result = jitted.overloads[jitted.signatures[0]]
             made.append(Source(name, result.fndesc.llvm_func_name, result.library.get_llvm_str()))
+    gc.enable()
     return made
 
 

@@ -48,7 +48,7 @@ with Client.connect(sys.argv[1], name="Ann") as client:
 
 def test_a_start_that_compiles_says_so_and_a_client_plays_meanwhile_with_equal_results(tmp_path: Path) -> None:
     first_start_and_later_ones(tmp_path)
-    remove(tmp_path, "step", "turn")  # the client has to compile these
+    remove(tmp_path, "step")  # the client has to compile it
     first_join(tmp_path)
     other = chains.elsewhere("hills", chains.TICKS, kernels.NUMBA, NUMBA_CACHE_DIR=str(tmp_path))
     assert other == f"{kernels.NUMBA} {chains.chain('hills', chains.TICKS, compiled=True)}"
