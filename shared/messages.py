@@ -276,9 +276,12 @@ def head_of(kind: type[Message]) -> bytes:
 
 _INPUTS_HEAD = head_of(Inputs)
 _SNAPSHOT_HEAD, _SNAPSHOT_KIND = b"\xdc", bytes((_KIND_OF[Snapshot],))
-pack: Callable[[Any], bytes] = msgpack.Packer().pack
+_PACKER = msgpack.Packer()
+pack: Callable[[Any], bytes] = _PACKER.pack
 """Packer of MessagePack values. It takes half the time of `msgpack.packb`, which creates a packer and a buffer for each
 message."""
+array_head: Callable[[int], bytes] = _PACKER.pack_array_header
+"""Returns the first bytes of a MessagePack array with a number of items."""
 
 
 def encode(message: Message) -> bytes:

@@ -221,6 +221,15 @@ class TickEncoder:
         due = self._due[1 : 1 + self._due[0]].tolist()
         return deltas, {(due[i], due[i + 1], due[i + 2]) for i in range(0, len(due), 3)}
 
+    def rows_in(self, segment: Cell) -> tuple[list[int], bytes]:
+        """Returns the ids of all entities in a loaded segment, ascending, and the entities packed as rows."""
+        world, w = self._world, self._world.arrays
+        if len(w.changed) >= len(self._ids):
+            self._allocate(len(w.changed))
+        end = world.kernel.muster(w.entities, w.heads, self._ids, self._packed, world.blocks.rows[segment])
+        keys = self._ids[: end // ROW_BYTES].tolist()
+        return [key >> bulk.ID_BITS for key in keys], self._packed[:end].tobytes()
+
     def _allocate(self, room: int) -> None:
         """Makes room for `room` entities."""
         self._ids, self._parts, self._due, self._packed = (
@@ -257,7 +266,7 @@ def encode_part(
         fields: records of extra columns (`shared.extras`).
     """
     packed = b"", encode_rows(rows, acted, placed)
-    return join_part(segment, ago, packed, gone, edits, check, attributes, fields)
+    return join_part(segment, ago, packed, gone, edits, check, pack(attributes) if attributes else b"", fields)
 
 
 def join_part(
@@ -267,13 +276,21 @@ def join_part(
     gone: Sequence[int] = (),
     edits: Sequence[tuple[int, int]] = (),
     check: int = 0,
-    attributes: Sequence[Any] = (),
+    attributes: bytes = b"",
     extra: bytes = b"",
 ) -> bytes:
-    """Returns a segment's part like `encode_part`, from `packed`: its turns and rows."""
+    """Returns a segment's part like `encode_part`, from `packed`: its turns and rows.
+
+    `attributes` is the field of this name, encoded already; empty: there are none.
+    """
     packed_gone = struct.pack(f"<{len(gone)}I", *gone) if gone else b""
     packed_edits = b"".join(EDIT.pack(*edit) for edit in edits) if edits else b""
-    fields = [*packed, packed_gone, check, packed_edits, attributes, extra]
+    fields = [*packed, packed_gone, check, packed_edits]
+    if attributes:
+        part = pack((*segment, ago, *fields))
+        more = (attributes, pack(extra)) if extra else (attributes,)
+        return b"".join((bytes((part[0] + len(more),)), part[1:], *more))  # the first byte has the number of fields
+    fields += [], extra
     while fields and not fields[-1]:
         del fields[-1]
     return pack((*segment, ago, *fields))

@@ -7,21 +7,19 @@ changed in these ticks. A client that is further behind than changes are kept, o
 keyframe of it. Nothing is computed per entity and client.
 """
 
-import contextlib
 from collections import defaultdict
 from collections.abc import Collection, Mapping
-from itertools import accumulate
+from itertools import accumulate, chain
 from typing import Any
 
 from server.observability.errors import FaultReporter
-from server.replication.segment_rows import in_segments
 from shared import messages
 from shared.blocks import offset_of, pack, segment_of
 from shared.bounds import bounds, in_ticks
 from shared.checks import Cell
-from shared.layout import ID, TEMPLATE, Int64s, X
+from shared.layout import ID, TEMPLATE, X
 from shared.ring import Ring
-from shared.snapshot import KEYFRAME, ROW_BYTES, SegmentDelta, TickEncoder, checksum, encode_rows, join_part
+from shared.snapshot import KEYFRAME, SegmentDelta, TickEncoder, checksum, encode_rows, join_part
 from shared.states import STATES
 from shared.units import TO_SEGMENT
 from shared.world import World
@@ -103,6 +101,26 @@ class DeltaCache(dict[Cell, bytes]):
         return made[1], made[2]
 
 
+class Labels(dict[int, tuple[bytes, ...]]):
+    """The number and the attributes of each entity, encoded when they are first used; empty: it has none.
+
+    Args:
+        attributes: the attributes by entity.
+        named: entities that have had attributes, which a client may still know.
+    """
+
+    def __init__(self, attributes: Mapping[int, Mapping[str, Any]], named: Collection[int]) -> None:
+        self._attributes, self._named = attributes, named
+
+    def __missing__(self, entity: int) -> tuple[bytes, ...]:
+        values = self._attributes.get(entity)
+        label: tuple[bytes, ...] = ()
+        if values is not None or entity in self._named:
+            label = messages.pack(entity), messages.pack(values or {})
+        self[entity] = label
+        return label
+
+
 class ChangeLog:
     """The changes of one world in the latest ticks. Call `record` once per tick, after the step; then `since`.
 
@@ -125,6 +143,7 @@ class ChangeLog:
         """Entities whose attributes are to be sent with the coming step."""
         self._named: set[int] = set()
         """Entities that have had attributes, in scenes where numbers are used again: a client may still know them."""
+        self._labels = Labels(self._attributes, self._named)
         self.history = bounds(world.scene.tick_rate).history
         """Number of ticks for which changes are kept."""
         self._ticks: Ring[_Tick] = Ring(self.history)
@@ -171,6 +190,7 @@ class ChangeLog:
     def note_removal(self, entity: int) -> None:
         """Notes that an entity was removed before the coming step."""
         self._latest = None
+        self._labels.pop(entity, None)
         home = self._home.pop(entity, None)
         if home is not None:
             self._now.gone[home].append(entity)
@@ -216,6 +236,8 @@ class ChangeLog:
                     self.moved.append(entity)
                     if entity in self._attributes or (home is None and entity in self._named):
                         now.attributes[segment].add(entity)
+        for entity in self._attributes_changed:
+            self._labels.pop(entity, None)
         for entity in self._attributes_changed & homes.keys():
             now.attributes[homes[entity]].add(entity)
             if self._world.extras.spawns:
@@ -282,43 +304,17 @@ class ChangeLog:
             kept = self._packed[segment] = (version, pack(self._world.blocks.segment(segment)))
         return kept[1]
 
-    def keyframes(self, segments: Collection[Cell]) -> DeltaCache:
-        """Returns the keyframes, as `since` does. It encodes those of the given segments together."""
-        known, blocks = self.since(KEYFRAME), self._world.blocks
-        new = [segment for segment in segments if segment not in known and segment in blocks]
-        if len(new) > 1:
-            with contextlib.suppress(Exception):  # each is encoded alone then, and the wrong one is reported
-                known.update(self._keyframes(new))
-        return known
-
     def _keyframe(self, segment: Cell) -> bytes:
-        if segment in self._world.blocks:
-            return self._keyframes([segment])[segment]
-        strays = [entity for entity, home in self._home.items() if home == segment]
-        return self._encoded([segment], self._world.rows(sorted(strays)), [len(strays)])[segment]
-
-    def _keyframes(self, segments: list[Cell]) -> dict[Cell, bytes]:
-        """Returns the keyframes of loaded segments."""
-        return self._encoded(segments, *in_segments(self._world, segments))
-
-    def _encoded(self, segments: list[Cell], rows: Int64s, counts: list[int]) -> dict[Cell, bytes]:
-        """Returns the keyframes of segments.
-
-        Args:
-            segments: the segments.
-            rows: their entities, one segment after the other.
-            counts: number of the entities of each.
-        """
-        ids, packed, at, parts = rows[:, ID].tolist(), encode_rows(rows, placed=self._placed_lately()), 0, {}
-        for segment, count in zip(segments, counts, strict=True):
-            end = at + count
-            fields = b"".join(map(self._fields_of, ids[at:end])) if self._world.extras.count else b""
-            changes = b"", packed[at * ROW_BYTES : end * ROW_BYTES]
-            parts[segment] = join_part(
-                segment, KEYFRAME, changes, attributes=self._of(ids[at:end]) if count else (), extra=fields
-            )
-            at = end
-        return parts
+        world = self._world
+        if segment in world.blocks:
+            ids, packed = self._encoder.rows_in(segment)
+        else:
+            ids = sorted(entity for entity, home in self._home.items() if home == segment)
+            packed = encode_rows(world.rows(ids))
+        if placed := self._placed_lately().intersection(ids):
+            packed = encode_rows(world.rows(ids), placed=placed)
+        fields = b"".join(map(self._fields_of, ids)) if world.extras.count else b""
+        return join_part(segment, KEYFRAME, (b"", packed), attributes=self._of(ids), extra=fields)
 
     def _placed_lately(self) -> set[int]:
         """Returns the entities placed in the last `history` ticks. A client may still know their former positions."""
@@ -360,20 +356,21 @@ class ChangeLog:
         ]
         return b"".join(records)
 
-    def _of(self, entities: list[int]) -> list[Any]:
-        """Returns the attributes of entities as on the wire. Those beyond `ATTRIBUTE_BYTES` wait for the next tick."""
-        tables = [
-            (entity, self._attributes.get(entity, {}))
-            for entity in entities
-            if entity in self._attributes or entity in self._named
-        ]
-        most = ATTRIBUTE_BYTES - ENTITY_BYTES * len(tables)
-        if len(tables) > FEW_ENTITIES and len(messages.pack([values for _, values in tables])) > most:
-            ends = accumulate(len(messages.pack(values)) + ENTITY_BYTES for _, values in tables)
+    def _of(self, entities: list[int]) -> bytes:
+        """Returns the field `attributes` of entities, encoded; empty if they have none.
+
+        The attributes beyond `ATTRIBUTE_BYTES` wait for the next tick.
+        """
+        labels = self._labels
+        named = [entity for entity in entities if labels[entity]]
+        packed = b"".join(chain.from_iterable(map(labels.__getitem__, named)))
+        if len(named) > FEW_ENTITIES and len(packed) + ENTITY_BYTES * len(named) > ATTRIBUTE_BYTES:
+            ends = accumulate(len(labels[entity][1]) + ENTITY_BYTES for entity in named)
             fits = max(sum(end <= ATTRIBUTE_BYTES for end in ends), 1)
-            self._attributes_changed.update(entity for entity, _ in tables[fits:])
-            del tables[fits:]
-        return [part for pair in tables for part in pair]
+            self._attributes_changed.update(named[fits:])
+            del named[fits:]
+            packed = b"".join(chain.from_iterable(map(labels.__getitem__, named)))
+        return messages.array_head(2 * len(named)) + packed if named else b""
 
     def _packed_since(self, segment: Cell, since: int, ticks: list[_Tick]) -> tuple[bytes, bytes]:
         """Returns the packed changes (turns, rows) of the entities that changed and are still in the segment."""

@@ -121,12 +121,7 @@ class ClientView:
                 return n, plain
         special = self._behind | dict.fromkeys(self._fresh, KEYFRAME)
         due = special | {segment: self.tick for segment in self.sees - special.keys() if deltas[segment]}
-        keyframes = log.keyframes(self._fresh) if self._fresh else deltas
-        parts = {
-            segment: part
-            for segment, since in due.items()
-            if (part := (keyframes if since == KEYFRAME else log.since(since))[segment])
-        }
+        parts = {segment: part for segment, since in due.items() if (part := log.since(since)[segment])}
         if sum(map(len, parts.values())) > room:
             parts = self._urgent(parts, due, tick, log.history, room)
         if self._fresh or self.drops:

@@ -1,6 +1,5 @@
 """The parts of a client's snapshot where not everything fits."""
 
-from collections.abc import Collection
 from itertools import groupby
 
 import pytest
@@ -27,9 +26,6 @@ class Log:
 
     def since(self, since: int) -> "Parts":
         return Parts(self, since)
-
-    def keyframes(self, segments: Collection[Cell]) -> "Parts":
-        return self.since(KEYFRAME)
 
 
 class Parts:

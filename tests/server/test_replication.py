@@ -12,7 +12,6 @@ from server.config.limits import Limits
 from server.game import Game
 from server.game.session import Session
 from server.replication.change_log import PACKS_PER_TICK, ChangeLog
-from server.replication.segment_rows import in_segments
 from shared.blocks import Kinds, unpack
 from shared.bounds import bounds
 from shared.checks import Cell
@@ -20,7 +19,7 @@ from shared.inputs import Input
 from shared.layout import FALLING, FLAGS, ID
 from shared.messages import VERSION, Announce, Hello, Resync, Snapshot, Terrain, Welcome, decode_from_server, encode
 from shared.scene import Scene
-from shared.snapshot import ACTED, KEYFRAME, PLACED, decode_parts
+from shared.snapshot import ACTED, KEYFRAME, PLACED, decode_parts, encode_part
 from shared.units import BLOCK, SEGMENT
 from shared.world import OverlapError, World
 from tests.lengths import long_but
@@ -491,35 +490,38 @@ def test_a_client_equals_the_server_with_any_skips_and_any_interest(seed: int) -
     assert recorded.game.counters.snapshots_skipped > 50
 
 
-def test_keyframes_that_are_encoded_together_are_those_that_are_encoded_alone() -> None:
+def test_a_keyframe_has_the_entities_of_its_segment_with_their_attributes() -> None:
     rng = random.Random(11)
     world = build([floor()], player="person", spawns=((0.0, 0.0, 0.0),))
     attributes: dict[int, dict[str, Any]] = {}
-    together, alone = ChangeLog(world, attributes), ChangeLog(world, attributes)
+    log, placed = ChangeLog(world, attributes), set[int]()
     for _ in range(70):
         with contextlib.suppress(OverlapError):
             entity = world.spawn("person", (rng.uniform(-30, 30), rng.uniform(-30, 30), 4.0 * rng.randint(0, 3)))
             attributes[entity] = {"name": f"player {entity}"}
-    for entity in list(attributes)[::7]:
-        world.remove(entity)
-        del attributes[entity]
-    segments = [*world.blocks, (99, 0, 0)]
-    for _ in range(4):
+    for _ in range(6):
         world.step()
-        for entity in attributes:
-            if rng.random() < 0.2:
+        log.record()
+        keyframes = log.since(KEYFRAME)
+        for segment in world.blocks:
+            rows = world.in_segment(segment)
+            named = [entity for entity in rows[:, ID].tolist() if entity in attributes]
+            tables = [part for entity in named for part in (entity, attributes[entity])]
+            assert keyframes[segment] == encode_part(segment, KEYFRAME, rows, placed=placed, attributes=tables)
+        assert keyframes[(99, 0, 0)] == encode_part((99, 0, 0), KEYFRAME, world.rows([]))
+        for entity in rng.sample(sorted(attributes), 20):
+            act = rng.randrange(4)
+            if act == 0:
                 with contextlib.suppress(OverlapError):
                     world.place(entity, (rng.uniform(-30, 30), rng.uniform(-30, 30), 20.0))
-        together.record()
-        alone.record()
-        rng.shuffle(segments)
-        some = segments[: rng.randint(2, len(segments))]
-        found = together.keyframes(some)
-        assert [found[segment] for segment in segments] == [alone.since(KEYFRAME)[segment] for segment in segments]
-        assert [alone.encode(segment, KEYFRAME) for segment in segments] == [found[segment] for segment in segments]
-        rows, counts = in_segments(world, list(world.blocks))
-        assert rows.tolist() == [row for segment in world.blocks for row in world.in_segment(segment).tolist()]
-        assert sum(counts) == len(rows) == len(world)
+                    placed.add(entity)
+            elif act == 1:
+                world.remove(entity)
+                del attributes[entity]
+                log.note_removal(entity)
+            else:
+                attributes[entity] = {"name": "another", "score": rng.randrange(300)} if act == 2 else {}
+                log.note_attributes(entity)
 
 
 def test_a_keyframe_that_cannot_be_encoded_leaves_the_others() -> None:
@@ -528,5 +530,5 @@ def test_a_keyframe_that_cannot_be_encoded_leaves_the_others() -> None:
     log = ChangeLog(world, {entity: {"wrong": object()}})
     world.step()
     log.record()
-    parts = log.keyframes(list(world.blocks))
+    parts = log.since(KEYFRAME)
     assert {segment for segment in world.blocks if not parts[segment]} == {log.segment(entity)}
