@@ -242,8 +242,8 @@ class InputLoop:
         if not arrivals or self._settling is not None:
             return
         needs = [(arrival.tick, arrival.need) for arrival in arrivals]
-        before, last = self._observed[connection]
-        for tick, need in self._sent.filled(needs, before, last):
+        clock, (before, last) = self.world.clock, self._observed[connection]
+        for tick, need in self._sent.filled(needs, before, last, clock.rtt_s * clock.rate):
             self._lead.observe(tick, 0.0, need, now)
         self._observed[connection] = needs[-1]
 

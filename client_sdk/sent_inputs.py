@@ -1,16 +1,16 @@
 """The inputs that a client has sent, by tick: the messages for new ones, and what a snapshot says about earlier ones.
 
-Theory of operation. A changed input is sent in its tick. One that stays the same is not: in the tick after a change,
-and then every `RENEW_S` seconds, a `Held` of 4 bytes says that it holds for the next `Bounds.repeats` ticks. A later
-input replaces it at once, so nothing is sent later than in a message per tick. The server uses the same input in every
-tick as if it had got one for each. Two things differ. There is an arrival margin per message, not per tick. And where
-an input changes while the one before holds, the server does not miss a late message: the status of the tick is USED
-although the input before was used (`replaced`). The margin says so. It may come in a snapshot after that of the status
-or, from an edge of a cluster, in one before.
+Theory of operation. A changed input is sent in its tick. One that stays the same is not: a `Held` of 4 bytes says that
+it holds for the next `Bounds.repeats` ticks. There is one in every tick until the server has the change, and then one
+every `RENEW_S` seconds. A later input replaces it at once, so nothing is sent later than in a message per tick. The
+server uses the same input in every tick as if it had got one for each. Two things differ. There is an arrival margin
+per message, not per tick. And where an input changes while the one before holds, the server does not miss a late
+message: the status of the tick is USED although the input before was used (`replaced`). The margin says so. It may come
+in a snapshot after that of the status or, from an edge of a cluster, in one before.
 
-TCP detects a lost message by the answer to the next one. So the loss of a `Held` delays it for longer than in a message
-per tick, by the time until the next one is sent. A changed input does not meet that delay: it is itself the next
-message, or a `Held` follows it in the next tick. The lead is for changed inputs, so it does not count (`filled`).
+TCP detects a lost message by the answer to a later one. So the loss of a `Held` delays it for longer than in a message
+per tick, by the time until the next one is sent. A changed input does not meet that delay, because there is a message
+in every tick after it. The lead is for changed inputs, so it does not count (`filled`).
 """
 
 import math
@@ -30,6 +30,9 @@ RENEW_S = 0.0625
 PRICE_S = 2 * priced.PRICE_S
 """Price of all inputs being late, in seconds of lead. With half as many messages, half as many are lost. With twice the
 price, the lead covers the same losses as with a message per tick."""
+DETECTED_RTT = 1.25
+"""Round trips from the arrival of the message that reveals a loss to that of the lost one: one, and a quarter in which
+TCP waits for packets that have only changed places (RFC 8985, section 6.2)."""
 CHANGED, RENEWED, QUIET = range(3)
 """Kinds of ticks by what was sent for them: the input; that the input before holds; nothing."""
 
@@ -65,7 +68,7 @@ class SentInputs:
         self._bounds, self._row_bytes = bounds(rate), row_bytes
         self.renew = in_ticks(RENEW_S, rate, 1)
         """Number of ticks after which an input that stays the same is sent again."""
-        self._due = self._newest = self._changed = 0
+        self._due = self._newest = self._changed = self._received = 0
         self.restart()
         self.forget()
 
@@ -109,7 +112,8 @@ class SentInputs:
             self._sent.put(tick, (phase, RENEWED if tick == at else QUIET, self._changed))
         if at > to:
             return []
-        after, self._newest, self._due = at - self._newest, at, max(at + self.renew, to + 1)
+        renew = self.renew if self._received >= self._changed else 1
+        after, self._newest, self._due = at - self._newest, at, max(at + renew, to + 1)
         return [Held(after, at - acked)]
 
     def has(self, tick: int) -> bool:
@@ -121,19 +125,28 @@ class SentInputs:
         sent = self._sent.get(tick)
         return sent is not None and sent[1] == CHANGED
 
-    def filled(self, needs: Sequence[tuple[int, float]], before: int, last: float) -> Iterator[tuple[int, float]]:
+    def filled(
+        self, needs: Sequence[tuple[int, float]], before: int, last: float, rtt: float
+    ) -> Iterator[tuple[int, float]]:
         """Yields the needs of messages, and of the ticks between them for which nothing was sent.
 
-        Where one snapshot reports several, they have arrived together: then a message per tick would have ended the
-        delay earlier, by the ticks until the next message.
+        Messages that have arrived together waited for the first of them, which was lost. If the second one revealed
+        that, a message per tick would have ended the delay earlier, by the ticks between the two. If the second one was
+        lost as well, the line was out, and for how long does not depend on the messages.
 
         Args:
             needs: ticks and needs of the messages that a snapshot reports.
             before, last: tick and need of the latest message before them.
+            rtt: round trip in ticks.
         """
+        least, revealed = min((need for _, need in needs), default=0.0), True
         for i, (tick, need) in enumerate(needs):
             if i + 1 < len(needs) and self.quiet(tick + 1, needs[i + 1][0]):
-                need = min(need, needs[i + 1][1] + needs[i + 1][0] - tick - 1)
+                after, gap = needs[i + 1][1], needs[i + 1][0] - tick
+                together = need > after + gap - 1
+                revealed = not together or (revealed and after - least <= DETECTED_RTT * rtt + gap / 2)
+                if together and revealed:
+                    need = after + gap - 1
             gap = tick - before
             if gap <= self._bounds.repeats and self.quiet(before + 1, tick):
                 for k in range(1, gap):
@@ -148,7 +161,7 @@ class SentInputs:
         )
 
     def arrived(self, snapshot: Snapshot, connection: int = 0) -> list[Arrival]:
-        """Takes the arrival margins of a snapshot: notes which changed inputs were late, or that one was refused.
+        """Takes from a snapshot up to which tick inputs have arrived, and the margins: which changed ones were late.
 
         Args:
             snapshot: the snapshot.
@@ -157,6 +170,8 @@ class SentInputs:
         Returns:
             The arrivals of messages that were sent.
         """
+        if not connection:
+            self._received = snapshot.newest
         arrivals, one = [], self._bounds.margin_one
         for tick, margin in margins_of(snapshot):
             sent = self._sent.get(tick)

@@ -43,8 +43,20 @@ SLOT_S = 0.001
 """Length of a slot in seconds. Each client sends in one slot of every tick."""
 CATCH_UP_SLOTS = 16
 """Most slots that are due and run without reading messages in between."""
-ARRAY16, UINT16, UINT32 = 0xDC, 0xCD, 0xCE
+ARRAY16, UINT8, UINT16, UINT32 = 0xDC, 0xCC, 0xCD, 0xCE
 SNAPSHOT, TERRAIN, WELCOME, PONG = 18, 19, 17, 20
+
+
+def number(data: bytes, at: int) -> tuple[int, int]:
+    """Returns a number as MessagePack packs it, from -1 to 2³² - 1, and where the next value begins."""
+    form = data[at]
+    if form == UINT32:
+        return int.from_bytes(data[at + 1 : at + 5], "big"), at + 5
+    if form == UINT16:
+        return data[at + 1] << 8 | data[at + 2], at + 3
+    if form == UINT8:
+        return data[at + 1], at + 2
+    return (form, at + 1) if form < 0x80 else (-1, at + 1)
 
 
 class Swarm:
@@ -120,14 +132,8 @@ class Swarm:
     def take(self, player: Player, data: bytes, start: int, end: int, now: float) -> None:
         """Handles one message."""
         if data[start] == ARRAY16:
-            form = data[start + 4]
-            if form == UINT32:
-                tick = int.from_bytes(data[start + 5 : start + 9], "big")
-            elif form == UINT16:
-                tick = data[start + 5] << 8 | data[start + 6]
-            else:
-                tick = data[start + 5] if form == 0xCC else form
-            player.acked = tick
+            tick, after = number(data, start + 4)
+            player.acked, player.received = tick, number(data, after)[0]
             player.snapshots += 1
             if player.time.tick_0 > -math.inf:
                 age_ms = int((now * self.rate + player.time.tick_0 - tick) / self.rate * 1e3)
@@ -165,10 +171,10 @@ class Swarm:
         self.inputs += n
         if row != player.row or n > self.repeats or player.acked > due:
             message: Message = Inputs(due - n + 1, player.acked, row * n)
-            player.row, player.due = row, due + 1
+            player.row, player.due, player.changed = row, due + 1, due
         elif due >= player.due:
             message = Held(due - player.said, due - player.acked)
-            player.due = due + self.renew
+            player.due = due + (self.renew if player.received >= player.changed else 1)
         else:
             return
         player.said = due

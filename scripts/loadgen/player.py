@@ -55,8 +55,8 @@ class Player:
     """A player with its connection to a path of the server."""
 
     __slots__ = (
-        "acked", "buffer", "due", "move", "number", "open", "phase", "pinged", "rng", "row", "said", "sent",
-        "snapshots", "sock", "time",
+        "acked", "buffer", "changed", "due", "move", "number", "open", "phase", "pinged", "received", "rng", "row",
+        "said", "sent", "snapshots", "sock", "time",
     )  # fmt: skip
 
     def __init__(self, number: int, port: int, seed: int, path: str, time: WorldTime) -> None:
@@ -70,6 +70,8 @@ class Player:
         self.buffer = b""
         self.open = False
         self.acked = self.sent = -1
+        self.changed = self.received = -1
+        """Newest tick of a changed input, and newest tick of an input that the server has received."""
         self.said = self.due = -1
         """Newest tick of a message with inputs, and that of the next one if the input stays the same."""
         self.row = b""

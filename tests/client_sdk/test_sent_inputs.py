@@ -13,11 +13,21 @@ EAST, NORTH = row(Input(127)), row(Input(0, 127))
 ONE = round(bounds(32).margin_one)
 
 
-def played(rows: str, sent: SentInputs | None = None, first: int = 1) -> dict[int, list[Inputs | Held]]:
-    """Returns what is sent in each tick for inputs by letter."""
+def snapshot(first: int, statuses: list[int], newest: int, *margins: int) -> Snapshot:
+    packed = b"".join(margin.to_bytes(2, "little", signed=True) for margin in margins)
+    return Snapshot(first + len(statuses) - 1, newest, packed, first, bytes(statuses), b"", b"", ())
+
+
+def played(
+    rows: str, sent: SentInputs | None = None, first: int = 1, received: int | None = None
+) -> dict[int, list[Inputs | Held]]:
+    """Returns what is sent in each tick for inputs by letter; `received`: newest tick that has arrived (None: all)."""
     sent = sent or SentInputs(32, 3)
-    kinds = {"e": EAST, "n": NORTH}
-    return {tick: sent.send(tick, kinds[letter], [0.0], 0) for tick, letter in enumerate(rows, first)}  # type: ignore[misc]
+    kinds, told = {"e": EAST, "n": NORTH}, {}
+    for tick, letter in enumerate(rows, first):
+        sent.arrived(snapshot(tick, [], tick - 1 if received is None else received))
+        told[tick] = sent.send(tick, kinds[letter], [0.0], 0)
+    return told  # type: ignore[return-value]
 
 
 def test_an_input_that_stays_the_same_is_sent_every_second_tick_in_4_bytes() -> None:
@@ -34,6 +44,26 @@ def test_an_input_that_stays_the_same_is_sent_every_second_tick_in_4_bytes() -> 
     assert len(encode(Held(2, 40))) == 4
 
 
+def test_an_input_that_the_server_may_lack_holds_by_a_message_in_every_tick() -> None:
+    sent = SentInputs(32, 3)
+    played("ee", sent)
+    told = played("nnnn", sent, 3, received=2) | played("nnnn", sent, 7, received=3)
+    assert told == {
+        3: [Inputs(3, 0, NORTH)],
+        **{tick: [Held(1, tick)] for tick in (4, 5, 6, 7)},
+        8: [],
+        9: [Held(2, 9)],
+        10: [],
+    }
+
+
+def test_what_arrives_over_a_second_connection_may_be_missing_over_the_first() -> None:
+    sent = SentInputs(32, 3)
+    sent.send(1, EAST, [0.0], 0)
+    sent.arrived(snapshot(1, [], 1), 1)
+    assert played("eee", sent, 2, received=0) == {tick: [Held(1, tick)] for tick in (2, 3, 4)}
+
+
 def test_inputs_that_change_in_every_tick_are_sent_as_before() -> None:
     assert played("enene") == {at: [Inputs(at, 0, EAST if at % 2 else NORTH)] for at in range(1, 6)}
 
@@ -41,7 +71,10 @@ def test_inputs_that_change_in_every_tick_are_sent_as_before() -> None:
 @pytest.mark.parametrize("rate", [1, 8, 20, 23, 30, 32, 60, 120, 240])
 def test_at_most_16_messages_a_second_and_each_holds_until_the_next(rate: int) -> None:
     sent, holds = SentInputs(rate, 3), bounds(rate).repeats
-    told = [tick for tick in range(1, 10 * rate + 1) if sent.send(tick, EAST, [0.0], 0)]
+    told = list[int]()
+    for tick in range(1, 10 * rate + 1):
+        told += [tick] * len(sent.send(tick, EAST, [0.0], 0))
+        sent.arrived(snapshot(tick, [], tick))
     assert len(told) <= max(16 * 10, 1) + 2
     assert all(later - one <= holds for one, later in pairwise(told))
 
@@ -49,6 +82,7 @@ def test_at_most_16_messages_a_second_and_each_holds_until_the_next(rate: int) -
 def test_a_slow_program_says_for_several_ticks_at_once_that_an_input_holds() -> None:
     sent = SentInputs(32, 3)
     assert sent.send(1, EAST * 5, [0.0] * 5, 0) == [Inputs(1, 0, EAST * 5)]
+    sent.arrived(snapshot(1, [], 5))
     assert sent.send(6, EAST * 5, [0.0] * 5, 0) == [Held(1, 6)]
     assert sent.send(11, EAST * 5, [0.0] * 5, 0) == [Held(5, 11)]
     assert sent.send(16, EAST * 40, [0.0] * 40, 0) == [
@@ -69,11 +103,6 @@ def test_a_client_behind_the_server_sends_its_inputs_themselves() -> None:
     sent = SentInputs(32, 3)
     sent.send(1, EAST, [0.0], 5)
     assert sent.send(2, EAST, [0.0], 5) == [Inputs(2, 5, EAST)]
-
-
-def snapshot(first: int, statuses: list[int], newest: int, *margins: int) -> Snapshot:
-    packed = b"".join(margin.to_bytes(2, "little", signed=True) for margin in margins)
-    return Snapshot(first + len(statuses) - 1, newest, packed, first, bytes(statuses), b"", b"", ())
 
 
 def replaced(sent: SentInputs, told: Snapshot) -> int:
@@ -130,14 +159,23 @@ def test_a_second_connection_has_margins_of_its_own() -> None:
 def test_ticks_without_a_message_get_needs_between_those_around_them() -> None:
     sent = SentInputs(32, 3)
     played("eeeeee", sent)
-    assert list(sent.filled([(1, 5.0), (2, 6.0)], -1, 0.0)) == [(1, 5.0), (2, 6.0)]
-    assert list(sent.filled([(4, 7.0)], 2, 6.0)) == [(3, 6.5), (4, 7.0)]
-    assert list(sent.filled([(6, 7.0)], 2, 6.0)) == [(6, 7.0)], "it is not known what became of tick 4"
+    assert list(sent.filled([(1, 5.0), (2, 6.0)], -1, 0.0, 3.0)) == [(1, 5.0), (2, 6.0)]
+    assert list(sent.filled([(4, 7.0)], 2, 6.0, 3.0)) == [(3, 6.5), (4, 7.0)]
+    assert list(sent.filled([(6, 7.0)], 2, 6.0, 3.0)) == [(6, 7.0)], "it is not known what became of tick 4"
 
 
 def test_a_stall_is_as_long_as_with_a_message_per_tick() -> None:
     sent = SentInputs(32, 3)
     played("eeeeeeee", sent)
-    # Ticks 4, 6 and 8 arrive together. A message for tick 5 would have ended the stall a tick earlier.
-    told = list(sent.filled([(4, 9.0), (6, 7.0), (8, 5.0)], 2, 1.0))
+    # Ticks 4, 6 and 8 arrive together: that of tick 6 has revealed the loss of tick 4, a round trip before.
+    # A message for tick 5 would have ended the stall a tick earlier.
+    told = list(sent.filled([(4, 9.0), (6, 7.0), (8, 5.0)], 2, 1.0, 2.0))
     assert told == [(3, 4.5), (4, 8.0), (5, 7.0), (6, 6.0), (7, 5.5), (8, 5.0)]
+
+
+def test_an_outage_is_as_long_as_the_messages_in_it_say() -> None:
+    sent = SentInputs(32, 3)
+    played("eeeeeeee", sent)
+    # A round trip takes less than tick 6 was late by, so tick 6 was lost, too. That of tick 8 has revealed both.
+    told = list(sent.filled([(4, 9.0), (6, 7.0), (8, 5.0)], 2, 1.0, 0.5))
+    assert told == [(3, 5.0), (4, 9.0), (5, 8.0), (6, 7.0), (7, 6.0), (8, 5.0)]

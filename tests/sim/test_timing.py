@@ -134,6 +134,22 @@ def test_a_match_is_as_late_as_the_league_says(preset: str, most: float) -> None
     assert abs(whole - lean) <= 0.006
 
 
+def turning(core: Core, rng: random.Random) -> Input:
+    """Walks, and turns every tenth of a second to half a second."""
+    return Input(127, rng.randrange(100)) if rng.random() < 0.125 else core.input
+
+
+@pytest.mark.parametrize("seed", [1, *long(2, 3, 4)])
+def test_where_inputs_hold_for_some_ticks_the_lead_covers_an_outage_as_well(seed: int) -> None:
+    match = Match(load_scene("flat"), seed)
+    players = [match.join(turning, PRESETS["outage"]) for _ in range(2)]
+    match.run_until(lambda: all(player.core.state == "playing" for player in players), 20)
+    match.run(30)
+    before = sum(player.core.stats.inputs_late for player in players)
+    match.run(40)
+    assert sum(player.core.stats.inputs_late for player in players) == before
+
+
 @pytest.mark.slow
 @pytest.mark.longest
 @pytest.mark.parametrize("preset", ["typical", "far"])
