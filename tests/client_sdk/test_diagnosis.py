@@ -59,7 +59,7 @@ def test_wrong_use_is_named() -> None:
 
 def test_corrections_are_kept_with_their_times() -> None:
     match = Match(load_scene("arena"), seed=3)
-    player, _ = (match.join(wander, PRESETS["wifi"]) for _ in range(2))
+    player, _ = (match.join(wander, PRESETS["far"]) for _ in range(2))
     match.run(30)
     stats = player.core.stats
     assert [each.blocks for each in stats.correction_times] == stats.correction_blocks != []

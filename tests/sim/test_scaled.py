@@ -487,15 +487,15 @@ def test_kills_while_players_move_between_edges(seed: int) -> None:
     hashes_agree(match)
 
 
-@pytest.mark.parametrize("seed", [3, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(4, 8))])
+@pytest.mark.parametrize("seed", [4, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(5, 9))])
 def test_a_client_knows_of_a_late_change_although_its_margin_comes_before_the_record_of_its_tick(seed: int) -> None:
     match = ScaledMatch(load_scene("hills"), seed, edges=1, standbys=0)
 
     def turns(core: Core, rng: random.Random) -> Input:
         return make_input(rng.uniform(-1, 1), rng.uniform(-1, 1)) if rng.random() < 0.15 else core.input
 
-    player = match.join(turns, Link(delay_s=0.03, jitter_s=0.02, loss=0.03))
-    for _ in range(40):
+    player = match.join(turns, Link(delay_s=0.03, jitter_s=0.02, loss=0.1))
+    for _ in range(60):
         match.bus.hold("log", match.edges[0].name, 0.15)
         match.run(0.25)
     assert player.core.stats.inputs_substituted >= player.core.stats.inputs_late > 0
