@@ -13,6 +13,8 @@ from websockets.http11 import Request
 from websockets.protocol import Event
 from websockets.server import ServerProtocol
 
+from tests.patience import PATIENCE_S
+
 ROOT = Path(__file__).resolve().parents[2]
 
 
@@ -29,7 +31,7 @@ def real_server(
             assert line.startswith("listening on "), "the server did not start"
             yield line.split()[-1]
             process.terminate()
-            assert process.wait(10) == 0
+            assert process.wait(PATIENCE_S) == 0
         finally:
             if process.poll() is None:
                 process.kill()
@@ -68,17 +70,17 @@ def scripted_server(*scripts: Callable[[socket.socket], object]) -> Iterator[str
             for script in scripts:
                 sock, _ = listener.accept()
                 with sock:
-                    sock.settimeout(10)
+                    sock.settimeout(PATIENCE_S)
                     script(sock)
         except BaseException as error:
             failed.append(error)
 
     with socket.create_server(("127.0.0.1", 0)) as listener:
-        listener.settimeout(10)
+        listener.settimeout(PATIENCE_S)
         thread = threading.Thread(target=serve)
         thread.start()
         yield f"ws://127.0.0.1:{listener.getsockname()[1]}"
-        thread.join(10)
+        thread.join(PATIENCE_S)
     assert not failed, failed
 
 
@@ -108,7 +110,7 @@ def silent_server() -> Iterator[str]:
 
     def script(sock: socket.socket) -> None:
         accept(sock)
-        over.wait(20)
+        over.wait(PATIENCE_S)
 
     with scripted_server(script) as url:
         try:

@@ -19,6 +19,7 @@ from client_sdk.transports.common import TIMEOUT_S, ConnectError
 from shared import messages
 from tests.client_sdk.servers import accept, real_server, request, scripted_server, silent_server
 from tests.lengths import long
+from tests.patience import PATIENCE_S
 
 pytestmark = pytest.mark.e2e
 
@@ -34,12 +35,12 @@ def url() -> Iterator[str]:
 
 @pytest.fixture(params=LOOPS)
 def run(request: pytest.FixtureRequest) -> Run:
-    """Runs a coroutine for at most 30 s; the test runs once with each kind of event loop."""
+    """Runs a coroutine with patience; the test runs once with each kind of event loop."""
 
     def limited(coroutine: Coroutine[Any, Any, None]) -> None:
         factory = pytest.importorskip("uvloop").new_event_loop if request.param == "uvloop" else None
         with asyncio.Runner(loop_factory=factory) as runner:
-            runner.run(asyncio.wait_for(coroutine, 30))
+            runner.run(asyncio.wait_for(coroutine, PATIENCE_S))
 
     return limited
 
@@ -143,7 +144,7 @@ def test_a_server_that_stops_reading_is_left(run: Run) -> None:
     def script(sock: socket.socket) -> None:
         sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
         accept(sock)
-        over.wait(20)
+        over.wait(PATIENCE_S)
 
     async def scene() -> None:
         client = await AsyncClient.connect(address)
@@ -191,7 +192,7 @@ def test_silence_ends_in_time(run: Run) -> None:
             await AsyncClient.connect(address, timeout=0.3)
         over.set()
 
-    with scripted_server(lambda _: over.wait(20)) as address:
+    with scripted_server(lambda _: over.wait(PATIENCE_S)) as address:
         run(scene())
 
 

@@ -23,6 +23,7 @@ from shared.scene import load_scene
 from sovereign_netcode.playtest import Match, wander
 from tests.client_sdk.servers import ROOT, real_server
 from tests.lengths import long
+from tests.patience import PATIENCE_S
 
 FAR = Link(0.125)
 SOON = 2**-20
@@ -197,7 +198,7 @@ def test_an_empty_message_is_malformed_as_without_a_link() -> None:
 @pytest.mark.e2e
 def test_over_real_sockets() -> None:
     def until(client: Client, so: Callable[[], bool]) -> None:
-        deadline = time.monotonic() + 20
+        deadline = time.monotonic() + PATIENCE_S
         while not so():
             assert time.monotonic() < deadline
             client.poll()
@@ -221,7 +222,7 @@ def test_over_real_sockets() -> None:
             goal = client.stats.snapshots + 10
             until(client, lambda: client.stats.snapshots > goal)
             client.link = None
-        asyncio.run(asyncio.wait_for(scene(), 20))
+        asyncio.run(asyncio.wait_for(scene(), PATIENCE_S))
 
 
 def test_a_client_without_a_link_has_nothing_of_the_simulator() -> None:

@@ -18,6 +18,7 @@ from shared import messages
 from shared.messages import Bye, encode
 from shared.scene import load_scene
 from tests.client_sdk.servers import accept, real_server, request, scripted_server, silent_server, until_closed
+from tests.patience import PATIENCE_S
 
 pytestmark = pytest.mark.e2e
 
@@ -28,7 +29,7 @@ def url() -> Iterator[str]:
         yield url
 
 
-def play(client: Client, until: Callable[[], bool], seconds: float = 20.0) -> list[Event]:
+def play(client: Client, until: Callable[[], bool], seconds: float = PATIENCE_S) -> list[Event]:
     """Runs a game's loop until a condition holds. Returns the events."""
     events: list[Event] = []
     deadline = time.monotonic() + seconds
@@ -120,7 +121,7 @@ def test_a_server_that_stops_reading_is_left() -> None:
     def script(sock: socket.socket) -> None:
         sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
         accept(sock)
-        over.wait(20)
+        over.wait(PATIENCE_S)
 
     core = Core()
     with scripted_server(script) as url:
@@ -149,7 +150,7 @@ def test_what_does_not_fit_goes_out_later_in_order() -> None:
 
     def script(sock: socket.socket) -> None:
         peer = accept(sock)
-        go.wait(10)
+        go.wait(PATIENCE_S)
         heard.extend(bytes(frame.data) for frame in until_closed(sock, peer))
 
     core = Core()
@@ -207,7 +208,7 @@ def test_a_page_that_is_no_game_reads_like_advice() -> None:
 
 def test_silence_ends_in_time() -> None:
     over = threading.Event()
-    with scripted_server(lambda _: over.wait(20)) as url:
+    with scripted_server(lambda _: over.wait(PATIENCE_S)) as url:
         begun = time.monotonic()
         with pytest.raises(ConnectError, match="no answer in time"):
             Client.connect(url, timeout=0.3)

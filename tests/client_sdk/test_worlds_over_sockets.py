@@ -14,6 +14,7 @@ from client_sdk import AsyncClient, Client, ConnectError, Event, Left, Matched, 
 from shared import messages
 from shared.messages import Bye, Go, decode_from_client, encode
 from tests.client_sdk.servers import Peer, accept, scripted_server, until_closed
+from tests.patience import PATIENCE_S
 
 Script = Callable[[socket.socket], object]
 REFUSED = b"there is no world 'arena-1'"
@@ -64,7 +65,7 @@ class Told:
 
 async def asynchronous(how: str, url: str, **options: Any) -> list[Event]:
     """Returns the events of an `AsyncClient` until it has left."""
-    async with asyncio.timeout(20):
+    async with asyncio.timeout(PATIENCE_S):
         async with await getattr(AsyncClient, how)(url, **options) as client:
             return [event async for event in client]
 
@@ -73,7 +74,7 @@ def polled(how: str, url: str, **options: Any) -> list[Event]:
     """Returns the events of a `Client` until it has left."""
     events: list[Event] = []
     with getattr(Client, how)(url, **options) as client:
-        until = time.monotonic() + 20
+        until = time.monotonic() + PATIENCE_S
         while not any(isinstance(event, Left) for event in events):
             assert time.monotonic() < until
             events += client.poll()

@@ -20,11 +20,12 @@ from client_sdk.client import Client
 from client_sdk.events import Event
 from server.runtime.event_loop import COMPILING
 from shared.checks import Vec
+from tests.patience import PATIENCE_S
 
 ROOT = Path(__file__).resolve().parents[2]
 START_S = 400.0
 """Seconds until a server is ready. Compiling the kernel for the first time takes long."""
-END_S = 10.0
+END_S = PATIENCE_S
 BUSY = re.compile("stalled|suspended|goes on|took longer than the time between two")
 """Events of the watchdog and of ticks that took long, which also a machine causes that is busy with other work."""
 RECOVERY_S = 2.0

@@ -20,6 +20,7 @@ from sovereign_netcode.loadtest.swarm import policy_of
 from tests.client_sdk.servers import real_server
 from tests.e2e.processes import inheriting
 from tests.lengths import long
+from tests.patience import PATIENCE_S
 
 pytestmark = pytest.mark.e2e
 needs_linux = pytest.mark.skipif(sys.platform != "linux", reason="looks for processes in /proc")
@@ -130,7 +131,7 @@ def test_a_broken_scene_is_one_clear_line() -> None:
 @pytest.fixture
 def playing(request: pytest.FixtureRequest) -> Iterator[tuple["subprocess.Popen[str]", dict[int, str]]]:
     """A running load test: its process, and the processes that it has started, with their commands."""
-    command = [sys.executable, "-u", "scripts/loadtest.py", "--clients", "4", "--processes", "2", "--seconds", "60"]
+    command = [sys.executable, "-u", "scripts/loadtest.py", "--clients", "4", "--processes", "2", "--seconds", "600"]
     with ExitStack() as stack:
         with inheriting(signal.SIG_IGN, *getattr(request, "param", ())):
             process = stack.enter_context(subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True))
@@ -166,7 +167,7 @@ def test_a_signal_leaves_nothing_behind(
 ) -> None:
     process, _ = playing
     process.send_signal(number)
-    assert process.wait(20) == 130
+    assert process.wait(PATIENCE_S) == 130
 
 
 @needs_linux
@@ -179,7 +180,7 @@ def test_the_death_of_a_process_ends_it_at_once_with_nothing_left_behind(
 ) -> None:
     process, started = playing
     os.kill(next(pid for pid, command in started.items() if killed in command), signal.SIGKILL)
-    out, _ = process.communicate(timeout=20)  # of the 60 s that it should last
+    out, _ = process.communicate(timeout=PATIENCE_S)  # of the 600 s that it should last
     assert process.returncode == 1
     assert f"failed: {name} ended during the test with exit code -9" in out
     assert "Traceback" not in out

@@ -18,6 +18,7 @@ from client_sdk.events import Disconnected, Event, Joined, Left, Resumed
 from scripts.soak_test.walkers import walk
 from tests.client_sdk.servers import ROOT
 from tests.e2e.processes import MOVING_BLOCKS, RECOVERY_S, Strider
+from tests.patience import PATIENCE_S
 
 pytestmark = pytest.mark.e2e
 COMMAND = (sys.executable, "-m", "server", "--host", "127.0.0.1", "--scene", "flat", "--log-level", "warning")
@@ -88,7 +89,7 @@ async def test_a_client_in_an_event_loop_survives_its_server(tmp_path: Path) -> 
         seen: list[Event] = []
 
         async def until(wanted: type[Event]) -> None:
-            async with asyncio.timeout(30):
+            async with asyncio.timeout(PATIENCE_S):
                 async for event in client:
                     seen.append(event)
                     if isinstance(event, wanted):

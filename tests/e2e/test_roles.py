@@ -10,6 +10,7 @@ from client_sdk.async_client import AsyncClient
 from scripts.scale_lab.cluster import Cluster, PartProcess
 from scripts.scale_lab.nats_server import binary
 from shared.inputs import make_input
+from tests.patience import PATIENCE_S
 from tests.server.cluster.conftest import until
 
 pytestmark = [pytest.mark.e2e, pytest.mark.skipif(not binary(), reason="there is no nats-server here")]
@@ -35,9 +36,11 @@ async def test_a_standby_takes_over_from_a_sequencer_that_was_killed(cluster: Cl
     )
     await until(lambda: client.stats.inputs_used > 10)
     cluster.sequencer.kill()
+    async with asyncio.timeout(PATIENCE_S):
+        while not (await standby.stats())["leads"]:  # noqa: ASYNC110 - another process has no event for it
+            await asyncio.sleep(0.1)
     used = client.stats.inputs_used
     await until(lambda: client.stats.inputs_used > used + 20)
-    assert (await standby.stats())["leads"]
     assert client.stats.reconnects == 0
     await client.close()
     status, page = await standby.page("/metrics")
@@ -45,5 +48,5 @@ async def test_a_standby_takes_over_from_a_sequencer_that_was_killed(cluster: Cl
     assert b'sovereign_part{role="standby",world="world"} 1.0' in page
     assert b"sovereign_leads 1.0" in page
     assert b"sovereign_epoch 2.0" in page
-    assert await asyncio.to_thread(other.wait, 30.0) == 2, "a part of another world does not start"
+    assert await asyncio.to_thread(other.wait, PATIENCE_S) == 2, "a part of another world does not start"
     assert "error: the world 'world' on the bus is another one (scene." in other.log.read_text("utf-8")

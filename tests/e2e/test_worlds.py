@@ -13,6 +13,7 @@ from client_sdk.netsim.links import Link
 from tests.client_sdk.servers import real_server
 from tests.e2e.processes import running, stats
 from tests.e2e.test_loadtest import loadtest
+from tests.patience import PATIENCE_S
 from tests.proxy import Proxy
 
 pytestmark = pytest.mark.e2e
@@ -45,7 +46,7 @@ def url(settings: Path) -> Iterator[str]:
 def frames(until: Callable[[], bool], *clients: Client) -> dict[Client, list[Event]]:
     """Calls clients once per frame until a condition holds. Returns their events."""
     events: dict[Client, list[Event]] = {client: [] for client in clients}
-    end = time.monotonic() + 20
+    end = time.monotonic() + PATIENCE_S
     while not until():
         assert time.monotonic() < end, events
         for client in clients:
@@ -84,7 +85,7 @@ async def test_an_asyncio_client_reconnects_to_its_world(settings: Path) -> None
     with running("--port", "0", "--host", "127.0.0.1", "--config", str(settings)) as server:
         address = server.address()
         async with (
-            asyncio.timeout(30),
+            asyncio.timeout(PATIENCE_S),
             Proxy(address, Link()) as proxy,
             await AsyncClient.match(proxy.url, "arena", patience_s=10.0) as client,
         ):

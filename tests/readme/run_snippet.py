@@ -21,6 +21,7 @@ from sovereign_netcode.server.config.settings import Settings
 from sovereign_netcode.shared.behaviours import Behaviour
 from sovereign_netcode.shared.buttons import Names
 from sovereign_netcode.shared.scene import load_scene
+from tests.patience import PATIENCE_S
 from tests.readme import engines
 from tests.readme.pages import programs
 
@@ -125,7 +126,7 @@ def on_a_server(url: str) -> None:
 
     async def leave(found: AsyncClient) -> None:
         start = None
-        until = time.monotonic() + 30
+        until = time.monotonic() + PATIENCE_S
         while time.monotonic() < until:
             await asyncio.sleep(0.02)
             me = found.view().me

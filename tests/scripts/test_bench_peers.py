@@ -15,6 +15,7 @@ import pytest
 from scripts.benchmarks.peers import figures, install, proxy, rig
 from scripts.benchmarks.peers.figures import Logs
 from scripts.benchmarks.server import RigError
+from tests.patience import PATIENCE_S
 
 ROOT = Path(__file__).resolve().parent.parent.parent
 needs_linux = pytest.mark.skipif(sys.platform != "linux", reason="the generator polls with epoll")
@@ -72,7 +73,7 @@ async def test_the_proxy_carries_and_counts_all_bytes_both_ways() -> None:
         writer.write((await reader.read(-1))[::-1] + b"!")
         writer.close()
 
-    async with asyncio.timeout(20.0), await asyncio.start_server(answer, "127.0.0.1", 0) as server:
+    async with asyncio.timeout(PATIENCE_S), await asyncio.start_server(answer, "127.0.0.1", 0) as server:
         target = server.sockets[0].getsockname()[1]
         async with await proxy.serve(target, lines) as front:
             reader, writer = await asyncio.open_connection("127.0.0.1", front.sockets[0].getsockname()[1])
@@ -85,7 +86,7 @@ async def test_the_proxy_carries_and_counts_all_bytes_both_ways() -> None:
 
 @pytest.mark.e2e
 async def test_a_client_is_cut_off_if_nobody_listens_behind_the_proxy() -> None:
-    async with asyncio.timeout(20.0), await proxy.serve(rig.free_port(), proxy.Lines(1)) as front:
+    async with asyncio.timeout(PATIENCE_S), await proxy.serve(rig.free_port(), proxy.Lines(1)) as front:
         reader, writer = await asyncio.open_connection("127.0.0.1", front.sockets[0].getsockname()[1])
         with contextlib.suppress(ConnectionError):
             assert await reader.read(1) == b""

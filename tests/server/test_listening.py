@@ -11,6 +11,7 @@ import pytest
 
 from server.net import addresses
 from server.net.addresses import listeners
+from tests.patience import PATIENCE_S
 
 BACKLOG = 8
 
@@ -40,7 +41,7 @@ def closing(sockets: list[socket.socket]) -> Iterator[list[socket.socket]]:
 
 def takes(host: str, port: int) -> bool:
     try:
-        with socket.create_connection((host, port), timeout=5):
+        with socket.create_connection((host, port), timeout=PATIENCE_S):
             return True
     except OSError:
         return False

@@ -13,13 +13,14 @@ from server.persistence.new_store import NewStore
 from server.persistence.store import Store
 from server.runtime.terrain import TerrainPool
 from shared.scene import load_scene
+from tests.patience import PATIENCE_S
 
 SCENE = load_scene("arena")
 POOL = TerrainPool()
 
 
 def until(condition: Callable[[], bool]) -> None:
-    deadline = time.monotonic() + 10
+    deadline = time.monotonic() + PATIENCE_S
     while not condition():
         assert time.monotonic() < deadline
         time.sleep(0.001)
@@ -34,14 +35,14 @@ def test_nothing_is_durable_before_the_files_are_there(tmp_path: Path) -> None:
 
     def created() -> None:
         called.set()
-        assert may.wait(10)
+        assert may.wait(PATIENCE_S)
 
     store = made(tmp_path / "a", created)
     assert not (tmp_path / "a" / "world.db").exists()
     store.start(lambda: None)
     store.world.note("a promise")
     store.world.step()
-    assert called.wait(10)
+    assert called.wait(PATIENCE_S)
     assert (store.durable_tick, store.world.tick) == (0, 1)
     assert not (tmp_path / "a" / "world.db").exists()
     may.set()

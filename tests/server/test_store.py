@@ -20,6 +20,7 @@ from shared.blocks import pack
 from shared.inputs import Input, make_input
 from shared.world import World
 from tests import worlds
+from tests.patience import PATIENCE_S
 
 SCENE = worlds.scene([worlds.floor(0)])
 KEPT = {"players": [1, 2], 7: b"\0"}
@@ -31,7 +32,7 @@ def keep() -> object:
 
 def until(condition: Callable[[], bool]) -> None:
     """Waits for a condition that the store's thread makes true."""
-    deadline = time.monotonic() + 20
+    deadline = time.monotonic() + PATIENCE_S
     while not condition():
         assert time.monotonic() < deadline
         time.sleep(0.002)

@@ -16,6 +16,7 @@ from server.persistence import store as stores
 from server.persistence.database import Database, StoreError
 from server.persistence.store import Store
 from tests.lengths import contained, long
+from tests.patience import PATIENCE_S
 from tests.server.test_store import SCENE, copied, crashed, keep, play, until
 
 HEAD = 32
@@ -149,7 +150,7 @@ class Disk:
         monkeypatch.setattr(stores, "RETRY_S", 0.01)
 
     def touched(self) -> None:
-        assert self.free.wait(20)
+        assert self.free.wait(PATIENCE_S)
         if self.error is not None:
             raise self.error
 

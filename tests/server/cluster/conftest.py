@@ -20,6 +20,7 @@ from server.rules import Rules, prepared
 from server.runtime.event_loop import loop_factory
 from shared.inputs import make_input
 from shared.scene import Scene, load_scene
+from tests.patience import PATIENCE_S
 
 
 def pytest_asyncio_loop_factories(
@@ -83,7 +84,7 @@ class Cluster:
         url = f"ws://127.0.0.1:{port}"
         part = self._start(EdgePart(self._make_bus(), self.fresh(), name=self._name("edge"), url=url, **more))
         gateway.game = part
-        await asyncio.wait_for(part.ready.wait(), 10)
+        await asyncio.wait_for(part.ready.wait(), PATIENCE_S)
         self.gateways[part], self.urls[part] = gateway, url
         return part
 
@@ -122,7 +123,7 @@ class Cluster:
         return f"{kind}-{self._names}"
 
 
-async def until(condition: Callable[[], bool], seconds: float = 10.0) -> None:
+async def until(condition: Callable[[], bool], seconds: float = PATIENCE_S) -> None:
     """Waits until a condition holds."""
     end = time.monotonic() + seconds
     while not condition():

@@ -122,7 +122,7 @@ async def test_an_edge_that_drains_hands_its_clients_over_without_a_pause(
         await until(lambda: player.client.stats.inputs_used > 40)
         entity = player.client.entity
         first.drain()
-        await until(lambda: player.has(HandedOver), 20)
+        await until(lambda: player.has(HandedOver))
         await until(lambda: first.drained)
         assert first.others() == [cluster.urls[second]]
         assert second.others() == []
@@ -152,7 +152,7 @@ async def test_a_client_goes_on_at_another_edge_after_a_crash(cluster: Cluster, 
         await until(lambda: player.client.stats.inputs_used > 20 and bool(player.client.core.travel.edges))
         entity = player.client.entity
         cluster.kill(first)
-        await until(lambda: player.has(Resumed), 20)
+        await until(lambda: player.has(Resumed))
         goal = player.client.stats.inputs_used + 20
         await until(lambda: player.client.stats.inputs_used >= goal)
         player.commands = False
@@ -184,6 +184,6 @@ async def test_an_edge_runs_load_player_and_asks_for_tokens(cluster: Cluster) ->
         (player,) = edge.players.values()
         assert player.subject == "ann"
         edge.drain()
-        await until(lambda: ann.has(HandedOver), 20)
+        await until(lambda: ann.has(HandedOver))
     finally:
         await ann.close()

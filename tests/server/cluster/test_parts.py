@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 
-from client_sdk.events import Answered, Disconnected
+from client_sdk.events import Answered, Disconnected, Event
 from server.cluster import sequencer as sequencer_module
 from server.cluster.bus import BusError
 from server.cluster.edge import BEHIND
@@ -17,6 +17,7 @@ from server.journal.recorded_world import RecordedWorld
 from server.scale.wire import record_of
 from server.scale.writer import UNACKNOWLEDGED_MAX, Entry
 from shared.scene import load_scene
+from tests.patience import PATIENCE_S
 from tests.server.cluster.conftest import Cluster, until
 
 
@@ -58,7 +59,8 @@ async def test_a_standby_takes_over_and_the_players_go_on(cluster: Cluster) -> N
     tick = edge.world.tick
     number = ann.edit(0, 0, 0, 1)
     await until(lambda: edge.world.tick > tick + 20)
-    events = [event async for event in _so_far(ann)]
+    events = await _up_to(ann, Answered)
+    events += [event async for event in _so_far(ann)]
     assert [event.number for event in events if isinstance(event, Answered)] == [number]
     assert not any(isinstance(event, Disconnected) for event in events)
     assert sum(standby.core is not None for standby in standbys) == 1
@@ -70,15 +72,15 @@ async def test_a_deposed_sequencer_ends(cluster: Cluster) -> None:
     bus = DeafBus(cluster.hub)
     cluster._make_bus = lambda: bus
     old = cluster.sequencer()
-    await asyncio.wait_for(old.leads.wait(), 10)
+    await asyncio.wait_for(old.leads.wait(), PATIENCE_S)
     cluster._make_bus = lambda: LocalBus(cluster.hub)
     new = cluster.sequencer(begins=False)
     await until(lambda: new.following.seq > 3)
     bus.deaf = True
-    await asyncio.wait_for(new.leads.wait(), 10)
+    await asyncio.wait_for(new.leads.wait(), PATIENCE_S)
     bus.deaf = False
     with pytest.raises(PartError, match="another sequencer"):
-        await asyncio.wait_for(asyncio.shield(cluster.tasks[old]), 10)
+        await asyncio.wait_for(asyncio.shield(cluster.tasks[old]), PATIENCE_S)
     assert new.core is not None
     assert new.core.epoch == 2
 
@@ -87,7 +89,7 @@ async def test_time_stands_still_while_the_bus_does_not_answer(cluster: Cluster)
     bus = DeafBus(cluster.hub)
     cluster._make_bus = lambda: bus
     sequencer = cluster.sequencer()
-    await asyncio.wait_for(sequencer.leads.wait(), 10)
+    await asyncio.wait_for(sequencer.leads.wait(), PATIENCE_S)
     await until(lambda: cluster.hub.newest.seq > 5)
     bus.deaf = True
     await until(lambda: sequencer.still > 3)
@@ -98,7 +100,7 @@ async def test_time_stands_still_while_the_bus_does_not_answer(cluster: Cluster)
     await until(lambda: record_of(cluster.hub.newest.data).tick > durable + 20)
     ticks = [record_of(data).tick for data in _records(cluster.hub)][1:]
     assert ticks == list(range(1, len(ticks) + 1))
-    assert sequencer.unready() == ""
+    await until(lambda: sequencer.unready() == "")
 
 
 async def test_a_new_edge_begins_with_a_checkpoint(cluster: Cluster, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -127,10 +129,10 @@ async def test_an_edge_that_is_behind_sends_its_clients_away(cluster: Cluster, m
     assert edge.shedding
     assert edge.unready().startswith("behind")
     await until(lambda: not edge.shedding)
-    await until(lambda: ann.reconnecting or ann.stats.reconnects > 0)
-    events = [event async for event in _so_far(ann)]
-    assert BEHIND in [event.reason for event in events if isinstance(event, Disconnected)]
-    assert edge.sheds == 1
+    events = await _up_to(ann, Disconnected)
+    assert isinstance(events[-1], Disconnected)
+    assert events[-1].reason == BEHIND
+    assert edge.sheds >= 1  # a busy machine can make it fall behind once more
 
 
 async def test_a_part_of_another_world_is_refused() -> None:
@@ -148,6 +150,15 @@ async def test_a_part_of_another_world_is_refused() -> None:
 
 def _records(hub: LocalHub) -> list[bytes]:
     return [stored.data for stored in hub.log.values()]
+
+
+async def _up_to(client: Any, kind: type[Event]) -> list[Event]:
+    """Returns the events up to the next of a kind."""
+    events: list[Event] = []
+    async with asyncio.timeout(PATIENCE_S):
+        while not (events and isinstance(events[-1], kind)):
+            events.append(await anext(client))
+    return events
 
 
 async def _so_far(client: Any) -> Any:

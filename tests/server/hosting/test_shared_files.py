@@ -8,6 +8,7 @@ import pytest
 from server.hosting.files import SavedWorld, WorldFiles
 from server.persistence.store import Store
 from shared.scene import load_scene
+from tests.patience import PATIENCE_S
 
 FLAT = load_scene("flat")
 SAVED = SavedWorld("arena", {"mode": "a"}, "", False, False)
@@ -15,7 +16,7 @@ SAVED = SavedWorld("arena", {"mode": "a"}, "", False, False)
 
 def until_saved(store: Store) -> bool:
     """Waits until all that the store has got is durable, or cannot be saved. Returns whether it is durable."""
-    deadline = time.monotonic() + 10
+    deadline = time.monotonic() + PATIENCE_S
     while store.durable_tick < store.world.tick and not store.trouble:
         assert time.monotonic() < deadline
         time.sleep(0.001)
