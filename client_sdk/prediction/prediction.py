@@ -268,11 +268,8 @@ class Prediction:
 
     def _placed(self, since: int, to: int) -> frozenset[int]:
         """Returns the entities that the server's rules placed after the tick `since`, up to `to`."""
-        found: frozenset[int] = frozenset()
-        for tick in range(max(since, to - self.confirmed_copy.follow_max) + 1, to + 1):
-            if placed := self.confirmed_copy.placed.get(tick):
-                found |= placed
-        return found
+        ticks = range(max(since, to - self.confirmed_copy.follow_max) + 1, to + 1)
+        return frozenset().union(*(ids for tick in ticks if (ids := self.confirmed_copy.placed.get(tick))))
 
     def _state(self, entity: int, tick: int) -> State | None:
         """Returns the kept state of an entity at the end of a tick; None if none is kept."""
