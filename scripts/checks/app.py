@@ -51,22 +51,27 @@ def main(arguments: list[str]) -> int:
 
 
 def everything(markers: str, profile: str) -> list[Step]:
-    """Runs all checks of the sources and the tests with these markers."""
+    """Runs all checks of the sources and the tests with these markers.
+
+    mypy needs most of a minute of one processor, beside the other checks and the tests. In a long run it has only the
+    time that these leave. The tests that wait leave enough.
+    """
     steps = [run("type stubs", *STUBS)]
     with ThreadPoolExecutor(1) as pool:
-        types = pool.submit(mypy)  # beside the other checks, and the tests, many of which wait
+        types = pool.submit(mypy, "19" if profile == "long" else "5")
         steps += [run(title, *command) for title, command in CHECKS.items()]
         steps += [*compiled(), together(markers, profile)]
+        if profile == "long":
+            steps.append(waiting(profile))
         step, output = types.result()
     print(f"\n== {step.title}\n{output}", end="", flush=True)
-    more = [waiting(profile)] if profile == "long" else []
-    return [*steps, step, *more, alone(markers, profile)]
+    return [*steps, step, alone(markers, profile)]
 
 
-def mypy() -> tuple[Step, str]:
-    """Checks the types. Returns the output, too."""
+def mypy(niceness: str) -> tuple[Step, str]:
+    """Checks the types; the tests come first. Returns the output, too."""
     started = time.perf_counter()
-    nice = ("nice", "-n", "5") if shutil.which("nice") else ()  # the tests come first
+    nice = ("nice", "-n", niceness) if shutil.which("nice") else ()
     command = (*nice, str(PYTHON), "-m", "mypy")
     done = subprocess.run(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, check=False)
     return Step("mypy", done.returncode, time.perf_counter() - started), done.stdout
