@@ -48,18 +48,7 @@ from shared.arrays import np
 from shared.checks import Cell
 from shared.fields import ENTITY_MAX, shown
 from shared.kernels import Kernel
-from shared.layout import (
-    BUTTONS,
-    CELL,
-    FALLING,
-    ID,
-    MOVE_X,
-    TEMPLATE,
-    TURN,
-    WIDTH_SHIFT,
-    Int64s,
-    X,
-)
+from shared.layout import BUTTONS, CELL, FALLING, ID, MOVE_X, TEMPLATE, TURN, WIDTH_SHIFT, Int64s, X
 from shared.messages import ProtocolError, pack
 from shared.units import BLOCK, SEGMENT
 from shared.world import World
