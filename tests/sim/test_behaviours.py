@@ -240,9 +240,7 @@ def test_an_ability_that_nobody_uses_costs_no_bytes_while_players_walk() -> None
     assert counts[1] == counts[0]
 
 
-@pytest.mark.parametrize(
-    ("preset", "seed"), [*contained(("thin", 5)), *long(*((preset, seed) for preset in PRESETS for seed in (6, 7)))]
-)
+@pytest.mark.parametrize(("preset", "seed"), [*contained(("thin", 5)), *long(*((preset, 6) for preset in PRESETS))])
 def test_each_announcement_reaches_its_own_player_once(preset: str, seed: int) -> None:
     """Holds also where an input is late, so that the client predicts the announcement for another tick or not at all.
 
