@@ -96,43 +96,46 @@ class ViewBuilder:
         former, self._way = self._way, way
         if former is not None and former.before is way.before:
             return
-        if former is None:
-            changed = changes(way.states[:0], way.states)
-        elif former.after is way.before:
+        if former is not None and former.after is way.before:
             changed = former.changed
-        else:
-            changed = changes(former.states, way.states)
+        else:  # the first one, or frames have left out snapshots
+            changed = changes(way.states[:0], way.states)
         ids, templates = layout = way.states[:, ID].tolist(), way.states[:, TEMPLATE].tolist()
         if len(self._facings) > 2 * len(ids) + FACINGS_MIN:
             there = set(ids)
             self._facings = {entity: facing for entity, facing in self._facings.items() if entity in there}
         own = range(self._prediction.entity, self._prediction.last_own + 1)
+        moves = {entity for entity, *_ in way.moving} if way.after is not way.before else ()
         for old, new in changed:
-            if new[ID] not in own:
-                self._put(old, new)
+            entity = new[ID]
+            if entity in own:
+                continue
+            if old is None or old[TEMPLATE] != new[TEMPLATE] or old[VX:] != new[VX:]:
+                self._put(new)
+            elif entity not in moves:  # otherwise each frame gives it a position
+                self._figures[entity] = _at(place_of(new), self._figures[entity])
         if layout != self._layout:
             self._layout = layout
             self._figures = {entity: self._figures[entity] for entity in ids if entity not in own}
             unsure = compress(ids, (template in self._predicted for template in templates))
             self._unsure = {entity: self._unsure[entity] for entity in unsure if entity not in own}
 
-    def _put(self, old: list[int] | None, new: list[int]) -> None:
-        """Takes the state of an entity that differs from its earlier one."""
-        entity, template, place = new[ID], new[TEMPLATE], place_of(new)
-        if template in self._predicted:
-            self._unsure[entity] = new
-            self._figures[entity] = self._figure(new, place, EAST)
-        elif old is None or old[TEMPLATE] != template or old[VX:] != new[VX:]:
-            self._figures[entity] = self._figure(new, place, self._facing(new))
+    def _put(self, state: list[int]) -> None:
+        """Takes the state of an entity that differs from its earlier one in more than its position."""
+        if state[TEMPLATE] in self._predicted:
+            self._unsure[state[ID]] = state
+            self._figures[state[ID]] = self._figure(state, place_of(state), EAST)
         else:
-            self._figures[entity] = _at(place, self._figures[entity])
+            self._figures[state[ID]] = self._figure(state, place_of(state), self._facing(state))
 
     def _label(self) -> None:
         """Takes the attributes of all entities."""
         self._labelled = self._prediction.confirmed_copy.attribute_changes
         attributes = self._prediction.attributes
         for entity, figure in self._figures.items():
-            self._figures[entity] = figure._replace(attributes=attributes.get(entity, NO_VALUES))
+            values = attributes.get(entity, NO_VALUES)
+            if values is not figure.attributes:
+                self._figures[entity] = figure._replace(attributes=values)
 
     def _ahead(self, entity: int, tick: float, now: float) -> EntityView | None:
         """Returns a predicted entity to draw, one tick before `tick` and with smoothing; None if it is not predicted.
