@@ -25,8 +25,8 @@ CHECKS = {
 }
 LONG = "(slow or hypothesis) and not contained"
 """Markers of the tests that are longer in a long run."""
-AT_A_TIME = ("-n", "4", "--dist", "worksteal")
-"""Options of pytest that run four tests at a time."""
+BALANCED = ("--dist", "worksteal")
+"""Options of pytest with which an idle worker takes tests from another."""
 
 
 def main(arguments: list[str]) -> int:
@@ -93,15 +93,15 @@ def compiled() -> list[Step]:
 
 def together(markers: str, profile: str) -> Step:
     """Runs several tests at a time, because many of them wait: two cores are busy all the time then."""
-    return run("tests", *pytest(markers, "not waiting and not alone", profile), *AT_A_TIME)
+    return run("tests", *pytest(markers, "not waiting and not alone", profile), "-n", "4", *BALANCED)
 
 
 def waiting(profile: str) -> Step:
     """Runs tests that wait most of the time, and that a busy machine disturbs. All are long ones.
 
-    They take the processor for a third of their time, so four of them leave it enough.
+    They take the processor for a third of their time, so three of them leave enough of two cores.
     """
-    return run("tests that wait", *pytest("", "waiting", profile), *AT_A_TIME, *files("waiting"))
+    return run("tests that wait", *pytest("", "waiting", profile), "-n", "3", *BALANCED, *files("waiting"))
 
 
 def alone(markers: str, profile: str) -> Step:
