@@ -255,15 +255,15 @@ class Core(Changing):
 
     def _begin(self, world: Replica, now: float) -> None:
         """Starts the play in a complete replica, for the first time or after a reconnect."""
-        play, same = self._worlds.begin(world, now)
+        unsent, same = self._worlds.begin(world, now)
         self.state = "playing"
         tick, away_s = world.prediction.predicted.tick, self.reconnect.away_s(now)
         self._events.append(Resumed(tick, away_s) if same else Joined(self.entity, world.scene, tick))
         self._game_events.release()
         self.reconnect.back()
         self.travel.plays(now)
-        for inputs in play.unreceived() if same else ():
-            self._send(inputs)
+        for message in unsent:
+            self._send(message)
 
     def _bye(self, bye: messages.Bye, now: float) -> None:
         if self.handover is not None and bye.code == messages.TAKEN_OVER:

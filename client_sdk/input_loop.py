@@ -62,6 +62,7 @@ class InputLoop:
         self.newest = -1
         self.seen = 0.0
         """View tick of the latest view, in ticks; of the latest update if the program draws no views."""
+        self._void = -1  # newest tick whose inputs were forgotten, because a restored server has none of them
         self._draws = False
         self._late = False
         self._silent = False
@@ -92,9 +93,13 @@ class InputLoop:
         self._sent.restart()
         self._observed = [(-1, 0.0), (-1, 0.0)]
         messages: list[Message] = []
-        if tick < self.newest and cause == RECONNECTED:
+        ahead, jump = self.newest - tick, jump_ticks(self.timeline.rate)
+        if cause == RECONNECTED and abs(ahead) > jump and self.world.newest_received < 0:
+            prediction.forget_inputs()  # the server was restored, and they belong to another time
+            self._void = tick
+        if 0 < ahead <= jump and cause == RECONNECTED:
             tick = min(self.newest, end)
-        elif tick < self.newest:
+        elif ahead > 0:
             messages.append(Restart(tick + 1))
             self._sent.forget()
             self._settling = now
@@ -123,9 +128,11 @@ class InputLoop:
         before, timeline.phase = timeline.phase, self._lead.step(self.world.clock) + timeline.own
         self._settling = now
         self._stepped += timeline.phase - before  # a server that stands still causes many small steps: they add up
-        if online and abs(self._stepped) > jump_ticks(timeline.rate):
-            self._stepped = 0.0
-            return self.restart(now, BEHIND if ticks < 0 else AHEAD)
+        if abs(self._stepped) > jump_ticks(timeline.rate):
+            if online:
+                self._stepped = 0.0
+                return self.restart(now, BEHIND if ticks < 0 else AHEAD)
+            self._sent.forget()  # `restart` follows after the reconnect; margins until then are those of another time
         return []
 
     def prepare(self, snapshot: Snapshot, now: float) -> None:
@@ -250,7 +257,7 @@ class InputLoop:
     def unreceived(self) -> list[Message]:
         """Returns the inputs to send again after a reconnect: those that the server may not have received yet."""
         prediction, newest = self.world.prediction, self.newest
-        since = max(self.world.newest_received, prediction.confirmed.tick, newest - self._bounds.ahead)
+        since = max(self.world.newest_received, prediction.confirmed.tick, newest - self._bounds.ahead, self._void)
         return [
             Inputs(
                 first + 1,

@@ -163,11 +163,11 @@ class Worlds:
         event = Announcement(message.entity, message.name, message.payload)
         return prediction.announcements.arrived(message.tick, event)
 
-    def begin(self, world: Replica, now: float) -> tuple[InputLoop, bool]:
+    def begin(self, world: Replica, now: float) -> tuple[list[Message], bool]:
         """Starts the input loop in a complete replica, for the first time or after a reconnect.
 
         Returns:
-            The input loop, and whether the own entity is the one from before a reconnect.
+            The messages to send, and whether the own entity is the one from before a reconnect.
         """
         old = self.play
         same = old is not None and world.take_over(old.world)
@@ -176,9 +176,9 @@ class Worlds:
         else:
             play = old
             play.world = world
-        play.restart(now, RECONNECTED)
+        messages = play.restart(now, RECONNECTED)
         self._stats.reconnects += old is not None
-        return play, same
+        return messages + play.unreceived() if same else messages, same
 
     def change_over(self, world: Replica) -> None:
         """Goes on in a complete replica of the same world with the same clock, without a pause."""

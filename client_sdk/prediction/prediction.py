@@ -141,6 +141,10 @@ class Prediction:
         """Files the own input for a future tick."""
         self._inputs.put(tick, input_)
 
+    def forget_inputs(self) -> None:
+        """Forgets all filed inputs: `NEUTRAL` stands in for them, as at a server that has got no input."""
+        self._inputs = Ring(self._bounds.predicted)
+
     def step(self) -> None:
         """Predicts one tick."""
         world = self.predicted
@@ -159,8 +163,7 @@ class Prediction:
         for event in turns.announced:
             if self.entity <= event.entity <= self.last_own:
                 self.announcements.add(tick, event)
-        failures = turns.take_failures() if turns.failures else ()
-        for each in failures:
+        for each in turns.take_failures() if turns.failures else ():
             if (each.tick, each.entity) not in self._failed:
                 self._failed.add((each.tick, each.entity))
                 self.failures.append(each)
@@ -336,10 +339,9 @@ class Prediction:
 
     def _acts(self, states: Int64s) -> list[list[int]]:
         """Returns the counts of the acts of the own entity and of what it has spawned, with their numbers."""
-        extras = self.confirmed.extras
         if not self.confirmed.scene.behaviours:
             return []
-        acts: list[list[int]] = states[self._mine(states[:, ID])][:, (ID, CELL + extras.acts)].tolist()
+        acts: list[list[int]] = states[self._mine(states[:, ID])][:, (ID, CELL + self.confirmed.extras.acts)].tolist()
         return acts
 
     def _near_equal(self, predicted_states: Int64s, confirmed_states: Int64s) -> bool:
@@ -382,10 +384,8 @@ class Prediction:
         return tuple(name for name, a, b in differing if a != b), math.sqrt(x * x + y * y + z * z)
 
     def _others_differ(self, predicted_states: Int64s, confirmed_states: Int64s) -> bool:
-        return not np.array_equal(
-            predicted_states[predicted_states[:, ID] != self.entity],
-            confirmed_states[confirmed_states[:, ID] != self.entity],
-        )
+        was, are = (states[states[:, ID] != self.entity] for states in (predicted_states, confirmed_states))
+        return not np.array_equal(was, are)
 
 
 def _offsets(before: Int64s, after: Int64s) -> dict[int, Place]:
