@@ -1,12 +1,11 @@
 """`bench.py frame`: the time that a client takes for a frame, with a number of other players in view.
 
-All players are in one match in simulated time. One of them draws 60 frames a second: it reads what has arrived, updates
-and makes a view. The time is that of its calls alone. The server and all other clients run between two of its frames,
-so it finds little of its memory in the processor's caches, as beside a program that draws.
+All players wander in one match in simulated time. One of them draws 60 frames a second: it reads what has arrived,
+updates and makes a view. The time is that of its calls alone. The server and all other clients run between two of its
+frames, so it finds little of its memory in the processor's caches, as beside a program that draws.
 """
 
 import argparse
-import random
 import time
 from typing import Any
 
@@ -14,15 +13,12 @@ from rich.console import Console
 
 from client_sdk.core import Core
 from shared import kernels
-from shared.inputs import Input
 from shared.scene import load_scene
 from sovereign_netcode.playtest import PRESETS, Match, wander
 
 FRAME_S = 1 / 60
 SETTLE_S = 4.0
 """Simulated seconds before the count starts."""
-TURNS = 0.04
-"""Probability of a new direction, per tick and other player."""
 
 
 class Drawing(Core):
@@ -48,11 +44,6 @@ class Drawing(Core):
         self._receiving, self.others = 0.0, len(view.others)
 
 
-def turning(core: Core, rng: random.Random) -> Input:
-    """Walks on, and now and then into another direction."""
-    return wander(core, rng) if rng.random() < TURNS else core.input
-
-
 def measured(entities: int, seconds: float, seed: int) -> dict[str, Any]:
     """Returns the figures of one match.
 
@@ -64,7 +55,7 @@ def measured(entities: int, seconds: float, seed: int) -> dict[str, Any]:
     match, core = Match(load_scene("arena"), seed), Drawing("drawing")
     match.join(wander, PRESETS["typical"], core).frame_s = FRAME_S
     for _ in range(entities):
-        match.join(turning, PRESETS["lan"])
+        match.join(wander, PRESETS["lan"])
     match.run(SETTLE_S)
     core.frames.clear()
     match.run(seconds)
