@@ -84,6 +84,7 @@ def installed(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Installe
     (folder / "shared" / "__init__.py").write_text("NAME = 'my shared'\n", "utf-8")
     # the pages, and the code that runs their programs, which is not part of the package
     shutil.copytree(ROOT / "tests" / "readme", folder / "tests" / "readme")
+    shutil.copy(ROOT / "tests" / "patience.py", folder / "tests")
     shutil.copytree(ROOT / "docs", folder / "docs")
     shutil.copy(ROOT / "README.md", folder)
     return Installed(environment(place / "venv", wheel, *PACKAGES), folder)

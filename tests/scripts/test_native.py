@@ -35,13 +35,13 @@ def test_a_match_comes_to_the_same_figures(tmp_path: Path) -> None:
 
     def figures(root: Path) -> dict[str, Any]:
         told = tmp_path / "told.json"
-        presets = ("--preset", "typical", "--preset", "outage")
+        presets = ("--preset", "wifi", "--preset", "outage")
         match = (*presets, "--clients", "3", "--minutes", "0.5", "--seed", "3", "--no-league")
         run(root, str(root / "scripts" / "netlab.py"), *match, "--json", str(told))
         found: dict[str, Any] = json.loads(told.read_text("utf-8"))["presets"]
-        for preset in ("typical", "outage"):
+        for preset in ("wifi", "outage"):
             assert found[preset].pop("simulated_s_per_cpu_s") > 0
-            assert found[preset]["late_inputs_share"] > 0
+        assert found["wifi"]["late_inputs_share"] > 0
         return found
 
     modules = [module.removesuffix(".py").replace("/", ".") for module in native.MODULES]
