@@ -258,6 +258,7 @@ class InputLoop:
         """Returns the inputs to send again after a reconnect: those that the server may not have received yet."""
         prediction, newest = self.world.prediction, self.newest
         since = max(self.world.newest_received, prediction.confirmed.tick, newest - self._bounds.ahead, self._void)
+        self._sent.again(since, newest)
         return [
             Inputs(
                 first + 1,

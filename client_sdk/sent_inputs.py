@@ -116,6 +116,12 @@ class SentInputs:
         after, self._newest, self._due = at - self._newest, at, max(at + renew, to + 1)
         return [Held(after, at - acked)]
 
+    def again(self, since: int, to: int) -> None:
+        """Notes that the inputs after the tick `since`, up to `to`, are sent again, also those that were forgotten."""
+        for tick in range(since + 1, to + 1):
+            if not self.has(tick):
+                self._sent.put(tick, (0.0, QUIET, tick))
+
     def has(self, tick: int) -> bool:
         """Returns whether the server was sent an input for a tick, or that the input before holds."""
         return self._sent.get(tick) is not None

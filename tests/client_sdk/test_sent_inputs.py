@@ -145,6 +145,17 @@ def test_the_margin_of_a_late_change_may_come_before_the_status_or_after_it() ->
     assert replaced(one, snapshot(6, [USED] * 3, 8, LATE, 9, 9, 9, 9)) == 0
 
 
+def test_inputs_that_are_sent_again_are_known_although_they_were_forgotten() -> None:
+    sent = SentInputs(32, 3)
+    played("eeennn", sent)
+    sent.forget()
+    played("n", sent, 7)
+    sent.again(3, 7)
+    assert [sent.has(tick) for tick in range(2, 9)] == [False, False, True, True, True, True, False]
+    assert [arrival.tick for arrival in sent.arrived(snapshot(5, [], 7, 9, 9, 9))] == [7], "no time is known of others"
+    assert replaced(sent, snapshot(5, [USED, USED], 5, 9)) == 1
+
+
 def test_a_second_connection_has_margins_of_its_own() -> None:
     sent = SentInputs(32, 3)
     played("eeennnnn", sent)

@@ -11,7 +11,7 @@ import pytest
 
 from client_sdk.core import Core
 from client_sdk.events import Corrected, Diverged, Resumed
-from client_sdk.netsim.links import Link
+from client_sdk.netsim.links import PRESETS, Link
 from server.game import Game
 from server.persistence.store import Store
 from server.worlds.host import Way
@@ -65,12 +65,12 @@ class Restored(Match):
         self.at(self._started / self.game.scene.tick_rate, self._tick)
 
 
-def played(directory: Path, seed: int, delay_s: float, away_s: float) -> tuple[Restored, Player]:
+def played(directory: Path, seed: int, link: Link, away_s: float, before_s: float = 4) -> tuple[Restored, Player]:
     """Returns a match whose server was away for a time, as soon as its player goes on, and the player."""
     match = Restored(directory, seed)
-    player = match.join(walks, Link(delay_s), Core("Ann", patience_s=60))
+    player = match.join(walks, link, Core("Ann", patience_s=60))
     match.run_until(lambda: player.core.state == "playing", 30)
-    match.run(4)
+    match.run(before_s)
     player.events.clear()
     match.end()
     match.run(away_s)
@@ -90,7 +90,7 @@ def played(directory: Path, seed: int, delay_s: float, away_s: float) -> tuple[R
 def test_a_client_goes_on_at_the_time_of_a_restored_world(
     tmp_path: Path, seed: int, delay_s: float, away_s: float
 ) -> None:
-    match, player = played(tmp_path, seed, delay_s, away_s)
+    match, player = played(tmp_path, seed, Link(delay_s), away_s)
     core, rate = player.core, match.game.scene.tick_rate
     for _ in range(8):
         assert core.prediction
@@ -102,6 +102,17 @@ def test_a_client_goes_on_at_the_time_of_a_restored_world(
     used, tick = queue.used, match.game.world.tick
     match.run(2)
     assert queue.used - used == match.game.world.tick - tick
+    assert match.store.close()
+
+
+@pytest.mark.parametrize(("seed", "away_s"), [(16, 0.7), *long((30, 0.5), (33, 0.5), (38, 0.5))])
+def test_inputs_that_a_restored_server_lacks_are_late_and_no_divergence(
+    tmp_path: Path, seed: int, away_s: float
+) -> None:
+    match, player = played(tmp_path, seed, PRESETS["far"], away_s, before_s=6)
+    match.run(2)
+    assert {event.cause for event in player.events if isinstance(event, Corrected)} == {"late input"}
+    assert not any(isinstance(event, Diverged) for event in player.events)
     assert match.store.close()
 
 
