@@ -12,7 +12,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from client_sdk.stats import Stats
-from client_sdk.view import EntityView, View
+from client_sdk.view import View
 from shared.scene import Scene
 
 HEAD = (
@@ -64,17 +64,21 @@ class FlatView:
         end = start + width * len(drawn)
         if end > len(self.values):
             self.values = _zeros(2 * end)
-        values, known = self.values, self._known
+        values, known, numbers = self.values, self._known, self._numbers
         head = (len(drawn), width, view.me is not None, view.tick, view.seen)
         for place, value in enumerate(head, AT["rows"]):
             values[place] = value
-        at = start
-        for each in drawn:
-            row = self._row(each)
-            values[at : at + width] = array("d", row)
-            at += width
-            if each.attributes is not known.get(each.entity):
-                known[each.entity] = self._changed[each.entity] = each.attributes
+        rows: list[float] = []
+        for entity, template, position, velocity, attributes, fields, facing in drawn:
+            number = numbers[template]
+            rows += (entity, number, *position, *velocity, *facing)
+            if width > len(COLUMNS):
+                names = self._fields[number]
+                rows += [fields[name] for name in names]
+                rows += [0.0] * (width - len(COLUMNS) - len(names))
+            if attributes is not known.get(entity):
+                known[entity] = self._changed[entity] = attributes
+        values[start:end] = array("d", rows)
         if len(known) > len(drawn):
             there = {each.entity for each in drawn}
             for entity in [entity for entity in known if entity not in there]:
@@ -111,14 +115,6 @@ class FlatView:
         self._numbers = scene.index_of
         self._fields = fields_of(scene)
         self._columns = len(COLUMNS) + max(map(len, self._fields))
-
-    def _row(self, each: EntityView) -> list[float]:
-        template = self._numbers[each.template]
-        row = [each.entity, template, *each.position, *each.velocity, *each.facing]
-        if self._columns > len(COLUMNS):
-            row += [each.fields[name] for name in self._fields[template]]
-            row += [0.0] * (self._columns - len(row))
-        return row
 
 
 def _zeros(count: int) -> "memoryview[float]":

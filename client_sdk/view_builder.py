@@ -4,20 +4,22 @@ Other entities are drawn as predicted, too, if their template is shown so (`show
 """
 
 import math
+from bisect import bisect_left, bisect_right
 from collections.abc import Mapping, Sequence
-from itertools import compress
+from functools import partial
+from typing import Any
 
 from client_sdk.interpolation import Interpolation
-from client_sdk.interpolation.interpolation import Way, changes, place_of
+from client_sdk.interpolation.interpolation import NO_ENTRY, Entry
 from client_sdk.interpolation.smoothing import Smoothing
 from client_sdk.prediction.prediction import Prediction, Reconciled
 from client_sdk.timing.server_clock import ServerClock
 from client_sdk.timing.timeline import Timeline
 from client_sdk.view import NO_VALUES, EntityView, View
 from shared.checks import Vec
-from shared.layout import CELL, ID, MOVE_X, TEMPLATE, VX
+from shared.layout import CELL, ID, MOVE_X, MOVE_Y, TEMPLATE, VX, VY, VZ, X, Y, Z
 from shared.scene import Scene
-from shared.units import SPEED
+from shared.units import BLOCK, SPEED
 
 Facing = tuple[float, float]
 """A direction of length 1: east and north."""
@@ -25,6 +27,8 @@ EAST: Facing = (1.0, 0.0)
 """The facing of an entity that has not moved yet."""
 FACINGS_MIN = 64
 """Number of kept directions up to which those of entities out of view are not dropped."""
+_entity_view = partial(tuple.__new__, EntityView)
+"""Makes an `EntityView` of a tuple. (`EntityView._make` takes several times as long.)"""
 
 
 class ViewBuilder:
@@ -38,11 +42,19 @@ class ViewBuilder:
         self._smoothing: dict[int, Smoothing] = {}
         self._extras = scene.extras
         self._facings: dict[int, Facing] = {}
-        self._way: Way | None = None  # the latest drawn one
-        self._layout: tuple[list[int], list[int]] = [], []  # numbers and templates of the entities where it begins
-        self._figures: dict[int, EntityView] = {}  # these entities there, without the own ones
-        self._unsure: dict[int, list[int]] = {}  # states of those that may be drawn as predicted
-        self._labelled = -1  # state of the attributes in `_figures`
+        self._drawn = NO_ENTRY  # the snapshot from which on the others are drawn; its entities:
+        self._ids: tuple[int, ...] = ()
+        self._names: list[str] = []
+        self._velocities: list[Vec] = []
+        self._labels: list[Mapping[str, Any]] = []
+        self._fields: list[Mapping[str, int]] = []
+        self._directions: list[Facing] = []
+        self._own = slice(0)  # rows of the own ones
+        self._unsure: list[tuple[int, list[int]]] = []  # rows and states of those that may be drawn as predicted
+        self._turning = (ID, TEMPLATE, MOVE_X, MOVE_Y, VX, VY, *((CELL, CELL + 1) if scene.extras.aims else ()))
+        self._turned: set[tuple[int, ...]] = set()  # these columns of the entities, which tell their directions
+        self._known: dict[tuple[int, ...], Mapping[str, int]] = {}  # fields by template and extra columns
+        self._labelled = -1  # state of the attributes in `_labels`
         self._delay = 0.0  # the input delay of the latest view, in ticks
         self._viewed = -math.inf  # the timeline's tick of the latest view
 
@@ -74,68 +86,67 @@ class ViewBuilder:
         self._viewed = tick
         seen = self.interpolation.shown(server_tick)
         way = self.interpolation.way(seen)
-        if way is not self._way:
-            self._follow(way)
-        if self._labelled != prediction.confirmed_copy.attribute_changes:
+        if way.before is not self._drawn:
+            self._follow(way.before)
+        elif self._labelled != prediction.confirmed_copy.attribute_changes:
             self._label()
-        figures, share = self._figures.copy(), way.share(seen)
-        for entity, x, y, z, u, v, w in way.moving:
-            if figure := figures.get(entity):
-                figures[entity] = _at((x + u * share, y + v * share, z + w * share), figure)
-        for entity, state in self._unsure.items():
-            ahead = self._ahead(entity, tick, now)
-            figures[entity] = ahead or figures[entity]._replace(facing=self._facing(state))
-        others = list(figures.values())
+        looks = self._velocities, self._labels, self._fields, self._directions
+        others = list(map(_entity_view, zip(self._ids, self._names, way.places(seen), *looks, strict=True)))
+        for row, state in self._unsure:
+            ahead = self._ahead(state[ID], tick, now)
+            others[row] = ahead or others[row]._replace(facing=self._facing(state))
+        del others[self._own]
         if prediction.last_own > prediction.entity:  # what the own entity has spawned: predicted, like itself
             own = (self._ahead(entity, tick, now) for entity in prediction.spawned())
             others = sorted([*others, *(each for each in own if each is not None)], key=lambda each: each.entity)
         return View(tick, self._ahead(prediction.entity, tick, now), others, seen)
 
-    def _follow(self, way: Way) -> None:
-        """Takes the states at the beginning of another way."""
-        former, self._way = self._way, way
-        if former is not None and former.before is way.before:
-            return
-        if former is not None and former.after is way.before:
-            changed = former.changed
-        else:  # the first one, or frames have left out snapshots
-            changed = changes(way.states[:0], way.states)
-        ids, templates = layout = way.states[:, ID].tolist(), way.states[:, TEMPLATE].tolist()
+    def _follow(self, drawn: Entry) -> None:
+        """Takes the states of another snapshot, from which on the others are drawn."""
+        self._drawn, columns = drawn, drawn.columns
+        self._ids, templates = ids, _ = columns[ID], columns[TEMPLATE]
+        first, last = self._prediction.entity, self._prediction.last_own
+        self._own = slice(bisect_left(ids, first), bisect_right(ids, last))
+        self._names = [self._templates[template] for template in templates]
+        self._velocities = list(zip(*([speed / SPEED for speed in axis] for axis in columns[VX : VZ + 1]), strict=True))
+        self._fields = self._fields_in(columns) if self._extras.count else [NO_VALUES] * len(ids)
+        self._label()
+        ahead = set(range(len(ids))[self._own])
+        self._unsure = []
+        if self._predicted:
+            unsure = [row for row, template in enumerate(templates) if template in self._predicted and row not in ahead]
+            self._unsure = [(row, drawn.states[row].tolist()) for row in unsure]
+            ahead.update(unsure)
+        self._turn(drawn, ahead)
+
+    def _fields_in(self, columns: Sequence[tuple[int, ...]]) -> list[Mapping[str, int]]:
+        """Returns the fields of the behaviours of all entities. Those that have the same as before share them."""
+        looks = list(zip(columns[TEMPLATE], *columns[CELL:], strict=True))
+        known, fields_of = self._known, self._prediction.predicted.fields_of
+        self._known = {look: known.get(look) or fields_of(look[0], list(look[1:])) for look in looks}
+        return [self._known[look] for look in looks]
+
+    def _turn(self, drawn: Entry, ahead: set[int]) -> None:
+        """Takes the directions of the entities that walk, move or aim otherwise than in the snapshot before.
+
+        Those in the rows `ahead` look as predicted.
+        """
+        ids, turned = self._ids, self._turned
         if len(self._facings) > 2 * len(ids) + FACINGS_MIN:
             there = set(ids)
             self._facings = {entity: facing for entity, facing in self._facings.items() if entity in there}
-        own = range(self._prediction.entity, self._prediction.last_own + 1)
-        moves = {entity for entity, *_ in way.moving} if way.after is not way.before else ()
-        for old, new in changed:
-            entity = new[ID]
-            if entity in own:
-                continue
-            if old is None or old[TEMPLATE] != new[TEMPLATE] or old[VX:] != new[VX:]:
-                self._put(new)
-            elif entity not in moves:  # otherwise each frame gives it a position
-                self._figures[entity] = _at(place_of(new), self._figures[entity])
-        if layout != self._layout:
-            self._layout = layout
-            self._figures = {entity: self._figures[entity] for entity in ids if entity not in own}
-            unsure = compress(ids, (template in self._predicted for template in templates))
-            self._unsure = {entity: self._unsure[entity] for entity in unsure if entity not in own}
-
-    def _put(self, state: list[int]) -> None:
-        """Takes the state of an entity that differs from its earlier one in more than its position."""
-        if state[TEMPLATE] in self._predicted:
-            self._unsure[state[ID]] = state
-            self._figures[state[ID]] = self._figure(state, place_of(state), EAST)
-        else:
-            self._figures[state[ID]] = self._figure(state, place_of(state), self._facing(state))
+        ways = list(zip(*(drawn.columns[column] for column in self._turning), strict=True))
+        for row, way in enumerate(ways):
+            if way not in turned and row not in ahead:
+                self._facing(drawn.states[row].tolist())
+        self._turned = set(ways)
+        self._directions = [self._facings.get(entity, EAST) for entity in ids]
 
     def _label(self) -> None:
         """Takes the attributes of all entities."""
         self._labelled = self._prediction.confirmed_copy.attribute_changes
         attributes = self._prediction.attributes
-        for entity, figure in self._figures.items():
-            values = attributes.get(entity, NO_VALUES)
-            if values is not figure.attributes:
-                self._figures[entity] = figure._replace(attributes=values)
+        self._labels = [attributes.get(entity, NO_VALUES) for entity in self._ids]
 
     def _ahead(self, entity: int, tick: float, now: float) -> EntityView | None:
         """Returns a predicted entity to draw, one tick before `tick` and with smoothing; None if it is not predicted.
@@ -148,11 +159,9 @@ class ViewBuilder:
         before, after, share = prediction.around(entity, tick - self._delay - 1)
         smoothing = self._smoothing.get(entity)
         offset = smoothing.offset(now) if smoothing else (0.0, 0.0, 0.0)
-        x, y, z = (
-            old + (new - old) * share + more
-            for old, new, more in zip(place_of(before), place_of(after), offset, strict=True)
-        )
-        return self._figure(after, (x, y, z), self._facing(after))
+        (x, y, z), (u, v, w), (i, j, k) = place_of(before), place_of(after), offset
+        place = x + (u - x) * share + i, y + (v - y) * share + j, z + (w - z) * share + k
+        return self._figure(after, place, self._facing(after))
 
     def _figure(self, state: Sequence[int], place: Vec, facing: Facing) -> EntityView:
         """Returns the view of an entity that is drawn at `place` (in blocks)."""
@@ -176,7 +185,6 @@ class ViewBuilder:
         return self._facings.get(state[ID], EAST)
 
 
-def _at(place: Vec, figure: EntityView) -> EntityView:
-    """Returns the view of an entity at another position. (`_replace` takes several times as long.)"""
-    entity, template, _, velocity, attributes, fields, facing = figure
-    return tuple.__new__(EntityView, (entity, template, place, velocity, attributes, fields, facing))
+def place_of(state: Sequence[int]) -> Vec:
+    """Returns the position in a state, in blocks."""
+    return state[X] / BLOCK, state[Y] / BLOCK, state[Z] / BLOCK

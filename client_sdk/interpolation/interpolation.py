@@ -12,11 +12,11 @@ their velocities for less than a tick, because the next snapshot may change anyt
 
 import math
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
-from shared.arrays import PLAIN, Float64s, np
+from shared.arrays import np
 from shared.checks import Vec
-from shared.layout import CELL, ID, VX, Int64s, X
+from shared.layout import CELL, ID, VX, VZ, Int64s, X, Z
 from shared.units import BLOCK, SPEED
 
 KEPT_S, KEPT_MIN = 3.0, 16
@@ -33,14 +33,40 @@ LONG_FALL, LONG_SHARE, LONG_CALM_S, FALL_MAX = 0.05, 0.5, 1.0, 1.0
 """Fall of a delay above `LONG_S`: it begins after `LONG_CALM_S` seconds without a late snapshot. Its speed in seconds
 per second is `LONG_FALL` plus `LONG_SHARE` times the seconds above `LONG_S`, at most `FALL_MAX`."""
 
-Positions = Float64s
-"""Positions in blocks, [n, 3]."""
-Entry = tuple[int, Int64s, frozenset[int]]
-"""An entry of the history: the tick of a snapshot, the states at its end, and the entities that the rules placed since
-the snapshot before."""
-Change = tuple[list[int] | None, list[int]]
-"""The states of an entity in two snapshots; None: it was not in the first one."""
-NO_ENTRY: Entry = (0, np.zeros((0, CELL), np.int64), frozenset())
+Axes = list[list[float]]
+"""Positions or ways of entities along x, y and z."""
+
+
+class Entry:
+    """A snapshot in the history.
+
+    Args:
+        tick: its tick.
+        states: the states at the end of that tick, [n, 12], ascending by id.
+        placed: the entities that the rules placed since the snapshot before.
+    """
+
+    def __init__(self, tick: int, states: Int64s, placed: frozenset[int] = frozenset()) -> None:
+        self.tick, self.states, self.placed = tick, states, placed
+        self._columns: list[tuple[int, ...]] = []
+        self._places: Axes = []
+
+    @property
+    def columns(self) -> list[tuple[int, ...]]:
+        """The columns of the states. Entries that are not drawn have none."""
+        if not self._columns:
+            self._columns = list(zip(*self.states.tolist(), strict=True)) or [()] * self.states.shape[1]
+        return self._columns
+
+    @property
+    def places(self) -> Axes:
+        """The positions of the entities in blocks."""
+        if not self._places:
+            self._places = [[position / BLOCK for position in axis] for axis in self.columns[X : Z + 1]]
+        return self._places
+
+
+NO_ENTRY = Entry(0, np.zeros((0, CELL), np.int64))
 """An entry without entities."""
 
 
@@ -62,7 +88,7 @@ class Interpolation:
             states: the confirmed states at the end of that tick, [n, 12], ascending by id.
             placed: the entities that the rules placed since the snapshot before.
         """
-        self._states.append((tick, states, placed))
+        self._states.append(Entry(tick, states, placed))
 
     def advance(self, server_tick: float, now: float) -> None:
         """Adapts the delay to the age of the newest snapshot.
@@ -75,7 +101,7 @@ class Interpolation:
             return
         if self._at == -math.inf:
             self._calm_since = self._at = now
-        short = (server_tick - self.delay_ticks) - self._states[-1][0]
+        short = (server_tick - self.delay_ticks) - self._states[-1].tick
         if short > 0:
             self.delay_ticks += short
             self._calm_since = now
@@ -100,25 +126,16 @@ class Interpolation:
         at = server_tick - self.delay_ticks
         if not self._states:
             return at
-        oldest, newest = self._states[0][0], self._states[-1][0]
+        oldest, newest = self._states[0].tick, self._states[-1].tick
         latest = min(newest + EXTRAPOLATE_S * self._rate, math.nextafter(newest + 1, newest))
         return latest if at > latest else max(oldest, at)
-
-    def sample(self, server_tick: float) -> tuple[Int64s, Positions]:
-        """Returns states ([n, 12]) and positions (blocks, [n, 3]) of all entities at the tick `shown(server_tick)`."""
-        at = self.shown(server_tick)
-        way = self.way(at)
-        share, places = way.share(at), {state[ID]: place_of(state) for state in way.states.tolist()}
-        for entity, x, y, z, u, v, w in way.moving:
-            places[entity] = (x + u * share, y + v * share, z + w * share)
-        return way.states, np.array(list(places.values()), np.float64).reshape(-1, 3)
 
     def way(self, at: float) -> "Way":
         """Returns the way on which the entities are drawn at the tick `at`."""
         before = after = self._states[-1] if self._states else NO_ENTRY
         for entry in reversed(self._states):
             before = entry
-            if entry[0] <= at:
+            if entry.tick <= at:
                 break
             after = entry
         if self._way is None or self._way.before is not before or self._way.after is not after:
@@ -130,7 +147,7 @@ class Way:
     """The ways of the entities from one snapshot to the next, or after the newest one. Frames share it.
 
     An entity that the rules placed or removed meanwhile stays at its earlier position. The positions have the floats of
-    `shared.between`.
+    `shared.between`. Everything is in columns, because a frame then needs no call for each entity.
 
     Args:
         before, after: the two snapshots; the same one twice: entities move on by their velocities.
@@ -139,45 +156,31 @@ class Way:
 
     def __init__(self, before: Entry, after: Entry, rate: float) -> None:
         self.before, self.after = before, after
-        self.tick, self.states, _ = before
-        self.ticks = after[0] - before[0] or rate
-        """The time in ticks after which the entities have gone the whole way."""
-        self.changed: list[Change] = []
-        """The entities whose states differ between the two snapshots."""
-        self.moving: list[tuple[int, float, float, float, float, float, float]] = []
-        """Numbers, positions and ways of those that move, in blocks."""
+        self._ticks = after.tick - before.tick or rate  # after these, the entities have gone the whole way
         if after is before:
-            for state in self.states.tolist():
-                u, v, w = state[VX : VX + 3]
-                if u or v or w:
-                    self.moving.append((state[ID], *place_of(state), u / SPEED, v / SPEED, w / SPEED))
-            return
-        self.changed = changes(before[1], after[1])
-        for old, new in self.changed:
-            if old is not None and new[ID] not in after[2]:
-                (x, y, z), (u, v, w) = place_of(old), place_of(new)
-                self.moving.append((new[ID], x, y, z, u - x, v - y, w - z))
+            self._ways = [[speed / SPEED for speed in axis] for axis in before.columns[VX : VZ + 1]]
+        else:
+            rows = _rows(before.columns[ID], after.columns[ID], after.placed)
+            self._ways = [_ways(*axis, rows) for axis in zip(before.places, after.places, strict=True)]
 
-    def share(self, at: float) -> float:
-        """Returns the share of the way that the entities have gone at the tick `at`."""
-        return (at - self.tick) / self.ticks
-
-
-def changes(before: Int64s, after: Int64s) -> list[Change]:
-    """Returns the entities in `after` whose states differ from those in `before`, or were not there.
-
-    Both are ascending by id.
-    """
-    if PLAIN or not len(before):
-        earlier = {state[ID]: state for state in before.tolist()}
-        return [(earlier.get(state[ID]), state) for state in after.tolist() if earlier.get(state[ID]) != state]
-    rows = np.minimum(before[:, ID].searchsorted(after[:, ID]), len(before) - 1)
-    former = before.take(rows, 0)
-    differ = (former != after).any(axis=1).nonzero()[0]
-    pairs = zip(former.take(differ, 0).tolist(), after.take(differ, 0).tolist(), strict=True)
-    return [(old if old[ID] == new[ID] else None, new) for old, new in pairs]
+    def places(self, at: float) -> Iterator[Vec]:
+        """Returns where the entities are drawn at the tick `at`, in blocks, in the order of `before`."""
+        share = (at - self.before.tick) / self._ticks
+        x, y, z = (
+            [start + way * share for start, way in zip(*axis, strict=True)]
+            for axis in zip(self.before.places, self._ways, strict=True)
+        )
+        return zip(x, y, z, strict=True)
 
 
-def place_of(state: Sequence[int]) -> Vec:
-    """Returns the position in a state, in blocks."""
-    return state[X] / BLOCK, state[X + 1] / BLOCK, state[X + 2] / BLOCK
+def _rows(ids: tuple[int, ...], there: tuple[int, ...], placed: frozenset[int]) -> Sequence[int]:
+    """Returns the row of each entity among those that are `there`; -1: there is none, or the rules have placed it."""
+    if there == ids and not placed:
+        return range(len(ids))
+    rows = {entity: row for row, entity in enumerate(there) if entity not in placed}
+    return [rows.get(entity, -1) for entity in ids]
+
+
+def _ways(starts: list[float], ends: list[float], rows: Sequence[int]) -> list[float]:
+    """Returns the way of each entity along one axis, to its row in `ends`."""
+    return [ends[row] - start if row >= 0 else 0.0 for start, row in zip(starts, rows, strict=True)]

@@ -19,36 +19,27 @@ never corrected as long as inputs arrive in time.
 """
 
 import math
-from bisect import bisect_left
 from dataclasses import dataclass
 
 from client_sdk.controls import Controls
 from client_sdk.events import Corrected
 from client_sdk.prediction.announcements import Announcements
+from client_sdk.prediction.comparison import Comparison, Place, State, state_in
 from client_sdk.prediction.confirmed import Confirmed
 from shared import edits
-from shared.aim import NO_AIM
-from shared.arrays import Truths, np
 from shared.bounds import bounds
 from shared.edits import Edit
 from shared.inputs import NEUTRAL, Input, row
-from shared.layout import CELL, ID, TEMPLATE, Int64s, X
+from shared.layout import CELL, ID, Int64s
 from shared.ring import Ring
 from shared.turns import Failure, Turns
-from shared.units import BLOCK
 from shared.world import World
-
-MEET_BLOCKS = 12
-"""Distance in blocks beyond which another entity cannot be met before the next replay, at walking speeds."""
 
 NONDETERMINISM = "nondeterminism"
 """Cause of a correction that must never occur: both sides knew the same and computed different results."""
 
 LOOK_BACK = 4
 """Number of ticks to search back for a kept state before a drawn moment; skipped snapshots leave gaps."""
-
-Place = tuple[float, float, float]
-State = tuple[int, ...]
 
 
 @dataclass(frozen=True)
@@ -59,7 +50,7 @@ class Reconciled:
     repredicted: bool
     replayed: int
     offsets: dict[int, Place]
-    """Old minus new position of each predicted entity that the replay moved, in blocks."""
+    """Old minus new position of each entity that may be drawn as predicted and that the replay moved, in blocks."""
     acted: frozenset[int]
     """Entities on which the server's rules have acted: they are drawn at their new place at once."""
     placed: frozenset[int] = frozenset()
@@ -85,19 +76,17 @@ class Prediction:
         self.entity = confirmed_copy.entity
         self.neighbours = neighbours
         scene = confirmed_copy.world.scene
-        self.last_own = self.entity + scene.extras.blocks[scene.template(scene.player)]
-        """Greatest number of an entity that the own one may have spawned; they follow its own number."""
+        self._comparison = Comparison(confirmed_copy.world, self.entity)
+        self.last_own = self._comparison.last_own
         self._controls = controls or Controls()
         self.confirmed = confirmed_copy.world
-        self.predicted = World(confirmed_copy.world.scene, compiled=confirmed_copy.world.compiled)
+        self.predicted = World(scene, compiled=confirmed_copy.world.compiled)
         self.attributes = confirmed_copy.attributes
         """Attributes of the entities that the client sees, by entity and name."""
         self.begun = False
-        limits = self._bounds = bounds(confirmed_copy.world.scene.tick_rate)
+        limits = self._bounds = bounds(scene.tick_rate)
         self._inputs: Ring[Input] = Ring(limits.predicted)
         self._states: Ring[Int64s] = Ring(limits.predicted)
-        templates = confirmed_copy.world.scene.templates
-        self._shown_ahead = np.array([template.shown == "predicted" for template in templates], np.int64)
         self.announcements = Announcements(scene.tick_rate)
         """The announcements of the own entity, for the program."""
         self.failures: list[Failure] = []
@@ -214,26 +203,26 @@ class Prediction:
         if tick > self.predicted.tick:  # the snapshot overtook the prediction: nothing to compare
             self.replay(tick)
             return Reconciled(None, False, 0, {}, acted, placed) if placed else NOTHING
-        predicted_states, confirmed_states = self._states.get(tick), self._confirmed_states()
+        predicted, confirmed = self._states.get(tick), self._confirmed_states()
         changed = confirmed_copy.terrain_changed or self._refused
-        if predicted_states is not None and not changed and self._near_equal(predicted_states, confirmed_states):
+        if predicted is not None and not changed and self._comparison.near_equal(predicted, confirmed):
             return NOTHING
         correction = None
-        if predicted_states is not None and (mine := self._difference(predicted_states, confirmed_states)):
+        if predicted is not None and (mine := self._comparison.difference(predicted, confirmed)):
             others = len(self.confirmed) > 1
             causes = (
                 (late, "late input"),
                 (self.entity in acted, "server act"),
                 (confirmed_copy.edited_near, "unknown edit"),
                 (others and (skipped or not self.neighbours), "other entity"),
-                (others and self._others_differ(predicted_states, confirmed_states), "other entity"),
+                (others and self._comparison.others_differ(predicted, confirmed), "other entity"),
                 (not confirmed_copy.grounded(), "missing terrain"),
             )
             cause = next((cause for holds, cause in causes if holds), NONDETERMINISM)
             correction = Corrected(tick, *mine, self.predicted.tick - tick, cause)
         before, now = self.predicted.states(), self.predicted.tick
         self.replay(now)
-        offsets = _offsets(before, self.predicted.states())
+        offsets = self._comparison.offsets(before, self.predicted.states())
         return Reconciled(correction, correction is None, now - tick, offsets, acted, placed)
 
     def around(self, entity: int, at: float) -> tuple[State, State, float]:
@@ -253,11 +242,11 @@ class Prediction:
         """
         newest = self.predicted.tick
         tick = min(math.floor(at), newest - 1)
-        last, after = newest, self.predicted.state(entity)
-        for later in range(max(tick + 1, newest - self._states.size), newest):
-            if (state := self._state(entity, later)) is not None:
-                last, after = later, state
+        for last in range(max(tick + 1, newest - self._states.size), newest):
+            if (after := self._state(entity, last)) is not None:
                 break
+        else:
+            last, after = newest, self.predicted.state(entity)
         for first in range(tick, tick - LOOK_BACK, -1):
             if (before := self._state(entity, first)) is not None:
                 if entity in self._placed(first, last):
@@ -277,11 +266,7 @@ class Prediction:
     def _state(self, entity: int, tick: int) -> State | None:
         """Returns the kept state of an entity at the end of a tick; None if none is kept."""
         states = self._states.get(tick)
-        if states is None:
-            return None
-        ids = states[:, ID].tolist()
-        row = bisect_left(ids, entity)
-        return tuple(states[row].tolist()) if row < len(ids) and ids[row] == entity else None
+        return None if states is None else state_in(states, entity)
 
     def sync_test(self) -> tuple[int, Int64s, Int64s] | None:
         """Runs the sync test: replays everything since the confirmed world. Changes nothing unless state is hidden.
@@ -306,7 +291,7 @@ class Prediction:
 
     def _confirmed_states(self) -> Int64s:
         states = self.confirmed_copy.states
-        return states if self.neighbours else states[self._mine(states[:, ID])]
+        return states if self.neighbours else states[self._comparison.own(states)]
 
     def replay(self, to: int) -> None:
         """Predicts again from the confirmed world on, up to the tick `to`."""
@@ -319,8 +304,8 @@ class Prediction:
         self.predicted.restore(self.confirmed)
         self.confirmed_copy.terrain_changed = self.confirmed_copy.edited_near = self._refused = False
         if not self.neighbours:
-            ids = self.predicted.states()[:, ID]
-            for entity in ids[~self._mine(ids)].tolist():
+            states = self.predicted.states()
+            for entity in states[~self._comparison.own(states)][:, ID].tolist():
                 self.predicted.forget(entity)
         self._states.put(self.confirmed.tick, self._confirmed_states())
         while self.predicted.tick < to:
@@ -341,60 +326,7 @@ class Prediction:
         """Returns the counts of the acts of the own entity and of what it has spawned, with their numbers."""
         if not self.confirmed.scene.behaviours:
             return []
-        acts: list[list[int]] = states[self._mine(states[:, ID])][:, (ID, CELL + self.confirmed.extras.acts)].tolist()
+        acts: list[list[int]] = states[self._comparison.own(states)][
+            :, (ID, CELL + self.confirmed.extras.acts)
+        ].tolist()
         return acts
-
-    def _near_equal(self, predicted_states: Int64s, confirmed_states: Int64s) -> bool:
-        """Returns whether all entities are as predicted that could meet the own one, or are drawn as predicted."""
-        if predicted_states.tobytes() == confirmed_states.tobytes():
-            return True
-        if self.confirmed.extras.count:
-            return bool(np.array_equal(self._counting(predicted_states), self._counting(confirmed_states)))
-        kernel, reach = self.confirmed.kernel, MEET_BLOCKS * BLOCK
-        a, b, always = map(kernel.lent, (predicted_states, confirmed_states, self._shown_ahead))
-        return bool(kernel.alike(a, len(predicted_states), b, len(confirmed_states), self.entity, reach, always))
-
-    def _counting(self, states: Int64s) -> Int64s:
-        """Returns the states that count in a comparison, as `bulk.alike` chooses them, with their extra columns.
-
-        The aim of others does not count: it changes in every tick, and what it leads to is compared.
-        """
-        own = states[states[:, ID] == self.entity]
-        if not len(own):
-            return states
-        ways = abs(states[:, X : X + 3] - own[0, X : X + 3])
-        near = (ways < MEET_BLOCKS * BLOCK).all(axis=1)
-        counting: Int64s = states[near | (self._shown_ahead[states[:, TEMPLATE]] != 0) | self._mine(states[:, ID])]
-        if self.confirmed.extras.aims:
-            counting[~self._mine(counting[:, ID]), CELL : CELL + len(NO_AIM)] = 0
-        return counting
-
-    def _mine(self, ids: Int64s) -> Truths:
-        """Returns for each entity whether it is the own one, or one that this has spawned."""
-        return (ids >= self.entity) & (ids <= self.last_own)
-
-    def _difference(self, predicted_states: Int64s, confirmed_states: Int64s) -> tuple[tuple[str, ...], float] | None:
-        """Returns the fields and the distance (blocks) by which the own entity differs; None if it does not."""
-        was, mine = (states[states[:, ID] == self.entity] for states in (predicted_states, confirmed_states))
-        if not len(mine) or not len(was) or np.array_equal(mine, was):
-            return None
-        now, before = mine[0].tolist(), was[0].tolist()
-        x, y, z = ((a - b) / BLOCK for a, b in zip(now[X : X + 3], before[X : X + 3], strict=True))
-        differing = zip(self.confirmed.extras.names, now, before, strict=True)
-        return tuple(name for name, a, b in differing if a != b), math.sqrt(x * x + y * y + z * z)
-
-    def _others_differ(self, predicted_states: Int64s, confirmed_states: Int64s) -> bool:
-        was, are = (states[states[:, ID] != self.entity] for states in (predicted_states, confirmed_states))
-        return not np.array_equal(was, are)
-
-
-def _offsets(before: Int64s, after: Int64s) -> dict[int, Place]:
-    """Returns old minus new position of each entity that is in both and has moved, in blocks."""
-    was = dict(zip(before[:, ID].tolist(), before[:, X : X + 3].tolist(), strict=True))
-    offsets: dict[int, Place] = {}
-    for entity, place in zip(after[:, ID].tolist(), after[:, X : X + 3].tolist(), strict=True):
-        old = was.get(entity, place)
-        if old != place:
-            x, y, z = ((a - b) / BLOCK for a, b in zip(old, place, strict=True))
-            offsets[entity] = (x, y, z)
-    return offsets

@@ -24,7 +24,8 @@ BUILT = ROOT / "build" / "native"
 MODULES = (
     "client_sdk/changing.py", "client_sdk/commands.py", "client_sdk/core.py", "client_sdk/input_loop.py",
     "client_sdk/interpolation/interpolation.py", "client_sdk/interpolation/smoothing.py", "client_sdk/netsim/linked.py",
-    "client_sdk/netsim/links.py", "client_sdk/prediction/confirmed.py", "client_sdk/prediction/prediction.py",
+    "client_sdk/netsim/links.py", "client_sdk/prediction/comparison.py", "client_sdk/prediction/confirmed.py",
+    "client_sdk/prediction/prediction.py",
     "client_sdk/program_side.py", "client_sdk/reconnect.py", "client_sdk/replica.py", "client_sdk/stats.py",
     "client_sdk/timing/lead.py", "client_sdk/timing/server_clock.py", "client_sdk/timing/timeline.py",
     "client_sdk/view_builder.py", "client_sdk/worlds.py", "server/game/clocks.py", "server/game/commands.py",

@@ -15,7 +15,7 @@ from client_sdk.interpolation.interpolation import (
     LONG_S,
     LONG_SHARE,
 )
-from shared.layout import TEMPLATE, VX, Int64s
+from shared.layout import ID, TEMPLATE, VX, Int64s
 from shared.units import BLOCK, SPEED
 
 RATE = 40.0
@@ -29,8 +29,9 @@ def states(**blocks: float) -> Int64s:
 
 def shown(interpolation: Interpolation, tick: float) -> dict[str, float]:
     """Returns the drawn x by name, with the view tick `tick`."""
-    rows, places = interpolation.sample(tick + interpolation.delay_ticks)
-    return {chr(96 + row[0]): place[0] for row, place in zip(rows.tolist(), places.tolist(), strict=True)}
+    at = interpolation.shown(tick + interpolation.delay_ticks)
+    way = interpolation.way(at)
+    return {chr(96 + entity): place[0] for entity, place in zip(way.before.columns[ID], way.places(at), strict=True)}
 
 
 def fed(*snapshots: tuple[int, Int64s]) -> Interpolation:
@@ -41,8 +42,8 @@ def fed(*snapshots: tuple[int, Int64s]) -> Interpolation:
 
 
 def test_before_the_first_snapshot_there_is_nothing() -> None:
-    rows, places = Interpolation(RATE).sample(100.0)
-    assert (rows.shape, places.shape) == ((0, 12), (0, 3))
+    way = Interpolation(RATE).way(100.0)
+    assert (way.before.columns, list(way.places(100.0))) == ([()] * 12, [])
     Interpolation(RATE).advance(1.0, 1.0)
 
 
@@ -146,10 +147,8 @@ def test_a_thing_that_is_placed_and_changed_is_drawn_as_it_was_until_then() -> N
     after = states(a=4)
     after[:, TEMPLATE] = 3
     interpolation = acts((10, states(a=0), ""), (11, after, "a"))
-    templates = [
-        interpolation.sample(tick + interpolation.delay_ticks)[0][0, TEMPLATE] for tick in (10.0, 10.5, 11.0, 11.5)
-    ]
-    assert templates == [0, 0, 3, 3]
+    ways = [interpolation.way(tick) for tick in (10.0, 10.5, 11.0, 11.5)]
+    assert [way.before.columns[TEMPLATE] for way in ways] == [(0,), (0,), (3,), (3,)]
     assert shown(interpolation, 10.5) == {"a": 0}
 
 

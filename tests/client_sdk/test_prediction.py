@@ -33,13 +33,13 @@ def ground() -> Scene:
 class Pair:
     """A server's world, and the prediction of the client whose entity is `ME`."""
 
-    def __init__(self, *others: tuple[float, float, float], **options: Any) -> None:
+    def __init__(self, *others: tuple[float, float, float], shown: str = "interpolated", **options: Any) -> None:
         self.server = World(ground(), compiled=False)
         self.server.load_terrain()
         self.server.spawn("box", (16, 16, 1))
         for place in others:
             self.server.spawn("box", place)
-        self.confirmed_copy = Confirmed(ground(), ME, compiled=False)
+        self.confirmed_copy = Confirmed(ground().with_changes("box", shown=shown), ME, compiled=False)
         self.client = Prediction(self.confirmed_copy, **options)
         for segment in (HERE, BESIDE):
             self.confirmed_copy.load_segment(segment, self.server.blocks.segment(segment).reshape(-1))
@@ -163,13 +163,14 @@ def test_after_a_correction_the_replay_is_what_the_server_will_compute() -> None
     assert pair.client.predicted.state_hash() == pair.server.state_hash()
 
 
-def test_a_new_input_of_another_entity_is_a_reprediction_and_no_correction() -> None:
-    pair = Pair((20, 20, 1))
+@pytest.mark.parametrize(("shown", "drawn_ahead"), [("interpolated", set()), ("predicted", {OTHER})])
+def test_a_new_input_of_another_entity_is_a_reprediction_and_no_correction(shown: str, drawn_ahead: set[int]) -> None:
+    pair = Pair((20, 20, 1), shown=shown)
     pair.ahead(EAST, EAST, EAST)
     pair.act(EAST, others=NORTH)
     pair.tell()
     done = pair.reconcile()
-    assert (done.correction, done.repredicted, done.replayed, set(done.offsets)) == (None, True, 2, {OTHER})
+    assert (done.correction, done.repredicted, done.replayed, set(done.offsets)) == (None, True, 2, drawn_ahead)
     pair.act(EAST, EAST, others=NORTH)
     assert pair.client.predicted.state_hash() == pair.server.state_hash()
 

@@ -3,16 +3,12 @@
 import random
 from dataclasses import replace
 
-import numpy as np
 import pytest
 
 from client_sdk.core import Core
-from client_sdk.interpolation import interpolation
-from client_sdk.interpolation.interpolation import changes
 from client_sdk.view import View
 from client_sdk.view_builder import ViewBuilder
 from server.rules import Rules
-from shared.layout import ID, Int64s
 from shared.scene import Scene, Template, load_scene
 from shared.world import OverlapError
 from sovereign_netcode.playtest import PRESETS, Match, Player, wander
@@ -88,26 +84,3 @@ def test_a_view_depends_on_the_present_alone(shown: str, link: str) -> None:
         match.run(frames.choice((0.002, 0.01, 0.03, 0.2)))
         entities += compared(players)
     assert entities > 1000
-
-
-def rows(draw: random.Random) -> Int64s:
-    """Returns random states of some of six entities."""
-    ids = sorted(draw.sample(range(1, 7), draw.randrange(7)))
-    states = [[entity, *(draw.randrange(2) for _ in range(11))] for entity in ids]
-    return np.array(states, np.int64).reshape(-1, 12)
-
-
-@pytest.mark.parametrize("plain", [False, True])
-def test_changes_are_the_states_that_differ(plain: bool, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(interpolation, "PLAIN", plain)
-    draw, seen = random.Random(5), set()
-    for _ in range(300):
-        before, after = rows(draw), rows(draw)
-        if len(after) and draw.random() < 0.5:  # mostly as before, as in a game
-            before = after.copy()
-            before[draw.randrange(len(before)), draw.randrange(1, 12)] ^= 1
-        old = {state[ID]: state for state in before.tolist()}
-        expected = [(old.get(state[ID]), state) for state in after.tolist() if old.get(state[ID]) != state]
-        assert changes(before, after) == expected
-        seen |= {"new" if was is None else "changed" for was, _ in expected}
-    assert seen == {"new", "changed"}

@@ -19,7 +19,7 @@ from server.rewind.history import WINDOW_S, Hit, Past
 from shared.block_kind import BlockKind
 from shared.checks import Cell, SceneError, Vec
 from shared.inputs import Input
-from shared.layout import Int64s
+from shared.layout import ID, Int64s
 from shared.rays import Ray
 from shared.scene import load_scene
 from shared.world import World
@@ -125,8 +125,9 @@ def test_between_two_snapshots_everybody_is_where_the_sdk_draws_them(seed: int, 
         past = rewind.at(seen, 0, gaps)
         if any(since < world.tick - len(rewind._undo) and since <= seen < until for since, until in gaps):
             return  # longer than lag compensation reaches back
-        states, places = interpolation.sample(seen)
-        drawn = dict(zip(states[:, 0].tolist(), map(tuple, places.tolist()), strict=True))
+        at = interpolation.shown(seen)
+        way = interpolation.way(at)
+        drawn = dict(zip(way.before.columns[ID], way.places(at), strict=True))
         assert {entity: past.position(entity) for entity in drawn} == drawn
         assert past.box((-99, -99, -99), (99, 99, 99)) == sorted(drawn)
         looks += 1

@@ -1,0 +1,103 @@
+"""Comparison of predicted with confirmed states: which entities count, and by how much they differ.
+
+All arguments are states of worlds, [n, 12], ascending by id; in a scene with extra columns (`shared.extras`) wider.
+"""
+
+import math
+from bisect import bisect_left
+
+from shared.aim import NO_AIM
+from shared.arrays import Truths, np
+from shared.layout import CELL, ID, TEMPLATE, Int64s, X, Y, Z
+from shared.units import BLOCK
+from shared.world import World
+
+MEET_BLOCKS = 12
+"""Distance in blocks beyond which another entity cannot be met before the next replay, at walking speeds."""
+
+Place = tuple[float, float, float]
+State = tuple[int, ...]
+
+
+class Comparison:
+    """Compares states for the client of one entity.
+
+    Args:
+        world: the confirmed world.
+        entity: number of the own entity.
+    """
+
+    def __init__(self, world: World, entity: int) -> None:
+        scene = world.scene
+        self.entity = entity
+        self.last_own = entity + scene.extras.blocks[scene.template(scene.player)]
+        """Greatest number of an entity that the own one may have spawned; they follow its own number."""
+        self._world = world
+        self._shown_ahead = np.array([template.shown == "predicted" for template in scene.templates], np.int64)
+
+    def own(self, states: Int64s) -> Truths:
+        """Returns for each entity whether it is the own one, or one that this has spawned."""
+        ids = states[:, ID]
+        return (ids >= self.entity) & (ids <= self.last_own)
+
+    def near_equal(self, predicted: Int64s, confirmed: Int64s) -> bool:
+        """Returns whether all entities are as predicted that could meet the own one, or are drawn as predicted."""
+        if predicted.tobytes() == confirmed.tobytes():
+            return True
+        if self._world.extras.count:
+            return bool(np.array_equal(self._counting(predicted), self._counting(confirmed)))
+        kernel, reach = self._world.kernel, MEET_BLOCKS * BLOCK
+        a, b, always = map(kernel.lent, (predicted, confirmed, self._shown_ahead))
+        return bool(kernel.alike(a, len(predicted), b, len(confirmed), self.entity, reach, always))
+
+    def difference(self, predicted: Int64s, confirmed: Int64s) -> tuple[tuple[str, ...], float] | None:
+        """Returns the fields and the distance (blocks) by which the own entity differs; None if it does not."""
+        before, now = state_in(predicted, self.entity), state_in(confirmed, self.entity)
+        if before is None or now is None or before == now:
+            return None
+        x, y, z = ((a - b) / BLOCK for a, b in zip(now[X : X + 3], before[X : X + 3], strict=True))
+        differing = zip(self._world.extras.names, now, before, strict=True)
+        return tuple(name for name, a, b in differing if a != b), math.sqrt(x * x + y * y + z * z)
+
+    def others_differ(self, predicted: Int64s, confirmed: Int64s) -> bool:
+        """Returns whether any other entity differs."""
+        was, are = (states[states[:, ID] != self.entity] for states in (predicted, confirmed))
+        return not np.array_equal(was, are)
+
+    def offsets(self, before: Int64s, after: Int64s) -> dict[int, Place]:
+        """Returns old minus new position of each entity that may be drawn as predicted and has moved, in blocks."""
+        if not self._shown_ahead.any():
+            before, after = (states[self.own(states)] for states in (before, after))
+        was, offsets = {state[ID]: state for state in before.tolist()}, {}
+        for state in after.tolist():
+            x, y, z = ((was.get(state[ID], state)[axis] - state[axis]) / BLOCK for axis in (X, Y, Z))
+            if x or y or z:
+                offsets[state[ID]] = (x, y, z)
+        return offsets
+
+    def _counting(self, states: Int64s) -> Int64s:
+        """Returns the states that count in a comparison, as `bulk.alike` chooses them, with their extra columns.
+
+        The aim of others does not count: it changes in every tick, and what it leads to is compared.
+        """
+        own = states[states[:, ID] == self.entity]
+        if not len(own):
+            return states
+        ways = abs(states[:, X : X + 3] - own[0, X : X + 3])
+        near = (ways < MEET_BLOCKS * BLOCK).all(axis=1)
+        counting: Int64s = states[near | self._drawn_ahead(states)]
+        if self._world.extras.aims:
+            counting[~self.own(counting), CELL : CELL + len(NO_AIM)] = 0
+        return counting
+
+    def _drawn_ahead(self, states: Int64s) -> Truths:
+        """Returns for each entity whether it is drawn as predicted."""
+        ahead: Truths = self.own(states) | (self._shown_ahead[states[:, TEMPLATE]] != 0)
+        return ahead
+
+
+def state_in(states: Int64s, entity: int) -> State | None:
+    """Returns the state of an entity; None if it is not there."""
+    ids = states[:, ID].tolist()
+    row = bisect_left(ids, entity)
+    return tuple(states[row].tolist()) if row < len(ids) and ids[row] == entity else None
