@@ -5,7 +5,7 @@ Other entities are drawn as predicted, too, if their template is shown so (`show
 
 import math
 from bisect import bisect_left, bisect_right
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from functools import partial
 from typing import Any
 
@@ -16,8 +16,9 @@ from client_sdk.prediction.prediction import Prediction, Reconciled
 from client_sdk.timing.server_clock import ServerClock
 from client_sdk.timing.timeline import Timeline
 from client_sdk.view import NO_VALUES, EntityView, View
+from shared.arrays import np
 from shared.checks import Vec
-from shared.layout import CELL, ID, MOVE_X, MOVE_Y, TEMPLATE, VX, VY, VZ, X, Y, Z
+from shared.layout import CELL, ID, MOVE_X, TEMPLATE, VX, Int64s, X, Y, Z
 from shared.scene import Scene
 from shared.units import BLOCK, SPEED
 
@@ -42,17 +43,16 @@ class ViewBuilder:
         self._smoothing: dict[int, Smoothing] = {}
         self._extras = scene.extras
         self._facings: dict[int, Facing] = {}
-        self._drawn = NO_ENTRY  # the snapshot from which on the others are drawn; its entities:
-        self._ids: tuple[int, ...] = ()
+        self._drawn = NO_ENTRY  # the snapshot from which on the others are drawn
+        self._layout: tuple[list[int], list[int]] = [], []  # numbers and templates of its entities; then in that order:
         self._names: list[str] = []
         self._velocities: list[Vec] = []
         self._labels: list[Mapping[str, Any]] = []
         self._fields: list[Mapping[str, int]] = []
         self._directions: list[Facing] = []
         self._own = slice(0)  # rows of the own ones
-        self._unsure: list[tuple[int, list[int]]] = []  # rows and states of those that may be drawn as predicted
-        self._turning = (ID, TEMPLATE, MOVE_X, MOVE_Y, VX, VY, *((CELL, CELL + 1) if scene.extras.aims else ()))
-        self._turned: set[tuple[int, ...]] = set()  # these columns of the entities, which tell their directions
+        self._unsure: list[int] = []  # rows of those that may be drawn as predicted
+        self._ahead_rows: set[int] = set()  # both
         self._known: dict[tuple[int, ...], Mapping[str, int]] = {}  # fields by template and extra columns
         self._labelled = -1  # state of the attributes in `_labels`
         self._delay = 0.0  # the input delay of the latest view, in ticks
@@ -88,13 +88,13 @@ class ViewBuilder:
         way = self.interpolation.way(seen)
         if way.before is not self._drawn:
             self._follow(way.before)
-        elif self._labelled != prediction.confirmed_copy.attribute_changes:
+        if self._labelled != prediction.confirmed_copy.attribute_changes:
             self._label()
         looks = self._velocities, self._labels, self._fields, self._directions
-        others = list(map(_entity_view, zip(self._ids, self._names, way.places(seen), *looks, strict=True)))
-        for row, state in self._unsure:
-            ahead = self._ahead(state[ID], tick, now)
-            others[row] = ahead or others[row]._replace(facing=self._facing(state))
+        others = list(map(_entity_view, zip(way.before.ids, self._names, way.places(seen), *looks, strict=True)))
+        for row in self._unsure:
+            ahead = self._ahead(self._drawn.ids[row], tick, now)
+            others[row] = ahead or others[row]._replace(facing=self._facing(self._drawn.states[row].tolist()))
         del others[self._own]
         if prediction.last_own > prediction.entity:  # what the own entity has spawned: predicted, like itself
             own = (self._ahead(entity, tick, now) for entity in prediction.spawned())
@@ -103,50 +103,48 @@ class ViewBuilder:
 
     def _follow(self, drawn: Entry) -> None:
         """Takes the states of another snapshot, from which on the others are drawn."""
-        self._drawn, columns = drawn, drawn.columns
-        self._ids, templates = ids, _ = columns[ID], columns[TEMPLATE]
+        former, self._drawn = self._drawn, drawn
+        states, layout = drawn.states, (drawn.ids, drawn.states[:, TEMPLATE].tolist())
+        fresh: Iterable[int] = range(len(states))
+        if layout == self._layout and former is not NO_ENTRY:
+            fresh = np.flatnonzero((states[:, VX:] != former.states[:, VX:]).any(axis=1)).tolist()
+        else:
+            self._arrange(*layout)
+        self._velocities = list(map(tuple, drawn.velocities.tolist()))
+        if self._extras.count:
+            self._fields = self._fields_in(states, layout[1])
+        for row in fresh:
+            if row not in self._ahead_rows:
+                self._facing(states[row].tolist())
+        self._directions = [self._facings.get(entity, EAST) for entity in drawn.ids]
+
+    def _arrange(self, ids: list[int], templates: list[int]) -> None:
+        """Takes other entities or templates than those in the snapshot before."""
+        self._layout = ids, templates
         first, last = self._prediction.entity, self._prediction.last_own
         self._own = slice(bisect_left(ids, first), bisect_right(ids, last))
+        own = range(*self._own.indices(len(ids)))
+        self._unsure = [row for row, kind in enumerate(templates) if kind in self._predicted and row not in own]
+        self._ahead_rows = {*own, *self._unsure}
         self._names = [self._templates[template] for template in templates]
-        self._velocities = list(zip(*([speed / SPEED for speed in axis] for axis in columns[VX : VZ + 1]), strict=True))
-        self._fields = self._fields_in(columns) if self._extras.count else [NO_VALUES] * len(ids)
+        self._fields = [NO_VALUES] * len(ids)
         self._label()
-        ahead = set(range(len(ids))[self._own])
-        self._unsure = []
-        if self._predicted:
-            unsure = [row for row, template in enumerate(templates) if template in self._predicted and row not in ahead]
-            self._unsure = [(row, drawn.states[row].tolist()) for row in unsure]
-            ahead.update(unsure)
-        self._turn(drawn, ahead)
-
-    def _fields_in(self, columns: Sequence[tuple[int, ...]]) -> list[Mapping[str, int]]:
-        """Returns the fields of the behaviours of all entities. Those that have the same as before share them."""
-        looks = list(zip(columns[TEMPLATE], *columns[CELL:], strict=True))
-        known, fields_of = self._known, self._prediction.predicted.fields_of
-        self._known = {look: known.get(look) or fields_of(look[0], list(look[1:])) for look in looks}
-        return [self._known[look] for look in looks]
-
-    def _turn(self, drawn: Entry, ahead: set[int]) -> None:
-        """Takes the directions of the entities that walk, move or aim otherwise than in the snapshot before.
-
-        Those in the rows `ahead` look as predicted.
-        """
-        ids, turned = self._ids, self._turned
         if len(self._facings) > 2 * len(ids) + FACINGS_MIN:
             there = set(ids)
             self._facings = {entity: facing for entity, facing in self._facings.items() if entity in there}
-        ways = list(zip(*(drawn.columns[column] for column in self._turning), strict=True))
-        for row, way in enumerate(ways):
-            if way not in turned and row not in ahead:
-                self._facing(drawn.states[row].tolist())
-        self._turned = set(ways)
-        self._directions = [self._facings.get(entity, EAST) for entity in ids]
+
+    def _fields_in(self, states: Int64s, templates: list[int]) -> list[Mapping[str, int]]:
+        """Returns the fields of the behaviours of all entities. Those that have the same as before share them."""
+        looks = [(template, *extra) for template, extra in zip(templates, states[:, CELL:].tolist(), strict=True)]
+        known, fields_of = self._known, self._prediction.predicted.fields_of
+        self._known = {look: known.get(look) or fields_of(look[0], list(look[1:])) for look in looks}
+        return [self._known[look] for look in looks]
 
     def _label(self) -> None:
         """Takes the attributes of all entities."""
         self._labelled = self._prediction.confirmed_copy.attribute_changes
         attributes = self._prediction.attributes
-        self._labels = [attributes.get(entity, NO_VALUES) for entity in self._ids]
+        self._labels = [attributes.get(entity, NO_VALUES) for entity in self._drawn.ids]
 
     def _ahead(self, entity: int, tick: float, now: float) -> EntityView | None:
         """Returns a predicted entity to draw, one tick before `tick` and with smoothing; None if it is not predicted.

@@ -12,11 +12,10 @@ their velocities for less than a tick, because the next snapshot may change anyt
 
 import math
 from collections import deque
-from collections.abc import Iterator, Sequence
 
-from shared.arrays import np
+from shared.arrays import Float64s, np
 from shared.checks import Vec
-from shared.layout import CELL, ID, VX, VZ, Int64s, X, Z
+from shared.layout import CELL, ID, VX, Int64s, X
 from shared.units import BLOCK, SPEED
 
 KEPT_S, KEPT_MIN = 3.0, 16
@@ -33,9 +32,6 @@ LONG_FALL, LONG_SHARE, LONG_CALM_S, FALL_MAX = 0.05, 0.5, 1.0, 1.0
 """Fall of a delay above `LONG_S`: it begins after `LONG_CALM_S` seconds without a late snapshot. Its speed in seconds
 per second is `LONG_FALL` plus `LONG_SHARE` times the seconds above `LONG_S`, at most `FALL_MAX`."""
 
-Axes = list[list[float]]
-"""Positions or ways of entities along x, y and z."""
-
 
 class Entry:
     """A snapshot in the history.
@@ -48,22 +44,27 @@ class Entry:
 
     def __init__(self, tick: int, states: Int64s, placed: frozenset[int] = frozenset()) -> None:
         self.tick, self.states, self.placed = tick, states, placed
-        self._columns: list[tuple[int, ...]] = []
-        self._places: Axes = []
+        self._ids: list[int] | None = None
+        self._places: Float64s | None = None
 
     @property
-    def columns(self) -> list[tuple[int, ...]]:
-        """The columns of the states. Entries that are not drawn have none."""
-        if not self._columns:
-            self._columns = list(zip(*self.states.tolist(), strict=True)) or [()] * self.states.shape[1]
-        return self._columns
+    def ids(self) -> list[int]:
+        """The numbers of the entities. Most entries are not drawn, and have no lists."""
+        if self._ids is None:
+            self._ids = self.states[:, ID].tolist()
+        return self._ids
 
     @property
-    def places(self) -> Axes:
-        """The positions of the entities in blocks."""
-        if not self._places:
-            self._places = [[position / BLOCK for position in axis] for axis in self.columns[X : Z + 1]]
+    def places(self) -> Float64s:
+        """The positions of the entities in blocks, [n, 3]."""
+        if self._places is None:
+            self._places = self.states[:, X : X + 3] / BLOCK
         return self._places
+
+    @property
+    def velocities(self) -> Float64s:
+        """The velocities of the entities in blocks/s, [n, 3]."""
+        return self.states[:, VX : VX + 3] / SPEED
 
 
 NO_ENTRY = Entry(0, np.zeros((0, CELL), np.int64))
@@ -147,7 +148,7 @@ class Way:
     """The ways of the entities from one snapshot to the next, or after the newest one. Frames share it.
 
     An entity that the rules placed or removed meanwhile stays at its earlier position. The positions have the floats of
-    `shared.between`. Everything is in columns, because a frame then needs no call for each entity.
+    `shared.between`. Everything is in columns, because that takes no call for each entity.
 
     Args:
         before, after: the two snapshots; the same one twice: entities move on by their velocities.
@@ -157,30 +158,22 @@ class Way:
     def __init__(self, before: Entry, after: Entry, rate: float) -> None:
         self.before, self.after = before, after
         self._ticks = after.tick - before.tick or rate  # after these, the entities have gone the whole way
-        if after is before:
-            self._ways = [[speed / SPEED for speed in axis] for axis in before.columns[VX : VZ + 1]]
-        else:
-            rows = _rows(before.columns[ID], after.columns[ID], after.placed)
-            self._ways = [_ways(*axis, rows) for axis in zip(before.places, after.places, strict=True)]
+        ways = before.velocities if after is before else _ends(before, after) - before.places
+        self._moves: list[list[float]] = np.concatenate((before.places, ways), axis=1).tolist()
 
-    def places(self, at: float) -> Iterator[Vec]:
+    def places(self, at: float) -> list[Vec]:
         """Returns where the entities are drawn at the tick `at`, in blocks, in the order of `before`."""
         share = (at - self.before.tick) / self._ticks
-        x, y, z = (
-            [start + way * share for start, way in zip(*axis, strict=True)]
-            for axis in zip(self.before.places, self._ways, strict=True)
-        )
-        return zip(x, y, z, strict=True)
+        return [(x + u * share, y + v * share, z + w * share) for x, y, z, u, v, w in self._moves]
 
 
-def _rows(ids: tuple[int, ...], there: tuple[int, ...], placed: frozenset[int]) -> Sequence[int]:
-    """Returns the row of each entity among those that are `there`; -1: there is none, or the rules have placed it."""
-    if there == ids and not placed:
-        return range(len(ids))
+def _ends(before: Entry, after: Entry) -> Float64s:
+    """Returns where the entities of a snapshot are in a later one. Those that it does not move are where they were."""
+    ids, there, placed = before.ids, after.ids, after.placed
+    if ids == there and not placed:
+        return after.places
     rows = {entity: row for row, entity in enumerate(there) if entity not in placed}
-    return [rows.get(entity, -1) for entity in ids]
-
-
-def _ways(starts: list[float], ends: list[float], rows: Sequence[int]) -> list[float]:
-    """Returns the way of each entity along one axis, to its row in `ends`."""
-    return [ends[row] - start if row >= 0 else 0.0 for start, row in zip(starts, rows, strict=True)]
+    moved = [row for row, entity in enumerate(ids) if entity in rows]
+    ends = before.places.copy()
+    ends[moved] = after.places.take([rows[ids[row]] for row in moved], 0)
+    return ends

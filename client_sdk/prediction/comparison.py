@@ -4,10 +4,10 @@ All arguments are states of worlds, [n, 12], ascending by id; in a scene with ex
 """
 
 import math
-from bisect import bisect_left
+from bisect import bisect_left, bisect_right
 
 from shared.aim import NO_AIM
-from shared.arrays import Truths, np
+from shared.arrays import np
 from shared.layout import CELL, ID, TEMPLATE, Int64s, X, Y, Z
 from shared.units import BLOCK
 from shared.world import World
@@ -34,11 +34,13 @@ class Comparison:
         """Greatest number of an entity that the own one may have spawned; they follow its own number."""
         self._world = world
         self._shown_ahead = np.array([template.shown == "predicted" for template in scene.templates], np.int64)
+        self._others_ahead = any(template.shown == "predicted" for template in scene.templates)
 
-    def own(self, states: Int64s) -> Truths:
-        """Returns for each entity whether it is the own one, or one that this has spawned."""
-        ids = states[:, ID]
-        return (ids >= self.entity) & (ids <= self.last_own)
+    def own(self, states: Int64s) -> Int64s:
+        """Returns the states of the own entity and of what it has spawned. A view."""
+        ids = states[:, ID].tolist()
+        own: Int64s = states[bisect_left(ids, self.entity) : bisect_right(ids, self.last_own)]
+        return own
 
     def near_equal(self, predicted: Int64s, confirmed: Int64s) -> bool:
         """Returns whether all entities are as predicted that could meet the own one, or are drawn as predicted."""
@@ -66,8 +68,8 @@ class Comparison:
 
     def offsets(self, before: Int64s, after: Int64s) -> dict[int, Place]:
         """Returns old minus new position of each entity that may be drawn as predicted and has moved, in blocks."""
-        if not self._shown_ahead.any():
-            before, after = (states[self.own(states)] for states in (before, after))
+        if not self._others_ahead:
+            before, after = self.own(before), self.own(after)
         was, offsets = {state[ID]: state for state in before.tolist()}, {}
         for state in after.tolist():
             x, y, z = ((was.get(state[ID], state)[axis] - state[axis]) / BLOCK for axis in (X, Y, Z))
@@ -85,15 +87,13 @@ class Comparison:
             return states
         ways = abs(states[:, X : X + 3] - own[0, X : X + 3])
         near = (ways < MEET_BLOCKS * BLOCK).all(axis=1)
-        counting: Int64s = states[near | self._drawn_ahead(states)]
+        ids = states[:, ID]
+        mine = (ids >= self.entity) & (ids <= self.last_own)
+        counts = near | mine | (self._shown_ahead[states[:, TEMPLATE]] != 0)
+        counting: Int64s = states[counts]
         if self._world.extras.aims:
-            counting[~self.own(counting), CELL : CELL + len(NO_AIM)] = 0
+            counting[~mine[counts], CELL : CELL + len(NO_AIM)] = 0
         return counting
-
-    def _drawn_ahead(self, states: Int64s) -> Truths:
-        """Returns for each entity whether it is drawn as predicted."""
-        ahead: Truths = self.own(states) | (self._shown_ahead[states[:, TEMPLATE]] != 0)
-        return ahead
 
 
 def state_in(states: Int64s, entity: int) -> State | None:

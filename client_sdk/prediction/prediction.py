@@ -260,8 +260,9 @@ class Prediction:
 
     def _placed(self, since: int, to: int) -> frozenset[int]:
         """Returns the entities that the server's rules placed after the tick `since`, up to `to`."""
+        placed = self.confirmed_copy.placed
         ticks = range(max(since, to - self.confirmed_copy.follow_max) + 1, to + 1)
-        return frozenset().union(*(ids for tick in ticks if (ids := self.confirmed_copy.placed.get(tick))))
+        return frozenset().union(*[ids for tick in ticks if (ids := placed.get(tick))])
 
     def _state(self, entity: int, tick: int) -> State | None:
         """Returns the kept state of an entity at the end of a tick; None if none is kept."""
@@ -291,7 +292,7 @@ class Prediction:
 
     def _confirmed_states(self) -> Int64s:
         states = self.confirmed_copy.states
-        return states if self.neighbours else states[self._comparison.own(states)]
+        return states if self.neighbours else self._comparison.own(states)
 
     def replay(self, to: int) -> None:
         """Predicts again from the confirmed world on, up to the tick `to`."""
@@ -304,9 +305,9 @@ class Prediction:
         self.predicted.restore(self.confirmed)
         self.confirmed_copy.terrain_changed = self.confirmed_copy.edited_near = self._refused = False
         if not self.neighbours:
-            states = self.predicted.states()
-            for entity in states[~self._comparison.own(states)][:, ID].tolist():
-                self.predicted.forget(entity)
+            for entity in self.predicted.states()[:, ID].tolist():
+                if not self.entity <= entity <= self.last_own:
+                    self.predicted.forget(entity)
         self._states.put(self.confirmed.tick, self._confirmed_states())
         while self.predicted.tick < to:
             self.step()
@@ -326,7 +327,6 @@ class Prediction:
         """Returns the counts of the acts of the own entity and of what it has spawned, with their numbers."""
         if not self.confirmed.scene.behaviours:
             return []
-        acts: list[list[int]] = states[self._comparison.own(states)][
-            :, (ID, CELL + self.confirmed.extras.acts)
-        ].tolist()
+        own = self._comparison.own(states)
+        acts: list[list[int]] = own[:, (ID, CELL + self.confirmed.extras.acts)].tolist()
         return acts

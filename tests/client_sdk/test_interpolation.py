@@ -15,7 +15,7 @@ from client_sdk.interpolation.interpolation import (
     LONG_S,
     LONG_SHARE,
 )
-from shared.layout import ID, TEMPLATE, VX, Int64s
+from shared.layout import TEMPLATE, VX, Int64s
 from shared.units import BLOCK, SPEED
 
 RATE = 40.0
@@ -31,7 +31,7 @@ def shown(interpolation: Interpolation, tick: float) -> dict[str, float]:
     """Returns the drawn x by name, with the view tick `tick`."""
     at = interpolation.shown(tick + interpolation.delay_ticks)
     way = interpolation.way(at)
-    return {chr(96 + entity): place[0] for entity, place in zip(way.before.columns[ID], way.places(at), strict=True)}
+    return {chr(96 + entity): place[0] for entity, place in zip(way.before.ids, way.places(at), strict=True)}
 
 
 def fed(*snapshots: tuple[int, Int64s]) -> Interpolation:
@@ -43,7 +43,7 @@ def fed(*snapshots: tuple[int, Int64s]) -> Interpolation:
 
 def test_before_the_first_snapshot_there_is_nothing() -> None:
     way = Interpolation(RATE).way(100.0)
-    assert (way.before.columns, list(way.places(100.0))) == ([()] * 12, [])
+    assert (way.before.ids, way.places(100.0)) == ([], [])
     Interpolation(RATE).advance(1.0, 1.0)
 
 
@@ -148,7 +148,7 @@ def test_a_thing_that_is_placed_and_changed_is_drawn_as_it_was_until_then() -> N
     after[:, TEMPLATE] = 3
     interpolation = acts((10, states(a=0), ""), (11, after, "a"))
     ways = [interpolation.way(tick) for tick in (10.0, 10.5, 11.0, 11.5)]
-    assert [way.before.columns[TEMPLATE] for way in ways] == [(0,), (0,), (3,), (3,)]
+    assert [way.before.states[0, TEMPLATE] for way in ways] == [0, 0, 3, 3]
     assert shown(interpolation, 10.5) == {"a": 0}
 
 

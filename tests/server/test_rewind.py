@@ -19,7 +19,7 @@ from server.rewind.history import WINDOW_S, Hit, Past
 from shared.block_kind import BlockKind
 from shared.checks import Cell, SceneError, Vec
 from shared.inputs import Input
-from shared.layout import ID, Int64s
+from shared.layout import Int64s
 from shared.rays import Ray
 from shared.scene import load_scene
 from shared.world import World
@@ -127,7 +127,7 @@ def test_between_two_snapshots_everybody_is_where_the_sdk_draws_them(seed: int, 
             return  # longer than lag compensation reaches back
         at = interpolation.shown(seen)
         way = interpolation.way(at)
-        drawn = dict(zip(way.before.columns[ID], way.places(at), strict=True))
+        drawn = dict(zip(way.before.ids, way.places(at), strict=True))
         assert {entity: past.position(entity) for entity in drawn} == drawn
         assert past.box((-99, -99, -99), (99, 99, 99)) == sorted(drawn)
         looks += 1
