@@ -19,7 +19,7 @@ from client_sdk.transports.common import TIMEOUT_S, ConnectError
 from shared import messages
 from tests.client_sdk.servers import accept, real_server, request, scripted_server, silent_server
 from tests.lengths import long
-from tests.patience import PATIENCE_S
+from tests.patience import PATIENCE_S, soon
 
 pytestmark = pytest.mark.e2e
 
@@ -52,11 +52,6 @@ async def first(client: AsyncClient, kind: type[Event]) -> Any:
     raise AssertionError(f"it ended without {kind.__name__}")
 
 
-async def until(so: Callable[[], bool]) -> None:
-    while not so():  # noqa: ASYNC110  # what it waits for happens in the client, which has no event for it
-        await asyncio.sleep(0.01)
-
-
 def test_a_player_joins_walks_and_leaves(url: str, run: Run) -> None:
     async def scene() -> None:
         async with await AsyncClient.connect(url, name="Ann") as client:
@@ -65,7 +60,7 @@ def test_a_player_joins_walks_and_leaves(url: str, run: Run) -> None:
             before = client.view().me
             client.set_input(1, 0)
             goal = client.stats.inputs_sent + 32
-            await until(lambda: client.stats.inputs_sent >= goal)
+            await soon(lambda: client.stats.inputs_sent >= goal)
             after = client.view().me
             assert before is not None
             assert after is not None
@@ -92,7 +87,7 @@ def test_a_block_is_placed_and_the_input_delay_changed(url: str, run: Run) -> No
             assert await first(client, Answered) == Answered(2, False, "out of reach")
             prediction = client.core.prediction
             assert prediction is not None
-            await until(lambda: prediction.confirmed.blocks.get(x + 2, y, z + 2) == 3)
+            await soon(lambda: prediction.confirmed.blocks.get(x + 2, y, z + 2) == 3)
             assert prediction.ahead == 2
             client.edit(x + 2, y, z + 2, 0)
             await first(client, Answered)
@@ -114,9 +109,9 @@ def test_bots_play_side_by_side_without_a_task_each(url: str, run: Run) -> None:
     async def scene() -> None:
         bots = [Bot(Wander(random.Random(seed))) for seed in range(8)]
         clients = await asyncio.gather(*(AsyncClient.connect(url, before_update=bot) for bot in bots))
-        await until(lambda: all(client.core.state == "playing" for client in clients))
+        await soon(lambda: all(client.core.state == "playing" for client in clients))
         goal = max(client.stats.snapshots for client in clients) + 32
-        await until(lambda: all(client.stats.snapshots >= goal for client in clients))
+        await soon(lambda: all(client.stats.snapshots >= goal for client in clients))
         assert len(asyncio.all_tasks()) <= 2
         for client in clients:
             assert client.stats.snapshots_skipped == 0
@@ -220,7 +215,7 @@ def test_an_error_in_before_update_is_reported_and_the_player_goes_on(url: str, 
         told: list[dict[str, Any]] = []
         asyncio.get_running_loop().set_exception_handler(lambda _, context: told.append(context))
         async with await AsyncClient.connect(url, before_update=wrong) as client:
-            await until(lambda: calls >= 3 and client.stats.inputs_sent >= 2)
+            await soon(lambda: calls >= 3 and client.stats.inputs_sent >= 2)
             assert client.playing
         assert {type(context["exception"]) for context in told} == {LookupError}
 
@@ -234,7 +229,7 @@ def test_two_waiting_tasks_both_get_the_end(url: str, run: Run) -> None:
 
         client = await AsyncClient.connect(url)
         both = asyncio.gather(all_of(client), all_of(client))
-        await until(lambda: client.playing)
+        await soon(lambda: client.playing)
         await client.close()
         assert sum(await both) >= 2
 

@@ -144,13 +144,6 @@ def other(*arguments: str, **environment: str) -> tuple[int, list[str]]:
         return command.end(), command.rest()
 
 
-def until(condition: Callable[[], bool], seconds: float = END_S) -> None:
-    deadline = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < deadline
-        time.sleep(0.01)
-
-
 def page(address: tuple[str, int], path: str) -> str:
     with urllib.request.urlopen(f"http://{address[0]}:{address[1]}{path}", timeout=END_S) as answer:
         return str(answer.read().decode())

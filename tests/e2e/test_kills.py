@@ -24,8 +24,9 @@ from shared.scene import Scene, load_scene
 from shared.snapshot import VERDICT, decode_parts
 from shared.units import BLOCK
 from shared.world import World
-from tests.e2e.processes import END_S, ServerProcess, page, running, stats, until
+from tests.e2e.processes import END_S, ServerProcess, page, running, stats
 from tests.lengths import contained
+from tests.patience import until
 
 pytestmark = pytest.mark.e2e
 

@@ -15,7 +15,8 @@ import pytest
 
 from client_sdk import Client, ConnectError, Disconnected, Event, Joined, Left, Matched, Resumed, list_worlds
 from server.hosting import command
-from tests.e2e.processes import END_S, ServerProcess, page, running, stats, until
+from tests.e2e.processes import END_S, ServerProcess, page, running, stats
+from tests.patience import until
 
 TOKEN = "a-token-of-operators"
 SETTINGS = """

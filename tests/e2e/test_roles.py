@@ -10,8 +10,7 @@ from client_sdk.async_client import AsyncClient
 from scripts.scale_lab.cluster import Cluster, PartProcess
 from scripts.scale_lab.nats_server import binary
 from shared.inputs import make_input
-from tests.patience import PATIENCE_S
-from tests.server.cluster.conftest import until
+from tests.patience import PATIENCE_S, soon
 
 pytestmark = [pytest.mark.e2e, pytest.mark.skipif(not binary(), reason="there is no nats-server here")]
 
@@ -34,13 +33,13 @@ async def test_a_standby_takes_over_from_a_sequencer_that_was_killed(cluster: Cl
     client = await AsyncClient.connect(
         edge.url, name="Ann", before_update=lambda core: core.set_input(make_input(1.0, 0.0))
     )
-    await until(lambda: client.stats.inputs_used > 10)
+    await soon(lambda: client.stats.inputs_used > 10)
     cluster.sequencer.kill()
     async with asyncio.timeout(PATIENCE_S):
         while not (await standby.stats())["leads"]:  # noqa: ASYNC110 - another process has no event for it
             await asyncio.sleep(0.1)
     used = client.stats.inputs_used
-    await until(lambda: client.stats.inputs_used > used + 20)
+    await soon(lambda: client.stats.inputs_used > used + 20)
     assert client.stats.reconnects == 0
     await client.close()
     status, page = await standby.page("/metrics")

@@ -34,9 +34,9 @@ from tests.e2e.processes import (
     page,
     running,
     stats,
-    until,
 )
 from tests.lengths import long
+from tests.patience import until
 
 pytestmark = pytest.mark.e2e
 

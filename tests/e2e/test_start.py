@@ -18,8 +18,9 @@ import pytest
 
 from client_sdk.client import Client
 from server.runtime.event_loop import COMPILING, announce_compiling
-from tests.e2e.processes import ROOT, START_S, other, page, running, stats, until
+from tests.e2e.processes import ROOT, START_S, other, page, running, stats
 from tests.lengths import long
+from tests.patience import until
 
 pytestmark = pytest.mark.e2e
 

@@ -12,7 +12,8 @@ from client_sdk import Joined, list_worlds
 from client_sdk.async_client import AsyncClient
 from client_sdk.client import Client
 from client_sdk.transports.common import ConnectError
-from tests.e2e.processes import END_S, ServerProcess, running, until
+from tests.e2e.processes import END_S, ServerProcess, running
+from tests.patience import until
 
 pytestmark = pytest.mark.e2e
 

@@ -17,7 +17,8 @@ import pytest
 
 from server.config.settings import KINDS
 from server.observability.histogram import between
-from tests.e2e.processes import END_S, ROOT, ServerProcess, running, stats, until
+from tests.e2e.processes import END_S, ROOT, ServerProcess, running, stats
+from tests.patience import until
 
 pytestmark = [
     pytest.mark.e2e,

@@ -21,7 +21,8 @@ from sovereign_netcode.examples.tag import Tag
 from sovereign_netcode.server.journal.records import replay
 from sovereign_netcode.shared import layout
 from sovereign_netcode.shared.layout import ID
-from tests.e2e.processes import running, stats, until
+from tests.e2e.processes import running, stats
+from tests.patience import until
 from tests.proxy import Proxy
 
 ROOT = Path(__file__).resolve().parents[2]

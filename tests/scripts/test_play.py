@@ -26,8 +26,9 @@ from shared.scene import SCENES, Scene, load_scene
 from shared.world import World
 from sovereign_netcode.playtest import Link as Line
 from sovereign_netcode.playtest import LocalWorlds, Match, Player
-from tests.e2e.processes import END_S, START_S, until
+from tests.e2e.processes import END_S, START_S
 from tests.lengths import long, long_but
+from tests.patience import until
 
 ROOT = Path(__file__).resolve().parents[2]
 os.environ["SDL_VIDEODRIVER"] = "dummy"

@@ -16,8 +16,9 @@ from shared.edits import Edit
 from shared.messages import Snapshot
 from shared.snapshot import VERDICT, checksum
 from shared.world import World
+from tests.patience import until
 from tests.server.test_persisted_state import Stored
-from tests.server.test_store import copied, until
+from tests.server.test_store import copied
 from tests.tables import order
 from tests.worlds import build, floor
 

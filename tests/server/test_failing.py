@@ -17,9 +17,10 @@ from server.persistence.database import read
 from server.persistence.store import Store
 from shared import messages
 from shared.messages import Hello, Snapshot, Welcome
+from tests.patience import until
 from tests.server.test_persisted_state import Stored
 from tests.server.test_rules import Recorder
-from tests.server.test_store import SCENE, copied, keep, play, until
+from tests.server.test_store import SCENE, copied, keep, play
 from tests.server.test_store_faults import found_in
 from tests.tables import FakeLink
 

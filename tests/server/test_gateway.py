@@ -25,13 +25,13 @@ from server.net.websocket import Connection
 from server.observability.pages import Page, Pages, json_page
 from shared.fields import CLIENT_MESSAGE_MAX
 from tests.lengths import examples
+from tests.patience import PATIENCE_S, soon
 
 UPGRADE = (
     b"GET / HTTP/1.1\r\nHost: x\r\nConnection: Upgrade\r\nUpgrade: websocket\r\n"
     b"Sec-WebSocket-Version: 13\r\nSec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\n"
     b"Sec-WebSocket-Extensions: permessage-deflate\r\n\r\n"
 )
-TIME_OUT_S = 5.0
 HANDSHAKE_S = 3.0
 
 
@@ -80,10 +80,10 @@ class Peer:
         self.writer.write(b"".join(parts))
 
     async def line(self) -> bytes:
-        return await asyncio.wait_for(self.reader.readuntil(b"\r\n\r\n"), TIME_OUT_S)
+        return await asyncio.wait_for(self.reader.readuntil(b"\r\n\r\n"), PATIENCE_S)
 
     async def frame(self) -> tuple[int, bytes]:
-        async with asyncio.timeout(TIME_OUT_S):
+        async with asyncio.timeout(PATIENCE_S):
             first, length = await self.reader.readexactly(2)
             assert length < 128, "a server does not mask"
             if length == 126:
@@ -93,7 +93,7 @@ class Peer:
     async def end(self) -> bytes:
         """Returns all bytes up to the end of the stream, by FIN or RST."""
         chunks = []
-        async with asyncio.timeout(TIME_OUT_S):
+        async with asyncio.timeout(PATIENCE_S):
             try:
                 while chunk := await self.reader.read(1 << 16):
                     chunks.append(chunk)
@@ -143,14 +143,9 @@ class Bench:
         assert (await peer.line()).startswith(b"HTTP/1.1 101 ")
         return peer
 
-    async def until(self, condition: Callable[[], bool]) -> None:
-        async with asyncio.timeout(TIME_OUT_S):
-            while not condition():  # noqa: ASYNC110 - any condition, not one event
-                await asyncio.sleep(0.001)
-
     async def all_gone(self) -> None:
         """Waits until all connections have ended, and checks that each was reported to the game exactly once."""
-        async with asyncio.timeout(TIME_OUT_S):
+        async with asyncio.timeout(PATIENCE_S):
             await self.gateway.drained()
         assert sorted(self.notes.lost_sessions) == list(range(1, len(self.notes.opened) + 1))
 
@@ -211,7 +206,7 @@ async def test_every_chopping_of_the_stream_gives_the_same_messages(bench: Bench
             at += step
             await peer.writer.drain()
             await asyncio.sleep(0)
-        await bench.until(lambda: len(bench.notes.received) == len(expected))
+        await soon(lambda: len(bench.notes.received) == len(expected))
         assert bench.notes.messages == expected
         bench.notes.received.clear()
 
@@ -235,7 +230,7 @@ async def test_fragments_make_one_message_with_pings_between_them(bench: Bench) 
     )
     assert await peer.frame() == (0x8A, b"p")
     assert await peer.frame() == (0x82, b"echo")
-    await bench.until(lambda: bench.notes.messages == [b"echo", b""])
+    await soon(lambda: bench.notes.messages == [b"echo", b""])
 
 
 @pytest.mark.parametrize(
@@ -266,7 +261,7 @@ async def test_a_broken_protocol_is_answered_with_its_code(
     peer.write(binary(b"before"), stream, binary(b"after"))
     closing = asyncio.ensure_future(peer.closed_with(code))
     if code == 1003:  # after an ordinary closing handshake, the peer closes the connection
-        await bench.until(lambda: len(bench.notes.lost_sessions) == 1)
+        await soon(lambda: len(bench.notes.lost_sessions) == 1)
         peer.write(masked(Opcode.CLOSE, struct.pack("!H", code)))
     await closing
     peer.writer.close()
@@ -386,7 +381,7 @@ async def test_the_peer_goes_in_the_middle(bench: Bench, sent: bytes, way: str) 
     if sent.startswith(UPGRADE):
         await peer.line()
     else:
-        await bench.until(lambda: len(bench.gateway.connections) == 1)
+        await soon(lambda: len(bench.gateway.connections) == 1)
     if way == "reset":
         peer.reset()
     else:
@@ -426,7 +421,7 @@ async def test_a_peer_that_neither_reads_nor_hangs_up_is_aborted(bench: Bench, m
 async def test_outstanding_counts_bytes_that_the_peer_has_not_received(bench: Bench) -> None:
     peer = await bench.client(limit=1024)
     link = bench.notes.opened[0]
-    await bench.until(lambda: not link.outstanding())
+    await soon(lambda: not link.outstanding())
     for _ in range(200):
         link.send(bytes(65_000))
     sent = 200 * 65_004
@@ -437,8 +432,8 @@ async def test_outstanding_counts_bytes_that_the_peer_has_not_received(bench: Be
     assert sent - (8 << 20) < (link.outstanding() or 0) <= sent
     total = 0
     while total < sent:
-        total += len(await asyncio.wait_for(peer.reader.read(1 << 20), TIME_OUT_S))
-    await bench.until(lambda: not link.outstanding())
+        total += len(await asyncio.wait_for(peer.reader.read(1 << 20), PATIENCE_S))
+    await soon(lambda: not link.outstanding())
 
 
 async def test_outstanding_is_harmless_after_a_reset(bench: Bench) -> None:
@@ -464,7 +459,7 @@ async def test_a_flood_without_a_message_ends_in_an_abort(bench: Bench, flood: s
     peer, other = await bench.client(), await bench.client()
     peer.write(EXTRAS[flood] * 5000)
     assert len(await peer.end()) <= 2 * module.EXTRAS_PER_S
-    await bench.until(lambda: bench.notes.lost_sessions == [1])
+    await soon(lambda: bench.notes.lost_sessions == [1])
     assert len(bench.notes.messages) < module.EXTRAS_PER_S
     other.write(EXTRAS[flood] * 100, binary(b"echo"))
     while (await other.frame())[1] != b"echo":
@@ -647,9 +642,9 @@ async def test_beyond_the_limits_a_websocket_is_refused_a_page_is_shown_and_a_fl
     assert (await get(bench, "/healthz"))[0] == 200
     for peer in bench.peers[2:]:
         peer.reset()
-    await bench.until(lambda: len(bench.gateway.connections) == 2)
+    await soon(lambda: len(bench.gateway.connections) == 2)
     silent = [await bench.connect() for _ in range(SPARE_PER_ADDRESS + 3)]
-    async with asyncio.timeout(TIME_OUT_S):
+    async with asyncio.timeout(PATIENCE_S):
         ended = [await peer.end() for peer in silent[SPARE_PER_ADDRESS:]]
     assert ended == [b""] * 3
     assert bench.gateway.admission.refused == {"address": 4}
@@ -658,7 +653,7 @@ async def test_beyond_the_limits_a_websocket_is_refused_a_page_is_shown_and_a_fl
     two.reset()
     for peer in silent:
         peer.reset()
-    await bench.until(lambda: len(bench.gateway.connections) == 1)
+    await soon(lambda: len(bench.gateway.connections) == 1)
     await bench.client()
 
 
@@ -672,7 +667,7 @@ async def test_a_browser_of_another_page_is_refused(bench: Bench) -> None:
 
 async def test_stop_listening_ends_connections_that_are_no_websocket(bench: Bench) -> None:
     good, idle = await bench.client(), await bench.connect(b"GET")
-    await bench.until(lambda: len(bench.gateway.connections) == 2)
+    await soon(lambda: len(bench.gateway.connections) == 2)
     bench.gateway.stop_listening()
     assert await idle.end() == b""
     good.write(binary(b"echo"))

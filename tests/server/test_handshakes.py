@@ -3,7 +3,7 @@
 import asyncio
 import socket
 import ssl
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator
 
 import pytest
 import pytest_asyncio
@@ -13,8 +13,8 @@ from server.config.limits import Limits
 from server.net import tls_accept
 from server.net.admission import SPARE_PER_ADDRESS, Admission
 from server.net.gateway import Gateway
+from tests.patience import PATIENCE_S, soon
 
-TIME_OUT_S = 30.0
 ALLOWED = 3
 ALL = ALLOWED + SPARE_PER_ADDRESS
 
@@ -55,15 +55,9 @@ async def gateway() -> AsyncIterator[Gateway]:
     gateway.stop_listening()
 
 
-async def until(condition: Callable[[], bool]) -> None:
-    async with asyncio.timeout(TIME_OUT_S):
-        while not condition():  # noqa: ASYNC110 - any condition, not one event
-            await asyncio.sleep(0.001)
-
-
 async def page(address: tuple[str, int], trust: ssl.SSLContext) -> bytes:
     """Returns the first line of the answer to a request."""
-    async with asyncio.timeout(TIME_OUT_S):
+    async with asyncio.timeout(PATIENCE_S):
         reader, writer = await asyncio.open_connection(*address, ssl=trust)
         writer.write(b"GET /healthz HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n")
         line = await reader.readline()
@@ -77,16 +71,16 @@ async def test_a_peer_that_only_opens_the_socket_counts_until_it_disconnects(
 ) -> None:
     address = await gateway.listen("127.0.0.1", 0, context)
     silent = [await asyncio.open_connection(*address) for _ in range(ALL + 2)]
-    async with asyncio.timeout(TIME_OUT_S):
+    async with asyncio.timeout(PATIENCE_S):
         assert [await reader.read() for reader, _ in silent[ALL:]] == [b""] * 2
     assert gateway.admission.refused == {"address": 2}
     with pytest.raises(ConnectionError):
         await page(address, trust)
     for _, writer in silent:
         writer.close()
-    await until(lambda: gateway.admission.total == 0)
+    await soon(lambda: gateway.admission.total == 0)
     assert await page(address, trust) == b"HTTP/1.1 200 OK\r\n"
-    await until(lambda: gateway.admission.total == 0)
+    await soon(lambda: gateway.admission.total == 0)
 
 
 async def test_a_handshake_has_a_time_limit_and_garbage_ends_it(
@@ -97,20 +91,20 @@ async def test_a_handshake_has_a_time_limit_and_garbage_ends_it(
     peers = [await asyncio.open_connection(*address) for _ in range(4)]
     for (_, writer), first in zip(peers, (b"", b"\x16\x03\x01", b"GET / HTTP/1.1\r\n\r\n", bytes(100)), strict=True):
         writer.write(first)
-    async with asyncio.timeout(TIME_OUT_S):
+    async with asyncio.timeout(PATIENCE_S):
         for reader, writer in peers:
             await reader.read()
             writer.close()
-    await until(lambda: gateway.admission.total == 0)
+    await soon(lambda: gateway.admission.total == 0)
     assert await page(address, trust) == b"HTTP/1.1 200 OK\r\n"
 
 
 async def test_closing_ends_handshakes(gateway: Gateway, context: ssl.SSLContext) -> None:
     address = await gateway.listen("127.0.0.1", 0, context)
     reader, writer = await asyncio.open_connection(*address)
-    await until(lambda: gateway.admission.total == 1)
+    await soon(lambda: gateway.admission.total == 1)
     gateway.stop_listening()
-    async with asyncio.timeout(TIME_OUT_S):
+    async with asyncio.timeout(PATIENCE_S):
         assert await reader.read() == b""
     writer.close()
     assert gateway.admission.total == 0
@@ -129,7 +123,7 @@ async def test_closing_ends_accepted_sockets_whose_handshake_has_not_begun(
 
     monkeypatch.setattr(gateway.admission, "arrive", arrive_at_the_end)
     reader, writer = await asyncio.open_connection(*await gateway.listen("127.0.0.1", 0, context))
-    async with asyncio.timeout(TIME_OUT_S):
+    async with asyncio.timeout(PATIENCE_S):
         assert await reader.read() == b""
     writer.close()
     assert gateway.admission.total == 0
@@ -141,7 +135,7 @@ async def test_many_connections_at_once_are_accepted_one_per_pass_of_the_loop(
     address = await gateway.listen("127.0.0.1", 0, context)
     peers = [socket.create_connection(address) for _ in range(20)]
     passes = 0
-    async with asyncio.timeout(TIME_OUT_S):
+    async with asyncio.timeout(PATIENCE_S):
         while gateway.admission.total + gateway.admission.refused["address"] < len(peers):
             await asyncio.sleep(0)
             passes += 1

@@ -13,17 +13,10 @@ from server.persistence.new_store import NewStore
 from server.persistence.store import Store
 from server.runtime.terrain import TerrainPool
 from shared.scene import load_scene
-from tests.patience import PATIENCE_S
+from tests.patience import PATIENCE_S, until
 
 SCENE = load_scene("arena")
 POOL = TerrainPool()
-
-
-def until(condition: Callable[[], bool]) -> None:
-    deadline = time.monotonic() + PATIENCE_S
-    while not condition():
-        assert time.monotonic() < deadline
-        time.sleep(0.001)
 
 
 def made(folder: Path, created: Callable[[], None] = lambda: None) -> NewStore:

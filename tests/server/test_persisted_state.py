@@ -10,8 +10,8 @@ from server.players.persisted_state import restored, whole
 from server.rules import Rules
 from shared import messages
 from shared.messages import Hello, Inputs, Shared, Welcome
+from tests.patience import until
 from tests.server.test_rules import Recorder, attributes
-from tests.server.test_store import until
 from tests.tables import FakeLink, Table, gone, order
 
 

@@ -7,6 +7,7 @@ import pytest_asyncio
 from server.net.admission import Admission
 from server.net.gateway import Events, Gateway
 from server.observability.pages import Page, PageRequest, Pages, line
+from tests.patience import soon
 from tests.server.test_gateway import UPGRADE, Bench, Notes, Peer, binary
 
 
@@ -64,7 +65,7 @@ async def test_each_connection_keeps_the_game_that_its_target_leads_to(routed: R
     assert two.messages == [b"/two?x=1", b"echo"]
     for peer in peers.values():
         peer.reset()
-    await routed.until(lambda: not routed.gateway.connections)
+    await soon(lambda: not routed.gateway.connections)
     assert (routed.notes.lost_sessions, two.lost_sessions) == ([1], [1])
     assert routed.asked == list(peers)
 

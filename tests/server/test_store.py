@@ -3,7 +3,6 @@
 import random
 import shutil
 import sqlite3
-import time
 from collections.abc import Callable, Iterator
 from contextlib import closing
 from pathlib import Path
@@ -20,7 +19,7 @@ from shared.blocks import pack
 from shared.inputs import Input, make_input
 from shared.world import World
 from tests import worlds
-from tests.patience import PATIENCE_S
+from tests.patience import until
 
 SCENE = worlds.scene([worlds.floor(0)])
 KEPT = {"players": [1, 2], 7: b"\0"}
@@ -28,14 +27,6 @@ KEPT = {"players": [1, 2], 7: b"\0"}
 
 def keep() -> object:
     return KEPT
-
-
-def until(condition: Callable[[], bool]) -> None:
-    """Waits for a condition that the store's thread makes true."""
-    deadline = time.monotonic() + PATIENCE_S
-    while not condition():
-        assert time.monotonic() < deadline
-        time.sleep(0.002)
 
 
 @pytest.fixture

@@ -16,8 +16,8 @@ from server.persistence import store as stores
 from server.persistence.database import Database, StoreError
 from server.persistence.store import Store
 from tests.lengths import contained, long
-from tests.patience import PATIENCE_S
-from tests.server.test_store import SCENE, copied, crashed, keep, play, until
+from tests.patience import PATIENCE_S, until
+from tests.server.test_store import SCENE, copied, crashed, keep, play
 
 HEAD = 32
 """Bytes of the head of a -wal file."""

@@ -18,8 +18,8 @@ from shared.checks import SceneError
 from shared.scene import Scene, load_scene
 from sovereign_netcode.playtest import Match
 from tests.client_sdk.test_wrong_values import Playing
+from tests.patience import until
 from tests.server.test_persisted_state import Stored
-from tests.server.test_store import until
 from tests.server.test_wrong_values import RUNNER, Played, marks
 from tests.tables import Table, order
 

@@ -9,8 +9,8 @@ import pytest
 
 from server.runtime import watchdog as module
 from server.runtime.watchdog import Watchdog
+from tests.patience import PATIENCE_S
 
-TIME_OUT_S = 10.0
 STALL_S = 0.02
 
 
@@ -29,7 +29,7 @@ class FakeLogger:
     def wait_for(self, event: str) -> dict[str, Any]:
         """Waits until this line was logged. Returns its values."""
         with self._changed:
-            assert self._changed.wait_for(lambda: self._found(event) is not None, TIME_OUT_S), self.lines
+            assert self._changed.wait_for(lambda: self._found(event) is not None, PATIENCE_S), self.lines
             found = self._found(event)
         assert found is not None
         return found

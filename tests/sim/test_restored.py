@@ -19,7 +19,7 @@ from shared.inputs import Input
 from shared.scene import load_scene
 from sovereign_netcode.playtest import Match, Player
 from tests.lengths import long
-from tests.server.test_store import until
+from tests.patience import until
 
 WAYS = ((127, 0), (0, 127), (-127, 0), (0, -127))
 

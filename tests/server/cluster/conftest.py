@@ -2,7 +2,6 @@
 
 import asyncio
 import contextlib
-import time
 from collections.abc import AsyncIterator, Callable, Mapping
 from typing import Any, TypeVar
 
@@ -121,14 +120,6 @@ class Cluster:
     def _name(self, kind: str) -> str:
         self._names += 1
         return f"{kind}-{self._names}"
-
-
-async def until(condition: Callable[[], bool], seconds: float = PATIENCE_S) -> None:
-    """Waits until a condition holds."""
-    end = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < end, "the condition did not hold in time"
-        await asyncio.sleep(0.01)
 
 
 @pytest.fixture

@@ -14,7 +14,8 @@ from client_sdk.events import Answered, Disconnected, Event, EventsDropped, Hand
 from client_sdk.netsim.links import Link
 from server.players.player import Player
 from server.rules import Rules
-from tests.server.cluster.conftest import Cluster, until
+from tests.patience import soon
+from tests.server.cluster.conftest import Cluster
 
 SLOW = Link(delay_s=0.02)
 
@@ -119,20 +120,20 @@ async def test_an_edge_that_drains_hands_its_clients_over_without_a_pause(
     first, second = await cluster.edge(rules=Echo()), await cluster.edge(rules=Echo())
     player = await program(cluster, kind, cluster.urls[first], link)
     try:
-        await until(lambda: player.client.stats.inputs_used > 40)
+        await soon(lambda: player.client.stats.inputs_used > 40)
         entity = player.client.entity
         first.drain()
-        await until(lambda: player.has(HandedOver))
-        await until(lambda: first.drained)
+        await soon(lambda: player.has(HandedOver))
+        await soon(lambda: first.drained)
         assert first.others() == [cluster.urls[second]]
         assert second.others() == []
         goal = player.client.stats.inputs_used + 40
-        await until(lambda: player.client.stats.inputs_used >= goal)
+        await soon(lambda: player.client.stats.inputs_used >= goal)
         player.commands = False
-        await until(lambda: sum(isinstance(event, Answered) for event in player.events) == player.sent)
+        await soon(lambda: sum(isinstance(event, Answered) for event in player.events) == player.sent)
         cluster.kill(first)
         goal = player.client.stats.inputs_used + 20
-        await until(lambda: player.client.stats.inputs_used >= goal)
+        await soon(lambda: player.client.stats.inputs_used >= goal)
         each_once(player)
         assert player.client.entity == entity
         assert player.client.core.travel.server == cluster.urls[second]
@@ -149,14 +150,14 @@ async def test_a_client_goes_on_at_another_edge_after_a_crash(cluster: Cluster, 
     first, second = await cluster.edge(rules=Echo()), await cluster.edge(rules=Echo())
     player = await program(cluster, kind, cluster.urls[first], link)
     try:
-        await until(lambda: player.client.stats.inputs_used > 20 and bool(player.client.core.travel.edges))
+        await soon(lambda: player.client.stats.inputs_used > 20 and bool(player.client.core.travel.edges))
         entity = player.client.entity
         cluster.kill(first)
-        await until(lambda: player.has(Resumed))
+        await soon(lambda: player.has(Resumed))
         goal = player.client.stats.inputs_used + 20
-        await until(lambda: player.client.stats.inputs_used >= goal)
+        await soon(lambda: player.client.stats.inputs_used >= goal)
         player.commands = False
-        await until(lambda: sum(isinstance(event, Answered) for event in player.events) == player.sent)
+        await soon(lambda: sum(isinstance(event, Answered) for event in player.events) == player.sent)
         assert (player.client.entity, player.client.core.travel.server) == (entity, cluster.urls[second])
         answered = Counter(event.number for event in player.events if isinstance(event, Answered))
         assert set(answered.values()) == {1}
@@ -180,10 +181,10 @@ async def test_an_edge_runs_load_player_and_asks_for_tokens(cluster: Cluster) ->
     assert left[0].reason.startswith("no such token")
     ann = Program(await AsyncClient.connect(cluster.urls[edge], name="Ann", token="secret"))
     try:
-        await until(lambda: ann.client.stats.inputs_used > 20)
+        await soon(lambda: ann.client.stats.inputs_used > 20)
         (player,) = edge.players.values()
         assert player.subject == "ann"
         edge.drain()
-        await until(lambda: ann.has(HandedOver))
+        await soon(lambda: ann.has(HandedOver))
     finally:
         await ann.close()

@@ -14,7 +14,8 @@ from server.cluster.bus import Bus, BusError, ConflictError, PurgedError, Refuse
 from server.cluster.local_bus import LocalBus, LocalHub
 from server.cluster.nats_bus import NatsBus
 from server.scale.writer import EMPTY, Entry, LogWriter
-from tests.server.cluster.conftest import Cluster, until
+from tests.patience import soon
+from tests.server.cluster.conftest import Cluster
 
 pytestmark = pytest.mark.skipif(not binary(), reason="there is no nats-server here")
 
@@ -174,15 +175,15 @@ async def test_keys(server: NatsServer) -> None:
         with pytest.raises(ConflictError):
             await other.put("arena.edge.one", b"2", 0)
         watching = asyncio.create_task(watch())
-        await until(lambda: seen == [("arena.edge.one", Revised(b"1", revision))])
+        await soon(lambda: seen == [("arena.edge.one", Revised(b"1", revision))])
         revision = await other.put("arena.edge.one", b"2", revision)
         await bus.put("arena.identity", b"x")
         third = await bus.put("arena.edge.two", b"3")
         with pytest.raises(ConflictError):
             await bus.put("arena.edge.one", b"4", revision - 1)
-        await until(lambda: len(seen) == 3)
+        await soon(lambda: len(seen) == 3)
         await bus.delete("arena.edge.two")
-        await until(lambda: len(seen) == 4)
+        await soon(lambda: len(seen) == 4)
         assert seen[1:] == [
             ("arena.edge.one", Revised(b"2", revision)),
             ("arena.edge.two", Revised(b"3", third)),
@@ -213,13 +214,13 @@ async def test_keys_are_read_after_a_change_is_stored(server: NatsServer, monkey
         monkeypatch.setattr(other, "get", counted)
         await bus.put("arena.key", b"0")
         watching = asyncio.create_task(watch())
-        await until(lambda: seen == [b"0"])
+        await soon(lambda: seen == [b"0"])
         with pytest.raises(ConflictError):
             await bus.put("arena.key", b"refused", 77)
         await bus.put("arenas.key", b"of another prefix")
         for number in range(1, 20):
             await bus.put("arena.key", b"%d" % number)
-            await until(lambda number=number: seen[-1] == b"%d" % number)  # type: ignore[misc]
+            await soon(lambda number=number: seen[-1] == b"%d" % number)  # type: ignore[misc]
         assert read == ["arena.key"] * 21, "one reading per stored change, and one again after an error"
         watching.cancel()
 
@@ -231,7 +232,7 @@ async def test_a_bucket_of_an_earlier_version(server: NatsServer) -> None:
     async with connected(server) as bus, connected(server, "other") as other:
         changes = other.watch("arena.")
         first = asyncio.ensure_future(anext(changes))
-        await until(lambda: other._client.stats["out_msgs"] > 0 and not first.done())
+        await soon(lambda: other._client.stats["out_msgs"] > 0 and not first.done())
         revision = await bus.put("arena.key", b"1")
         assert await first == ("arena.key", Revised(b"1", revision))
         revision = await bus.put("arena.key", b"2")
@@ -287,12 +288,12 @@ async def test_the_parts_of_a_world_on_nats(server: NatsServer) -> None:
         sequencer, edge = made.sequencer(), await made.edge()
         standby = made.sequencer(begins=False)
         ann = await made.join(edge, "Ann")
-        await until(lambda: ann.stats.inputs_used > 10)
+        await soon(lambda: ann.stats.inputs_used > 10)
         made.kill(sequencer)
         await buses[0].close()
-        await until(lambda: standby.core is not None)
+        await soon(lambda: standby.core is not None)
         used = ann.stats.inputs_used
-        await until(lambda: ann.stats.inputs_used > used + 10)
+        await soon(lambda: ann.stats.inputs_used > used + 10)
         assert ann.stats.reconnects == 0
     finally:
         await made.close()

@@ -17,8 +17,8 @@ from server.journal.recorded_world import RecordedWorld
 from server.scale.wire import record_of
 from server.scale.writer import UNACKNOWLEDGED_MAX, Entry
 from shared.scene import load_scene
-from tests.patience import PATIENCE_S
-from tests.server.cluster.conftest import Cluster, until
+from tests.patience import PATIENCE_S, soon
+from tests.server.cluster.conftest import Cluster
 
 
 class DeafBus(LocalBus):
@@ -41,8 +41,8 @@ async def test_two_edges_serve_one_world(cluster: Cluster) -> None:
     cluster.sequencer()
     first, second = await cluster.edge(), await cluster.edge()
     ann, bob = await cluster.join(first, "Ann"), await cluster.join(second, "Bob")
-    await until(lambda: len(ann.view().others) == len(bob.view().others) == 1)
-    await until(lambda: ann.stats.inputs_used > 30 and bob.stats.inputs_used > 30)
+    await soon(lambda: len(ann.view().others) == len(bob.view().others) == 1)
+    await soon(lambda: ann.stats.inputs_used > 30 and bob.stats.inputs_used > 30)
     assert ann.entity != bob.entity
     assert set(first.players) == set(second.players) == {ann.entity, bob.entity}
     assert first.others() == [cluster.urls[second]]
@@ -53,12 +53,12 @@ async def test_a_standby_takes_over_and_the_players_go_on(cluster: Cluster) -> N
     sequencer, edge = cluster.sequencer(), await cluster.edge()
     standbys = [cluster.sequencer(begins=False) for _ in range(2)]
     ann = await cluster.join(edge, "Ann")
-    await until(lambda: ann.stats.inputs_used > 10)
+    await soon(lambda: ann.stats.inputs_used > 10)
     cluster.kill(sequencer)
-    await until(lambda: any(standby.core for standby in standbys))
+    await soon(lambda: any(standby.core for standby in standbys))
     tick = edge.world.tick
     number = ann.edit(0, 0, 0, 1)
-    await until(lambda: edge.world.tick > tick + 20)
+    await soon(lambda: edge.world.tick > tick + 20)
     events = await _up_to(ann, Answered)
     events += [event async for event in _so_far(ann)]
     assert [event.number for event in events if isinstance(event, Answered)] == [number]
@@ -75,7 +75,7 @@ async def test_a_deposed_sequencer_ends(cluster: Cluster) -> None:
     await asyncio.wait_for(old.leads.wait(), PATIENCE_S)
     cluster._make_bus = lambda: LocalBus(cluster.hub)
     new = cluster.sequencer(begins=False)
-    await until(lambda: new.following.seq > 3)
+    await soon(lambda: new.following.seq > 3)
     bus.deaf = True
     await asyncio.wait_for(new.leads.wait(), PATIENCE_S)
     bus.deaf = False
@@ -90,17 +90,17 @@ async def test_time_stands_still_while_the_bus_does_not_answer(cluster: Cluster)
     cluster._make_bus = lambda: bus
     sequencer = cluster.sequencer()
     await asyncio.wait_for(sequencer.leads.wait(), PATIENCE_S)
-    await until(lambda: cluster.hub.newest.seq > 5)
+    await soon(lambda: cluster.hub.newest.seq > 5)
     bus.deaf = True
-    await until(lambda: sequencer.still > 3)
+    await soon(lambda: sequencer.still > 3)
     durable = record_of(cluster.hub.newest.data).tick
     assert sequencer.world.tick == durable + UNACKNOWLEDGED_MAX
     assert sequencer.unready() != ""
     bus.deaf = False
-    await until(lambda: record_of(cluster.hub.newest.data).tick > durable + 20)
+    await soon(lambda: record_of(cluster.hub.newest.data).tick > durable + 20)
     ticks = [record_of(data).tick for data in _records(cluster.hub)][1:]
     assert ticks == list(range(1, len(ticks) + 1))
-    await until(lambda: sequencer.unready() == "")
+    await soon(lambda: sequencer.unready() == "")
 
 
 async def test_a_new_edge_begins_with_a_checkpoint(cluster: Cluster, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -109,26 +109,26 @@ async def test_a_new_edge_begins_with_a_checkpoint(cluster: Cluster, monkeypatch
     first = await cluster.edge()
     standby = cluster.sequencer(begins=False, checkpoint_s=0.5)
     ann = await cluster.join(first, "Ann")
-    await until(lambda: standby.checkpoints > 1 and ann.stats.inputs_used > 10)
+    await soon(lambda: standby.checkpoints > 1 and ann.stats.inputs_used > 10)
     assert 1 not in cluster.hub.log
     late = await cluster.edge()
     assert late.players[ann.entity].name == "Ann"
     bob = await cluster.join(late, "Bob")
-    await until(lambda: len(ann.view().others) == len(bob.view().others) == 1)
+    await soon(lambda: len(ann.view().others) == len(bob.view().others) == 1)
 
 
 async def test_an_edge_that_is_behind_sends_its_clients_away(cluster: Cluster, monkeypatch: pytest.MonkeyPatch) -> None:
     cluster.sequencer()
     edge = await cluster.edge()
     ann = await cluster.join(edge, "Ann")
-    await until(lambda: ann.stats.inputs_used > 5)
+    await soon(lambda: ann.stats.inputs_used > 5)
     monkeypatch.setattr(edge, "_shed_at", 3)
     assert edge.core is not None
-    await until(lambda: edge.following.reader is not None and edge.following.reader.waiting == 0)
+    await soon(lambda: edge.following.reader is not None and edge.following.reader.waiting == 0)
     edge._look_whether_behind(edge.core, 5)
     assert edge.shedding
     assert edge.unready().startswith("behind")
-    await until(lambda: not edge.shedding)
+    await soon(lambda: not edge.shedding)
     events = await _up_to(ann, Disconnected)
     assert isinstance(events[-1], Disconnected)
     assert events[-1].reason == BEHIND
