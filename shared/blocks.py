@@ -329,7 +329,7 @@ class Blocks:
             self._freshen(row)
 
     def restore(self, other: "Blocks") -> bool:
-        """Makes this equal to `other`. Returns whether the arrays have moved in memory.
+        """Makes this equal to `other`, also the heads of its cells. Returns whether the arrays have moved in memory.
 
         Only segments that differ are copied, if both have the same segments in the same rows.
         """
@@ -340,7 +340,7 @@ class Blocks:
                     self.kinds[row] = other.kinds[row]
                     self.solid[row] = other.solid[row]
                 self.versions[:] = other.versions
-            self.digests[:] = other.digests
+            self.digests[:], self.heads[:] = other.digests, other.heads
             return False
         self.count, self.rows, self._free = other.count, dict(other.rows), list(other._free)
         self.generated = dict(other.generated)

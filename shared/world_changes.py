@@ -10,12 +10,12 @@ from typing import Protocol
 
 from shared import blocks, layout
 from shared.aim import NO_AIM
-from shared.arrays import FEW, np
+from shared.arrays import np
 from shared.checks import Cell, SceneError, shown
 from shared.extras import RESERVED
 from shared.free_places import OverlapError, box_at, free_place, overlapping
 from shared.inputs import BUTTONS_MAX, MOVE_PART_MAX, Input, checked_input
-from shared.layout import FALLING, FLAGS, ID, PREV, TEMPLATE, Int64s, X
+from shared.layout import FALLING, FLAGS, ID, TEMPLATE, Int64s, X
 from shared.states import STATES
 from shared.units import BLOCK, SEGMENT
 from shared.world_state import WorldState
@@ -361,7 +361,6 @@ class UncheckedWorld(WorldState):
         if theirs is not mine and theirs.fingerprint != mine.fingerprint:
             differ = sorted(name for name, digest in mine.digests.items() if theirs.digests[name] != digest)
             raise SceneError(f"other = a world of {theirs.name!r}: its scene differs in {', '.join(differ)}")
-        self._set_heads(there=False)
         before, moved = self._rows, len(self._entities) != len(other._entities)
         if moved:
             self._allocate(len(other._entities))
@@ -384,17 +383,5 @@ class UncheckedWorld(WorldState):
             count = int(self._lengths[length])
             getattr(self, name)[:count] = getattr(other, name)[:count]
         moved |= self.blocks.restore(other.blocks)
-        self._set_heads(there=True)
         if moved:
             self._bind()
-
-    def _set_heads(self, *, there: bool) -> None:
-        """Sets the heads of all cells with entities to the first row of each, or to none."""
-        heads, rows, cell = self.blocks.heads, self._entities[: self._rows], layout.CELL
-        if len(rows) <= FEW:
-            for first, row in enumerate(rows.tolist()):
-                if row[cell] >= 0 > row[PREV] and row[ID]:
-                    heads[row[cell]] = first if there else -1
-            return
-        firsts = np.flatnonzero((rows[:, cell] >= 0) & (rows[:, PREV] < 0) & (rows[:, ID] != 0))
-        heads[rows[firsts, cell]] = firsts if there else -1
