@@ -16,9 +16,8 @@ from client_sdk.prediction.prediction import Prediction, Reconciled
 from client_sdk.timing.server_clock import ServerClock
 from client_sdk.timing.timeline import Timeline
 from client_sdk.view import NO_VALUES, EntityView, View
-from shared.arrays import np
 from shared.checks import Vec
-from shared.layout import CELL, ID, MOVE_X, TEMPLATE, VX, Int64s, X, Y, Z
+from shared.layout import CELL, ID, MOVE_X, TEMPLATE, VX, VY, VZ, X, Y, Z
 from shared.scene import Scene
 from shared.units import BLOCK, SPEED
 
@@ -53,7 +52,7 @@ class ViewBuilder:
         self._own = slice(0)  # rows of the own ones
         self._unsure: list[int] = []  # rows of those that may be drawn as predicted
         self._ahead_rows: set[int] = set()  # both
-        self._known: dict[tuple[int, ...], Mapping[str, int]] = {}  # fields by template and extra columns
+        self._looks: list[list[int]] = []  # states from the velocity on
         self._labelled = -1  # state of the attributes in `_labels`
         self._delay = 0.0  # the input delay of the latest view, in ticks
         self._viewed = -math.inf  # the timeline's tick of the latest view
@@ -94,7 +93,7 @@ class ViewBuilder:
         others = list(map(_entity_view, zip(way.before.ids, self._names, way.places(seen), *looks, strict=True)))
         for row in self._unsure:
             ahead = self._ahead(self._drawn.ids[row], tick, now)
-            others[row] = ahead or others[row]._replace(facing=self._facing(self._drawn.states[row].tolist()))
+            others[row] = ahead or others[row]._replace(facing=self._facing(self._drawn.rows[row]))
         del others[self._own]
         if prediction.last_own > prediction.entity:  # what the own entity has spawned: predicted, like itself
             own = (self._ahead(entity, tick, now) for entity in prediction.spawned())
@@ -103,20 +102,22 @@ class ViewBuilder:
 
     def _follow(self, drawn: Entry) -> None:
         """Takes the states of another snapshot, from which on the others are drawn."""
-        former, self._drawn = self._drawn, drawn
-        states, layout = drawn.states, (drawn.ids, drawn.states[:, TEMPLATE].tolist())
-        fresh: Iterable[int] = range(len(states))
-        if layout == self._layout and former is not NO_ENTRY:
-            fresh = np.flatnonzero((states[:, VX:] != former.states[:, VX:]).any(axis=1)).tolist()
+        self._drawn, rows = drawn, drawn.rows
+        layout, before = (drawn.ids, [row[TEMPLATE] for row in rows]), self._looks
+        self._looks = [row[VX:] for row in rows]
+        fresh: Iterable[int] = range(len(rows))
+        if layout == self._layout:
+            fresh = [row for row, (old, new) in enumerate(zip(before, self._looks, strict=True)) if old != new]
         else:
             self._arrange(*layout)
-        self._velocities = list(map(tuple, drawn.velocities.tolist()))
-        if self._extras.count:
-            self._fields = self._fields_in(states, layout[1])
+        fields_of = self._prediction.predicted.fields_of
         for row in fresh:
+            state = rows[row]
+            self._velocities[row] = (state[VX] / SPEED, state[VY] / SPEED, state[VZ] / SPEED)
+            if self._extras.count:
+                self._fields[row] = fields_of(state[TEMPLATE], state[CELL:])
             if row not in self._ahead_rows:
-                self._facing(states[row].tolist())
-        self._directions = [self._facings.get(entity, EAST) for entity in drawn.ids]
+                self._directions[row] = self._facing(state)
 
     def _arrange(self, ids: list[int], templates: list[int]) -> None:
         """Takes other entities or templates than those in the snapshot before."""
@@ -127,18 +128,12 @@ class ViewBuilder:
         self._unsure = [row for row, kind in enumerate(templates) if kind in self._predicted and row not in own]
         self._ahead_rows = {*own, *self._unsure}
         self._names = [self._templates[template] for template in templates]
-        self._fields = [NO_VALUES] * len(ids)
+        self._velocities = [(0.0, 0.0, 0.0)] * len(ids)
+        self._fields, self._directions = [NO_VALUES] * len(ids), [EAST] * len(ids)
         self._label()
         if len(self._facings) > 2 * len(ids) + FACINGS_MIN:
             there = set(ids)
             self._facings = {entity: facing for entity, facing in self._facings.items() if entity in there}
-
-    def _fields_in(self, states: Int64s, templates: list[int]) -> list[Mapping[str, int]]:
-        """Returns the fields of the behaviours of all entities. Those that have the same as before share them."""
-        looks = [(template, *extra) for template, extra in zip(templates, states[:, CELL:].tolist(), strict=True)]
-        known, fields_of = self._known, self._prediction.predicted.fields_of
-        self._known = {look: known.get(look) or fields_of(look[0], list(look[1:])) for look in looks}
-        return [self._known[look] for look in looks]
 
     def _label(self) -> None:
         """Takes the attributes of all entities."""

@@ -12,10 +12,11 @@ their velocities for less than a tick, because the next snapshot may change anyt
 
 import math
 from collections import deque
+from typing import Self
 
-from shared.arrays import Float64s, np
+from shared.arrays import np
 from shared.checks import Vec
-from shared.layout import CELL, ID, VX, Int64s, X
+from shared.layout import CELL, ID, VX, Int64s
 from shared.units import BLOCK, SPEED
 
 KEPT_S, KEPT_MIN = 3.0, 16
@@ -32,9 +33,12 @@ LONG_FALL, LONG_SHARE, LONG_CALM_S, FALL_MAX = 0.05, 0.5, 1.0, 1.0
 """Fall of a delay above `LONG_S`: it begins after `LONG_CALM_S` seconds without a late snapshot. Its speed in seconds
 per second is `LONG_FALL` plus `LONG_SHARE` times the seconds above `LONG_S`, at most `FALL_MAX`."""
 
+Move = tuple[float, float, float, float, float, float]
+"""A position and a way from it, in blocks."""
+
 
 class Entry:
-    """A snapshot in the history.
+    """A snapshot in the history. Once it is drawn (`listed`), it has lists, in which Python finds numbers faster.
 
     Args:
         tick: its tick.
@@ -44,27 +48,20 @@ class Entry:
 
     def __init__(self, tick: int, states: Int64s, placed: frozenset[int] = frozenset()) -> None:
         self.tick, self.states, self.placed = tick, states, placed
-        self._ids: list[int] | None = None
-        self._places: Float64s | None = None
+        self.rows: list[list[int]] = []
+        """The states."""
+        self.ids: list[int] = []
+        """The numbers of the entities."""
+        self.places: list[Vec] = []
+        """The positions of the entities in blocks."""
 
-    @property
-    def ids(self) -> list[int]:
-        """The numbers of the entities. Most entries are not drawn, and have no lists."""
-        if self._ids is None:
-            self._ids = self.states[:, ID].tolist()
-        return self._ids
-
-    @property
-    def places(self) -> Float64s:
-        """The positions of the entities in blocks, [n, 3]."""
-        if self._places is None:
-            self._places = self.states[:, X : X + 3] / BLOCK
-        return self._places
-
-    @property
-    def velocities(self) -> Float64s:
-        """The velocities of the entities in blocks/s, [n, 3]."""
-        return self.states[:, VX : VX + 3] / SPEED
+    def listed(self) -> Self:
+        """Returns this entry with its lists."""
+        if not self.rows:
+            self.rows = self.states.tolist()
+            self.ids = [row[ID] for row in self.rows]
+            self.places = [(x / BLOCK, y / BLOCK, z / BLOCK) for _, _, _, x, y, z, *_ in self.rows]
+        return self
 
 
 NO_ENTRY = Entry(0, np.zeros((0, CELL), np.int64))
@@ -156,10 +153,15 @@ class Way:
     """
 
     def __init__(self, before: Entry, after: Entry, rate: float) -> None:
-        self.before, self.after = before, after
+        self.before, self.after = before.listed(), after.listed()
         self._ticks = after.tick - before.tick or rate  # after these, the entities have gone the whole way
-        ways = before.velocities if after is before else _ends(before, after) - before.places
-        self._moves: list[list[float]] = np.concatenate((before.places, ways), axis=1).tolist()
+        self._moves: list[Move]
+        if after is before:
+            speeds = ((u / SPEED, v / SPEED, w / SPEED) for u, v, w in (row[VX : VX + 3] for row in before.rows))
+            self._moves = [(*start, *speed) for start, speed in zip(before.places, speeds, strict=True)]
+        else:
+            ends = zip(before.places, _ends(before, after), strict=True)
+            self._moves = [(x, y, z, u - x, v - y, w - z) for (x, y, z), (u, v, w) in ends]
 
     def places(self, at: float) -> list[Vec]:
         """Returns where the entities are drawn at the tick `at`, in blocks, in the order of `before`."""
@@ -167,13 +169,11 @@ class Way:
         return [(x + u * share, y + v * share, z + w * share) for x, y, z, u, v, w in self._moves]
 
 
-def _ends(before: Entry, after: Entry) -> Float64s:
+def _ends(before: Entry, after: Entry) -> list[Vec]:
     """Returns where the entities of a snapshot are in a later one. Those that it does not move are where they were."""
-    ids, there, placed = before.ids, after.ids, after.placed
-    if ids == there and not placed:
+    if before.ids == after.ids and not after.placed:
         return after.places
-    rows = {entity: row for row, entity in enumerate(there) if entity not in placed}
-    moved = [row for row, entity in enumerate(ids) if entity in rows]
-    ends = before.places.copy()
-    ends[moved] = after.places.take([rows[ids[row]] for row in moved], 0)
-    return ends
+    ends = dict(zip(after.ids, after.places, strict=True))
+    for entity in after.placed:
+        ends.pop(entity, None)
+    return [ends.get(entity, start) for entity, start in zip(before.ids, before.places, strict=True)]
