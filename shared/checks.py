@@ -169,10 +169,10 @@ def vector(value: object, at: str) -> Vec:
     Raises:
         SceneError: `value` has not three numbers, or one is not finite; the message names the axis.
     """
-    if type(value) is tuple and len(value) == 3 and all(type(part) is float for part in value):
+    if type(value) is tuple and len(value) == 3:
         x, y, z = value
-        if math.isfinite(x + y + z):  # a short cut; the sum of finite numbers may be infinite, and then this goes on
-            return x, y, z
+        if type(x) is type(y) is type(z) is float and math.isfinite(x + y + z):
+            return x, y, z  # a short cut; the sum of finite numbers may be infinite, and then this goes on
     x, y, z = (finite(part, f"{at}.{axis}") for axis, part in zip("xyz", _three(value, at, "numbers"), strict=True))
     return x, y, z
 

@@ -21,9 +21,10 @@ class OverlapError(SceneError):
 
 def box_at(world: WorldState, kind: int, position: Iterable[int]) -> list[int]:
     """Returns the low and the high corner of a template's box at a position, in grid steps."""
-    row = world.templates[kind].tolist()
-    low = [part + row[layout.LO_X + k] for k, part in enumerate(position)]
-    return low + [part + row[layout.SIZE_X + k] for k, part in enumerate(low)]
+    x, y, z = position
+    low_x, low_y, low_z, size_x, size_y, size_z = world.boxes[kind]
+    x, y, z = x + low_x, y + low_y, z + low_z
+    return [x, y, z, x + size_x, y + size_y, z + size_z]
 
 
 def _near(world: WorldState, but: int, box: list[int]) -> layout.Int64s:
@@ -49,7 +50,7 @@ def taken(world: WorldState, row: int, kind: int, box: list[int]) -> bool:
     """Returns whether a block or a solid entity is in the way of a template's box, without the row `row` (-1: none)."""
     if world.kernel.blocks_in(world.bound, *box):
         return True
-    return _meets(world, kind) and any(True for _ in _overlaps(world, row, box))
+    return _meets(world, kind) and next(_overlaps(world, row, box), None) is not None
 
 
 def _meets(world: WorldState, kind: int) -> bool:
@@ -71,8 +72,8 @@ def free_place(world: WorldState, row: int, kind: int, position: object, push: b
         OverlapError: the place is occupied (and, with `push`, so are the places near it).
         SceneError: a value is not finite or out of range.
     """
-    parts = vector(position, "position")
-    at = [to_position(part, f"position.{axis}") for axis, part in zip("xyz", parts, strict=True)]
+    parts = x, y, z = vector(position, "position")
+    at = [to_position(x, "position.x"), to_position(y, "position.y"), to_position(z, "position.z")]
     if not taken(world, row, kind, box_at(world, kind, at)):
         return at
     places = (_pushed(world, row, kind, at, axis, sign) for axis, sign in PUSHES) if push else ()

@@ -133,13 +133,7 @@ class World(TurnWorld):
         """
         kind = self.scene.template(template)
         at = free_place(self, -1, kind, position, boolean(push, "push"))
-        speed = _velocity(velocity)
-        if self._next_id + self.extras.blocks[kind] > ID_MAX:
-            raise SceneError("ids: used up")
-        entity = self._next_id
-        more = self.extras.new[kind].tolist()
-        self._put([(entity, kind, self._thrown(kind, speed[2]), *at, *speed, 0, 0, 0, *more)])
-        return entity
+        return self.add(kind, at, _velocity(velocity))
 
     def spawn_many(self, template: str, positions: Any) -> range:
         """Adds entities at rest, as `spawn` would one after the other; all of them, or none if it raises an error.

@@ -5,7 +5,7 @@ each change and of each step: a recording consists of these calls. A change that
 an entity aside) is not reported by itself.
 """
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Protocol
 
 from shared import blocks, layout
@@ -16,7 +16,7 @@ from shared.extras import RESERVED
 from shared.free_places import OverlapError, box_at, free_place, overlapping
 from shared.inputs import BUTTONS_MAX, MOVE_PART_MAX, Input, checked_input
 from shared.layout import FALLING, FLAGS, ID, TEMPLATE, Int64s, X
-from shared.states import STATES
+from shared.states import ID_MAX, STATES
 from shared.units import BLOCK, SEGMENT
 from shared.world_state import WorldState
 
@@ -201,6 +201,15 @@ class UncheckedWorld(WorldState):
                 self.turns.rows = None
             new = np.ascontiguousarray(new[:, :STATES])
         self.kernel.store(self.bound, self.kernel.lent(rows), self.kernel.lent(new), len(rows), self.tick + 1)
+
+    def add(self, template: int, position: Iterable[int], velocity: Sequence[int] = (0, 0, 0)) -> int:
+        """Adds an entity at a place that is free, in grid steps and velocity steps, and returns its id."""
+        entity, extras = self._next_id, self.extras
+        if entity + extras.blocks[template] > ID_MAX:
+            raise SceneError("ids: used up")
+        state = entity, template, self._thrown(template, velocity[2]), *position, *velocity, 0, 0, 0
+        self._put([(*state, *extras.new[template].tolist())])
+        return entity
 
     def _settle(self, template: int, positions: Int64s) -> int:
         """Adds entities at rest, in order, until one has no room. Returns how many have room; then it removes them all.

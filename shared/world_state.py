@@ -50,6 +50,8 @@ class WorldState:
         self.kernel = kernels.get(compiled)
         """Kernel that steps this world; all other code that works on the world's arrays uses it, too."""
         self.templates, self._walk, self.parameters = scene.kernel_tables()
+        self.boxes = [tuple(row[layout.LO_X : layout.LO_X + 6]) for row in self.templates.tolist()]
+        """Low corner and size of each template's box, in grid steps."""
         self.extras = scene.extras
         """The extra columns of the scene's states."""
         self._row_of: dict[int, int] = {}
