@@ -216,6 +216,8 @@ class TickEncoder:
         if len(w.changed) >= len(self._ids):
             self._allocate(len(w.changed))
         end = world.kernel.muster(w.entities, w.heads, self._ids, self._packed, world.blocks.rows[segment])
+        if not end:
+            return [], b""
         keys = self._ids[: end // ROW_BYTES].tolist()
         return [key >> bulk.ID_BITS for key in keys], self._packed[:end].tobytes()
 

@@ -9,7 +9,7 @@ keyframe of it. Nothing is computed per entity and client.
 
 from collections import defaultdict
 from collections.abc import Collection, Mapping
-from itertools import accumulate, chain
+from itertools import accumulate
 from typing import Any
 
 from server.observability.errors import FaultReporter
@@ -101,7 +101,7 @@ class DeltaCache(dict[Cell, bytes]):
         return made[1], made[2]
 
 
-class Labels(dict[int, tuple[bytes, ...]]):
+class Labels(dict[int, bytes]):
     """The number and the attributes of each entity, encoded when they are first used; empty: it has none.
 
     Args:
@@ -112,11 +112,11 @@ class Labels(dict[int, tuple[bytes, ...]]):
     def __init__(self, attributes: Mapping[int, Mapping[str, Any]], named: Collection[int]) -> None:
         self._attributes, self._named = attributes, named
 
-    def __missing__(self, entity: int) -> tuple[bytes, ...]:
+    def __missing__(self, entity: int) -> bytes:
         values = self._attributes.get(entity)
-        label: tuple[bytes, ...] = ()
+        label = b""
         if values is not None or entity in self._named:
-            label = messages.pack(entity), messages.pack(values or {})
+            label = messages.pack(entity) + messages.pack(values or {})
         self[entity] = label
         return label
 
@@ -306,12 +306,14 @@ class ChangeLog:
 
     def _keyframe(self, segment: Cell) -> bytes:
         world = self._world
-        if segment in world.blocks:
+        if segment in world.blocks.rows:
             ids, packed = self._encoder.rows_in(segment)
         else:
             ids = sorted(entity for entity, home in self._home.items() if home == segment)
             packed = encode_rows(world.rows(ids))
-        if placed := self._placed_lately().intersection(ids):
+        if not ids:
+            return messages.pack((*segment, KEYFRAME))
+        if (lately := self._placed_lately()) and (placed := lately.intersection(ids)):
             packed = encode_rows(world.rows(ids), placed=placed)
         fields = b"".join(map(self._fields_of, ids)) if world.extras.count else b""
         return join_part(segment, KEYFRAME, (b"", packed), attributes=self._of(ids), extra=fields)
@@ -332,12 +334,16 @@ class ChangeLog:
         fields = self._fields(segment, since, ticks) if self._world.extras.count else b""
         if segment not in deltas.more:
             return join_part(segment, ago, packed, check=check, extra=fields)
-        gone = {entity for tick in ticks for entity in tick.gone.get(segment, ()) if self._home.get(entity) != segment}
-        edited = {offset for tick in ticks for offset in tick.edited.get(segment, ())}
-        kinds = self._kinds(segment, sorted(edited))
-        fresh = {entity for tick in ticks for entity in tick.attributes.get(segment, ())}
-        named = sorted(entity for entity in fresh if self._home.get(entity) == segment)
-        return join_part(segment, ago, packed, sorted(gone), kinds, check, self._of(named), fields)
+        gone, edited, fresh = set[int](), set[int](), set[int]()
+        for tick in ticks:
+            gone.update(tick.gone.get(segment, ()))
+            edited.update(tick.edited.get(segment, ()))
+            fresh.update(tick.attributes.get(segment, ()))
+        home = self._home.get
+        left = sorted([entity for entity in gone if home(entity) != segment]) if gone else []
+        named = sorted([entity for entity in fresh if home(entity) == segment]) if fresh else []
+        kinds = self._kinds(segment, sorted(edited)) if edited else []
+        return join_part(segment, ago, packed, left, kinds, check, self._of(named) if named else b"", fields)
 
     def _fields(self, segment: Cell, since: int, ticks: list[_Tick]) -> bytes:
         """Returns the records of extra columns of the entities that changed and are still in the segment."""
@@ -361,16 +367,18 @@ class ChangeLog:
 
         The attributes beyond `ATTRIBUTE_BYTES` wait for the next tick.
         """
-        labels = self._labels
-        named = [entity for entity in entities if labels[entity]]
-        packed = b"".join(chain.from_iterable(map(labels.__getitem__, named)))
-        if len(named) > FEW_ENTITIES and len(packed) + ENTITY_BYTES * len(named) > ATTRIBUTE_BYTES:
-            ends = accumulate(len(labels[entity][1]) + ENTITY_BYTES for entity in named)
+        labels = list(filter(None, map(self._labels.__getitem__, entities)))
+        packed = b"".join(labels)
+        if len(labels) > FEW_ENTITIES and len(packed) + ENTITY_BYTES * len(labels) > ATTRIBUTE_BYTES:
+            named = [entity for entity in entities if self._labels[entity]]
+            numbers = map(len, map(messages.pack, named))
+            sizes = (len(label) - number for label, number in zip(labels, numbers, strict=True))
+            ends = accumulate(size + ENTITY_BYTES for size in sizes)
             fits = max(sum(end <= ATTRIBUTE_BYTES for end in ends), 1)
             self._attributes_changed.update(named[fits:])
-            del named[fits:]
-            packed = b"".join(chain.from_iterable(map(labels.__getitem__, named)))
-        return messages.array_head(2 * len(named)) + packed if named else b""
+            del labels[fits:]
+            packed = b"".join(labels)
+        return messages.array_head(2 * len(labels)) + packed if labels else b""
 
     def _packed_since(self, segment: Cell, since: int, ticks: list[_Tick]) -> tuple[bytes, bytes]:
         """Returns the packed changes (turns, rows) of the entities that changed and are still in the segment."""
@@ -385,7 +393,5 @@ class ChangeLog:
         return b"", encode_rows(self._world.rows(sorted(here)), acted, placed)
 
     def _kinds(self, segment: Cell, offsets: list[int]) -> list[tuple[int, int]]:
-        if not offsets:
-            return []
         kinds = self._world.blocks.segment(segment).reshape(-1)
         return [(offset, int(kinds[offset])) for offset in offsets]

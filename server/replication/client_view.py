@@ -7,6 +7,9 @@ urgent, so every segment is sent eventually. A segment that is new to the client
 same order. Thus walking up to a crowd does not delay the update of the own position.
 """
 
+from collections.abc import Iterable
+from itertools import filterfalse
+
 from server.replication import interest
 from server.replication.change_log import ChangeLog
 from shared.checks import Cell
@@ -75,9 +78,9 @@ class ClientView:
             self._fresh[segment] = since + 1
         return list(lost)
 
-    def begun(self, segment: Cell) -> bool:
-        """Returns whether a segment of the view has been sent as a keyframe."""
-        return segment not in self._fresh
+    def begun(self, segments: Iterable[Cell]) -> Cell | None:
+        """Returns the first of some segments of the view that has been sent as a keyframe; None: none has."""
+        return next(filterfalse(self._fresh.__contains__, segments), None)
 
     @property
     def plain(self) -> tuple[Cell, ...] | None:
@@ -119,9 +122,11 @@ class ClientView:
             if len(plain) <= room:
                 self.tick = tick
                 return n, plain
-        special = self._behind | dict.fromkeys(self._fresh, KEYFRAME)
-        due = special | {segment: self.tick for segment in self.sees - special.keys() if deltas[segment]}
-        parts = {segment: part for segment, since in due.items() if (part := log.since(since)[segment])}
+        due = self._behind | dict.fromkeys(self._fresh, KEYFRAME)
+        if len(due) < len(self.sees):
+            due |= {segment: self.tick for segment in self.sees - due.keys() if deltas[segment]}
+        since_then = {since: log.since(since) for since in {*due.values()}}
+        parts = {segment: part for segment, since in due.items() if (part := since_then[since][segment])}
         if sum(map(len, parts.values())) > room:
             parts = self._urgent(parts, due, tick, log.history, room)
         if self._fresh or self.drops:
@@ -148,13 +153,14 @@ class ClientView:
             history: ticks for which changes are kept; a keyframe counts as waiting for as long.
             room: the room in bytes.
         """
-        centre = self.near[0]
+        centre, distance = self.near[0], interest.distance
 
-        def urgency(segment: Cell) -> float:
+        def rank(segment: Cell) -> tuple[bool, float]:
             waits = tick - due[segment] if due[segment] != KEYFRAME else history
-            return waits / (1 + 3 * interest.distance(segment, centre))
+            return segment != centre, -waits / (1 + 3 * distance(segment, centre))
 
-        order = sorted(parts, key=lambda segment: (segment != centre, -urgency(segment)))
+        new = tuple(self._fresh) == self.near == tuple(parts)  # the nearest first already, and all wait for as long
+        order = parts if new else sorted(parts, key=rank)
         chosen: dict[Cell, bytes] = {}
         for segment in order:
             room -= len(parts[segment])

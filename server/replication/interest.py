@@ -22,9 +22,14 @@ def around(centre: Cell, see: int, exists: Callable[[Cell], bool]) -> tuple[Cell
         see: maximum distance in segments.
         exists: returns whether a segment exists.
     """
+    return (centre, *filter(exists, _others(centre, see)))
+
+
+@functools.lru_cache(256)
+def _others(centre: Cell, see: int) -> tuple[Cell, ...]:
+    """Returns the segments around a segment, nearest first, without itself."""
     x, y, z = centre
-    cube = [(x + i, y + j, z + k) for i, j, k in _nearest_first(see)]
-    return (centre, *filter(exists, cube[1:]))
+    return tuple((x + i, y + j, z + k) for i, j, k in _nearest_first(see)[1:])
 
 
 @functools.cache

@@ -89,7 +89,7 @@ class Sender:
     def _look_around(self, stream: ClientStream, centre: Cell) -> None:
         """Updates the client view after the entity has come into another segment."""
         sight = stream.view
-        exists = self._world.blocks.__contains__
+        exists = self._world.blocks.rows.__contains__
         near = interest.around(centre, self._limits.see_radius, exists)
         if self._around.get(centre) != near:
             self._around[centre] = near
@@ -172,17 +172,17 @@ class Sender:
         A segment's blocks are never sent before its keyframe. A keyframe has no edits, so the client would miss the
         edits between the two.
         """
-        room = min(room, self._limits.terrain_bytes_per_tick)
+        room, most = min(room, self._limits.terrain_bytes_per_tick), self._limits.terrain_chunk_bytes
         while room > 0 and (stream.terrain_now or stream.terrain_due):
             if stream.terrain_now is None:
-                segment = next((segment for segment in stream.terrain_due if stream.view.begun(segment)), None)
+                segment = stream.view.begun(stream.terrain_due)
                 blocks = None if segment is None else self._log.packed(segment)
                 if segment is None or blocks is None:
                     return
                 stream.terrain_due.remove(segment)
                 stream.terrain_now = (segment, blocks, 0)
             segment, packed, offset = stream.terrain_now
-            chunk = packed[offset : offset + self._limits.terrain_chunk_bytes]
+            chunk = packed[offset : offset + most]
             stream.send(encode(Terrain(*segment, offset, len(packed), chunk)))
             offset += len(chunk)
             stream.terrain_now = (segment, packed, offset) if offset < len(packed) else None
