@@ -70,9 +70,7 @@ class Clocks:
         if self._connections.all_fast:
             return
         most = self._limits.messages_per_tick
-        for session in self._connections.sessions:
-            if session.row >= 0:
-                continue
+        for session in self._connections.others:
             if session.allowance < 0:  # messages beyond the burst were allowed because of late ticks
                 session.allowance = min(max(session.allowance, -self.burst) + most, 0.0)
             elif session.allowance:  # credit for messages that waited during a pause of the server
@@ -83,8 +81,8 @@ class Clocks:
         if self._connections.all_fast:
             return
         limits, kick = self._limits, self._connections.kick
-        for session in tuple(self._connections.sessions):
-            if session.row >= 0 or session.closed:
+        for session in self._connections.others:
+            if session.closed:
                 continue
             if not session.entity:
                 if session.hello is None and not session.loading and now - session.opened > limits.hello_s:

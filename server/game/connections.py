@@ -31,23 +31,52 @@ class Connections:
         self.sessions: list[Session] = []
         self.fast = 0
         """Number of sessions on the fast path (`server.game.fast_path`)."""
+        self._others: dict[Session, None] = {}
+        """Sessions that are not on it."""
+        self._opened = 0
 
     @property
     def all_fast(self) -> bool:
         """Whether all sessions are on the fast path, so that each of them plays and has nothing special to do."""
         return self.fast == len(self.sessions)
 
+    @property
+    def mostly_fast(self) -> bool:
+        """Whether most sessions are on the fast path, so that it pays to look at the others alone."""
+        return 2 * self.fast > len(self.sessions)
+
+    @property
+    def others(self) -> list[Session]:
+        """The sessions that are not on the fast path, in the order in which they opened. A copy."""
+        if self.mostly_fast:
+            return sorted(self._others, key=_number) if len(self._others) > 1 else [*self._others]
+        return [session for session in self.sessions if session.row < 0]
+
     def open(self, link: Transport, now: float) -> Session:
         """Adds a new connection and returns its session."""
         session = Session(link, now)
+        self._opened += 1
+        session.number = self._opened
         self.sessions.append(session)
+        self._others[session] = None
         return session
+
+    def enrol(self, session: Session) -> None:
+        """Notes that a session has come to the fast path."""
+        self.fast += 1
+        del self._others[session]
+
+    def withdraw(self, session: Session) -> None:
+        """Notes that a session has left the fast path."""
+        self.fast -= 1
+        self._others[session] = None
 
     def lost(self, session: Session, now: float) -> None:
         """Removes a session whose connection is gone. Its player may reconnect."""
         session.recall()
         session.closed = True
-        if session in self.sessions:
+        if session in self._others:
+            del self._others[session]
             self.sessions.remove(session)
         self._roster.lost(session, now)
 
@@ -124,3 +153,8 @@ class Connections:
         for session in tuple(self.sessions):
             if not session.closed:
                 self.end(session, code, reason, wait)
+
+
+def _number(session: Session) -> int:
+    """Returns the number of a session, by which sessions are sorted."""
+    return session.number

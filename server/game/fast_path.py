@@ -287,7 +287,7 @@ class FastPath:
         session.fast_path, session.enrolled, session.plain = self, tick, 0
         if session.framed is not None:
             session.framed.inlet = partial(self.arrivals.post_frame, session.row)
-        self._connections.fast += 1
+        self._connections.enrol(session)
 
     def _see(self, segment: Cell) -> int:
         """Notes that one more session sees a segment. Returns the segment's number."""
@@ -328,7 +328,7 @@ class FastPath:
         soon = self._world.tick - session.enrolled < SOON
         session.patience = min(2 * max(session.patience, PATIENCE), PATIENCE_MAX) if soon else PATIENCE
         session.plain = 0
-        self._connections.fast -= 1
+        self._connections.withdraw(session)
 
     def recall_all(self) -> None:
         """Takes all sessions off the fast path."""

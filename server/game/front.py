@@ -190,8 +190,8 @@ class Front:
             fast_path.send(values.version, now)
             if self.connections.all_fast:
                 return
-        for session in tuple(self.sessions):
-            if session.row < 0 and session.entity and not session.closed:
+        for session in self.connections.others:
+            if session.entity and not session.closed:
                 try:
                     values.show(session.stream)
                     if session.greeting is None or self.joining.greet(session, *session.greeting):

@@ -84,7 +84,8 @@ class Joining:
         if not self._authenticated(session, hello.token):
             return
         session.stream.flow.answered(now - session.opened, 0, now)  # a round trip with nothing on the way
-        hello = hello._replace(token="")
+        if hello.token:
+            hello = hello._replace(token="")
         if self._load is None or self._roster.knows(hello.resume, session.subject):
             session.hello = hello
             return
@@ -108,8 +109,8 @@ class Joining:
         """
         if self._connections.all_fast:
             return
-        sessions = self._connections.sessions
-        joining = [session for session in sessions if session.hello is not None and not session.closed]
+        others = self._connections.others
+        joining = [session for session in others if session.hello is not None and not session.closed]
         for session in joining[: self._limits.joins_per_tick]:
             session.received_at = session.stream.sent_at = now
             try:

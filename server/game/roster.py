@@ -124,9 +124,10 @@ class Roster:
 
     def knows(self, token: bytes, subject: str) -> bool:
         """Returns whether a player has a resume token and a subject; unlike `find`, this changes nothing."""
+        if not token:
+            return False
         wanted = self._digest(token)
-        players = self._api.players.values() if token else ()
-        return any(wanted in player.tokens and player.subject == subject for player in players)
+        return any(wanted in player.tokens and player.subject == subject for player in self._api.players.values())
 
     def find(self, token: bytes, subject: str) -> Player | None:
         """Returns the player with a resume token and a subject, or None. The token is used up by this.
@@ -137,8 +138,10 @@ class Roster:
             token: the token from the client's hello; empty if it has none.
             subject: the subject of the client.
         """
+        if not token:
+            return None
         wanted = self._digest(token)
-        for player in self._api.players.values() if token else ():
+        for player in self._api.players.values():
             if player.session is not None and player.session.acknowledged:
                 player.drop_older_tokens()
             if wanted in player.tokens and player.subject == subject:

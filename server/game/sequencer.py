@@ -14,6 +14,7 @@ from server.game.fast_path import FastPath
 from server.game.roster import Roster
 from server.game_api.api import GameApi
 from server.journal.recorded_world import RecordedWorld
+from server.players.player import Player
 from server.replication.outcome import Outcome
 from server.rewind import Rewind
 from shared import messages
@@ -60,7 +61,7 @@ class Sequencer:
         api, world = self._api, self._world
         with api.turn:
             api.hooks.start()
-            if len(api.players) > self._connections.fast:  # otherwise all players have a connection
+            if len(api.players) > self._connections.fast and self._some_are_away():
                 self._roster.leave(now)
             self._joining.join(now)
             self._roster.revive()
@@ -75,6 +76,20 @@ class Sequencer:
         self._rewind.record()
         self._roster.fell_out()
         return api.outcome
+
+    def _some_are_away(self) -> bool:
+        """Returns whether there may be players without a connection."""
+        return len(self._api.players) > self._connections.fast + len(self._connected())
+
+    def _connected(self) -> list[Player]:
+        """Returns the players who have a connection that is not on the fast path, if they are a few; otherwise none."""
+        connections, players = self._connections, self._api.players
+        found = []
+        for session in connections.others if connections.mostly_fast else ():
+            player = session.player
+            if player is not None and player.session is session and players.get(player.entity) is player:
+                found.append(player)
+        return found
 
     def finish(self) -> None:
         """Ends the tick once its outcome was used: removes players whom the rules have kicked or sent away."""
@@ -99,7 +114,10 @@ class Sequencer:
         else:
             inputs = self.fast_path.take(tick, everyone=world.recorded or world.extras.count > 0)
             if len(players) > self._connections.fast:
-                inputs |= {entity: player.inputs.take(tick) for entity, player in players.items() if player.row < 0}
+                others = self._connected()
+                if len(players) > self._connections.fast + len(others):  # some have no connection
+                    others = [player for player in players.values() if player.row < 0]
+                inputs |= {player.entity: player.inputs.take(tick) for player in others}
             if len(inputs) > 1:
                 inputs = {entity: inputs[entity] for entity in sorted(inputs)}  # players join with ascending numbers
         if api.steered:

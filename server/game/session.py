@@ -31,6 +31,8 @@ class Session:
         self.link = link
         self.framed = cast("Framed", link) if hasattr(link, "inlet") else None
         """The connection, if it takes and gives whole frames."""
+        self.number = 0
+        """Number of the connection, in the order in which the connections of the game opened."""
         self.row = -1
         """Number of its row on the fast path; -1: it is not on it."""
         self.fast_path: FastPath | None = None

@@ -14,6 +14,9 @@ ATTRIBUTES_MAX = 32
 VALUE_BYTES_MAX = 256
 """Maximum size of a value in MessagePack, in bytes."""
 
+NOTHING = b"\xc0"
+"""None, packed."""
+
 
 def checked(name: str, value: Any) -> bytes:
     """Packs a value after checking it and its name.
@@ -33,7 +36,7 @@ def checked(name: str, value: Any) -> bytes:
 
 def packed(value: Any) -> bytes:
     """Packs a value that has been checked. Values that are equal in Python (1, True and 1.0) differ here."""
-    return msgpack.packb(value)  # type: ignore[no-any-return]
+    return NOTHING if value is None else msgpack.packb(value)
 
 
 def copied(value: Any) -> Any:
