@@ -30,7 +30,7 @@ class Link:
 
 
 class Silent:
-    """A roster that is told of lost connections."""
+    """A roster that does nothing for a lost connection."""
 
     def lost(self, session: Session, now: float) -> None:
         pass
@@ -58,7 +58,7 @@ def test_one_who_loses_the_connection_leaves_in_time_while_the_others_are_on_the
     sessions = [game.open(Link(), now) for _ in range(8)]
     for number, session in enumerate(sessions):
         game.receive(session, encode(Hello(messages.VERSION, {}, f"player {number}")), now)
-    left = []
+    left, lost_at = [], 0
     for _ in range(3 * game.scene.tick_rate):
         tick = game.world.tick
         for session in sessions:
