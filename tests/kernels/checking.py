@@ -28,7 +28,7 @@ def loaded() -> tuple[ModuleType, Any]:
     llvm.initialize_native_target()
     llvm.initialize_native_asmprinter()
     names = {**exports.functions(), "built_from": exports.NUMBER}
-    machine = ir.Machine(llvm.get_process_triple(), llvm.get_host_cpu_name(), speed=1)  # its checks are the same
+    machine = ir.Machine(llvm.get_process_triple(), llvm.get_host_cpu_name(), speed=0)  # its checks are the same
     sources = ir.numba_sources(ROOT, bounds=True)
     module, target_machine = ir.linked(sources, 0, machine, python_module.module(names), (python_module.INIT,))
     engine = llvm.create_mcjit_compiler(module, target_machine)
