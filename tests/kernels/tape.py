@@ -35,6 +35,12 @@ class Shadow:
     data: bytes
 
 
+Touched = tuple[Shadow, np.ndarray[Any, Any]]
+"""An array that a call gets: its shadow, and its units as they are now."""
+WORLDS_MAX = 8
+"""Worlds whose arrays are found without a search."""
+
+
 class Tape:
     """A tape in a file, written call by call.
 
@@ -46,6 +52,7 @@ class Tape:
     def __init__(self, kernel: Kernel, file: BinaryIO) -> None:
         self._kernel, self._file = kernel, file
         self._known: dict[tuple[int, int], Shadow] = {}
+        self._worlds: dict[int, tuple[Any, list[Touched], bytes, Any]] = {}
         self._held = 0
         self.calls: dict[str, int] = dict.fromkeys(exports.functions(server=False), 0)
 
@@ -64,24 +71,26 @@ class Tape:
             if self._held > BYTES_MAX:
                 self._file.write(b"R")
                 self._known.clear()
+                self._worlds.clear()
                 self._held = 0
-            touched: list[tuple[Shadow, np.ndarray[Any, Any]]] = []
+            touched: list[Touched] = []
+            given: list[Any] = []
             words = bytearray(struct.pack("<cB", b"C", number))
             for kind, argument in zip(kinds, arguments, strict=True):
                 if kind in (exports.NUMBER, exports.TRUTH):
                     words += struct.pack("<q", argument)
-                    continue
-                for each in argument if kind == exports.WORLD else (argument,):
-                    shadow, now = self._array(each)
+                elif kind == exports.WORLD:
+                    _, arrays, packed, argument = self._world(argument)
+                    touched += arrays
+                    words += packed
+                else:
+                    shadow, now = self._array(argument)
                     touched.append((shadow, now))
-                    words += struct.pack("<II", shadow.number, len(each))
+                    words += struct.pack("<II", shadow.number, len(argument))
+                given.append(argument)
             for shadow, now in touched:
                 if changes := _changes(shadow, now):
                     self._file.write(b"W" + changes)
-            given = [
-                self._kernel.bound(argument) if kind == exports.WORLD else argument
-                for kind, argument in zip(kinds, arguments, strict=True)
-            ]
             result = function(*given)
             made = [changes for shadow, now in touched if (changes := _changes(shadow, now))]
             self._file.write(bytes(words) + struct.pack("<iH", int(result or 0), len(made)) + b"".join(made))
@@ -90,7 +99,21 @@ class Tape:
 
         return call
 
-    def _array(self, given: Any) -> tuple[Shadow, np.ndarray[Any, Any]]:
+    def _world(self, given: Any) -> tuple[Any, list[Touched], bytes, Any]:
+        """Returns the arrays of a world, and what a call gets of them: shadows, packed arguments, its argument.
+
+        The arrays of a world stay where they are, until it has others.
+        """
+        if id(given) not in self._worlds:
+            if len(self._worlds) == WORLDS_MAX:
+                self._worlds.clear()
+            arrays = [self._array(each) for each in given]
+            pairs = zip(arrays, given, strict=True)
+            packed = b"".join(struct.pack("<II", shadow.number, len(each)) for (shadow, _), each in pairs)
+            self._worlds[id(given)] = given, arrays, packed, self._kernel.bound(given)
+        return self._worlds[id(given)]
+
+    def _array(self, given: Any) -> Touched:
         """Returns the shadow of an array, and its units as they are now."""
         raw = np.frombuffer(given, np.uint8) if len(given) else np.zeros(0, np.uint8)
         unit = next(size for size in (8, 4, 1) if len(raw) % size == 0)
