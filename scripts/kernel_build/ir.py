@@ -17,7 +17,6 @@ from typing import Any
 
 import llvmlite.binding as llvm
 
-from scripts.kernel_build import quicker
 from shared import exports, kernels
 
 FAILED = -(1 << 31)
@@ -72,7 +71,7 @@ def numba_sources(root: Path, *, bounds: bool = False) -> list[Source]:
     from shared import jit, layout
 
     _without_machine_code()
-    quicker.quicken()
+    _flags_compare_fast()
     options: dict[str, Any] = {name: value for name, value in jit.OPTIONS.items() if name != "cache"}
     options["boundscheck"] = bounds
     jit.OPTIONS.clear()
@@ -113,6 +112,20 @@ def _without_machine_code() -> None:
     cpu.CPUContext.get_executable = own_function  # type: ignore[method-assign]
     lowering.Lower.create_cpython_wrapper = nothing  # type: ignore[method-assign]
     lowering.Lower.create_cfunc_wrapper = nothing  # type: ignore[method-assign]
+
+
+def _flags_compare_fast() -> None:
+    """Lets Numba compare its flags by what was set, in this process. It reads 40 properties of both otherwise, for each
+    call of a function that it meets."""
+    from numba.core.targetconfig import TargetConfig
+
+    plain: Any = TargetConfig.__eq__
+
+    def equal(one: Any, other: Any) -> Any:
+        return one is other or (type(one) is type(other) and one._values == other._values) or plain(one, other)
+
+    TargetConfig.__eq__ = equal  # type: ignore[method-assign]
+    TargetConfig.__hash__ = lambda flags: hash(type(flags))  # type: ignore[method-assign]
 
 
 def _wrapper(name: str, kinds: str, returns: bool) -> str:
