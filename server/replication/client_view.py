@@ -125,10 +125,7 @@ class ClientView:
         due = self._behind | dict.fromkeys(self._fresh, KEYFRAME)
         if len(due) < len(self.sees):
             due |= {segment: self.tick for segment in self.sees - due.keys() if deltas[segment]}
-        since_then = {since: log.since(since) for since in {*due.values()}}
-        parts = {segment: part for segment, since in due.items() if (part := since_then[since][segment])}
-        if sum(map(len, parts.values())) > room:
-            parts = self._urgent(parts, due, tick, log.history, room)
+        parts = self._urgent(log, due, tick, room)
         if self._fresh or self.drops:
             self._knows = self._knows.difference(self.drops) | (self._fresh.keys() & parts.keys())
             self._fresh = {segment: since for segment, since in self._fresh.items() if segment not in parts}
@@ -141,30 +138,30 @@ class ClientView:
         self.tick = tick
         return len(parts), b"".join(parts.values())
 
-    def _urgent(
-        self, parts: dict[Cell, bytes], due: dict[Cell, int], tick: int, history: int, room: int
-    ) -> dict[Cell, bytes]:
+    def _urgent(self, log: ChangeLog, due: dict[Cell, int], tick: int, room: int) -> dict[Cell, bytes]:
         """Returns the most urgent deltas that fit into the room, but at least the own segment and one more.
 
+        Those that do not fit are not encoded.
+
         Args:
-            parts: the deltas by segment.
-            due: the tick of each segment that was sent last, or `KEYFRAME`.
+            log: the changes of the world.
+            due: the tick of each segment that was sent last, or `KEYFRAME`, which counts as waiting for longest.
             tick: the tick of the snapshot.
-            history: ticks for which changes are kept; a keyframe counts as waiting for as long.
             room: the room in bytes.
         """
-        centre, distance = self.near[0], interest.distance
+        centre, distance, history = self.near[0], interest.distance, log.history
 
         def rank(segment: Cell) -> tuple[bool, float]:
             waits = tick - due[segment] if due[segment] != KEYFRAME else history
             return segment != centre, -waits / (1 + 3 * distance(segment, centre))
 
-        new = tuple(self._fresh) == self.near == tuple(parts)  # the nearest first already, and all wait for as long
-        order = parts if new else sorted(parts, key=rank)
+        new = tuple(self._fresh) == self.near == tuple(due)  # the nearest first already, and all wait for as long
+        deltas = {since: log.since(since) for since in {*due.values()}}
         chosen: dict[Cell, bytes] = {}
-        for segment in order:
-            room -= len(parts[segment])
-            if len(chosen) > 1 and room < 0:
-                break
-            chosen[segment] = parts[segment]
-        return chosen
+        for segment in due if new else sorted(due, key=rank):
+            if part := deltas[due[segment]][segment]:
+                room -= len(part)
+                if len(chosen) > 1 and room < 0:
+                    break
+                chosen[segment] = part
+        return chosen if room < 0 else {segment: chosen[segment] for segment in due if segment in chosen}
