@@ -52,10 +52,11 @@ def spread(longest: Sequence[T], rest: Sequence[T], workers: int) -> list[T]:
 
     pytest-xdist deals one run of successive tests to each worker. A long test that comes last would leave the other
     workers idle. The longest ones come a little behind the first test of a worker, because the runs need not begin
-    where these do.
+    where these do; at the beginning, if there are few tests.
     """
     order: list[T] = []
     for worker in range(workers):
         share = rest[worker * len(rest) // workers : (worker + 1) * len(rest) // workers]
-        order += [*share[: len(longest)], *longest[worker::workers], *share[len(longest) :]]
+        before = min(len(longest), len(share) // 8)
+        order += [*share[:before], *longest[worker::workers], *share[before:]]
     return order

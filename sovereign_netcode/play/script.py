@@ -16,7 +16,7 @@ WALK_BLOCKS, JUMP_BLOCKS = 3.0, 1.2
 LAG_S = 0.15
 TOGETHER = 5
 """Number of figures that should be in the picture."""
-PATIENCE_S = 45.0
+PATIENCE_S = 20.0
 """Seconds after which the picture is taken without waiting for a good moment."""
 
 

@@ -52,7 +52,7 @@ def told(player: Player) -> Counter[str]:
 
 @pytest.mark.parametrize(
     ("preset", "ticks"),
-    [*contained(("far", 200)), *long(*((preset, 8_000 if preset == "typical" else 2_500) for preset in PRESETS))],
+    [*contained(("far", 200)), *long(*((preset, 5_000 if preset == "typical" else 1_600) for preset in PRESETS))],
 )
 def test_a_lone_player_with_every_ability_is_corrected_for_late_inputs_only(preset: str, ticks: int) -> None:
     match = joined(Playground(), PRESETS[preset], Presser(), seed=11)
