@@ -4,10 +4,9 @@ A test that steps a world runs twice: with the compiled kernel of this machine, 
 Python. All worlds of a process share the terrain that is generated for them.
 """
 
-import gc
 import os
 import signal
-from collections.abc import Generator, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import pytest
@@ -62,18 +61,6 @@ def _terrain_once() -> Iterator[None]:
 def compiled(request: pytest.FixtureRequest) -> bool:
     """Whether the world of this test runs the compiled kernel."""
     return bool(request.param)
-
-
-@pytest.hookimpl(wrapper=True)
-def pytest_collection() -> Generator[None, object, object]:
-    """Keeps the collected tests out of the collections of garbage. They have 250,000 objects, which stay."""
-    gc.disable()
-    try:
-        return (yield)
-    finally:
-        gc.enable()
-        gc.collect()
-        gc.freeze()
 
 
 @pytest.hookimpl(tryfirst=True, wrapper=True)

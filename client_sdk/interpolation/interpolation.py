@@ -145,7 +145,7 @@ class Way:
     """The ways of the entities from one snapshot to the next, or after the newest one. Frames share it.
 
     An entity that the rules placed or removed meanwhile stays at its earlier position. The positions have the floats of
-    `shared.between`. Everything is in columns, because that takes no call for each entity.
+    `shared.between`.
 
     Args:
         before, after: the two snapshots; the same one twice: entities move on by their velocities.

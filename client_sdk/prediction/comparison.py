@@ -8,6 +8,7 @@ from bisect import bisect_left, bisect_right
 
 from shared.aim import NO_AIM
 from shared.arrays import np
+from shared.checks import Vec
 from shared.layout import CELL, ID, TEMPLATE, Int64s, X, Y, Z
 from shared.units import BLOCK
 from shared.world import World
@@ -15,7 +16,6 @@ from shared.world import World
 MEET_BLOCKS = 12
 """Distance in blocks beyond which another entity cannot be met before the next replay, at walking speeds."""
 
-Place = tuple[float, float, float]
 State = tuple[int, ...]
 
 
@@ -34,7 +34,7 @@ class Comparison:
         """Greatest number of an entity that the own one may have spawned; they follow its own number."""
         self._world = world
         self._shown_ahead = np.array([template.shown == "predicted" for template in scene.templates], np.int64)
-        self._others_ahead = any(template.shown == "predicted" for template in scene.templates)
+        self._others_ahead = bool(self._shown_ahead.any())
 
     def own(self, states: Int64s) -> Int64s:
         """Returns the states of the own entity and of what it has spawned. A view."""
@@ -66,7 +66,7 @@ class Comparison:
         was, are = (states[states[:, ID] != self.entity] for states in (predicted, confirmed))
         return not np.array_equal(was, are)
 
-    def offsets(self, before: Int64s, after: Int64s) -> dict[int, Place]:
+    def offsets(self, before: Int64s, after: Int64s) -> dict[int, Vec]:
         """Returns old minus new position of each entity that may be drawn as predicted and has moved, in blocks."""
         if not self._others_ahead:
             before, after = self.own(before), self.own(after)

@@ -24,10 +24,11 @@ from dataclasses import dataclass
 from client_sdk.controls import Controls
 from client_sdk.events import Corrected
 from client_sdk.prediction.announcements import Announcements
-from client_sdk.prediction.comparison import Comparison, Place, State, state_in
+from client_sdk.prediction.comparison import Comparison, State, state_in
 from client_sdk.prediction.confirmed import Confirmed
 from shared import edits
 from shared.bounds import bounds
+from shared.checks import Vec
 from shared.edits import Edit
 from shared.inputs import NEUTRAL, Input, row
 from shared.layout import CELL, ID, Int64s
@@ -49,7 +50,7 @@ class Reconciled:
     correction: Corrected | None
     repredicted: bool
     replayed: int
-    offsets: dict[int, Place]
+    offsets: dict[int, Vec]
     """Old minus new position of each entity that may be drawn as predicted and that the replay moved, in blocks."""
     acted: frozenset[int]
     """Entities on which the server's rules have acted: they are drawn at their new place at once."""

@@ -141,7 +141,7 @@ class ClientView:
     def _urgent(self, log: ChangeLog, due: dict[Cell, int], tick: int, room: int) -> dict[Cell, bytes]:
         """Returns the most urgent deltas that fit into the room, but at least the own segment and one more.
 
-        Those that do not fit are not encoded.
+        A delta that does not fit is not encoded.
 
         Args:
             log: the changes of the world.
