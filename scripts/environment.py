@@ -86,12 +86,21 @@ def become(python: Path, *args: str) -> NoReturn:
     os.execv(python, [str(python), *args])
 
 
-def run(title: str, *args: str) -> Step:
-    """Runs the environment's Python with `args` in the repository's root. Its output is not captured."""
+def run(title: str, *args: str, niceness: int = 0) -> Step:
+    """Runs the environment's Python with `args` in the repository's root. Its output is not captured.
+
+    Args:
+        niceness: how far other processes come before it, from 0 to 19, where the system can do that.
+    """
     print(f"\n== {title}", flush=True)
     started = time.perf_counter()
-    status = subprocess.run([str(PYTHON), *args], cwd=ROOT, check=False).returncode
+    status = subprocess.run([*nice(niceness), str(PYTHON), *args], cwd=ROOT, check=False).returncode
     return Step(title, status, time.perf_counter() - started)
+
+
+def nice(niceness: int) -> tuple[str, ...]:
+    """Returns the beginning of a command that runs with a niceness. It is empty where there is no such program."""
+    return ("nice", "-n", str(niceness)) if niceness and shutil.which("nice") else ()
 
 
 def lacking(module: str) -> str:

@@ -7,13 +7,12 @@ scripts/test ARGS     pytest alone with these arguments
 """
 
 import os
-import shutil
 import subprocess
 import time
 from concurrent.futures import ThreadPoolExecutor
 
 from scripts.browser_build import tools
-from scripts.environment import PYTHON, ROOT, Step, run
+from scripts.environment import PYTHON, ROOT, Step, nice, run
 
 STUBS = ("hatch_build.py",)
 """The command that writes the type stubs from the modules as they are now. The checks read them."""
@@ -37,7 +36,7 @@ def main(arguments: list[str]) -> int:
         run("browsers", "-m", "scripts.browser_build.app", "--tests")  # without it, tests in browsers are skipped
         os.environ["PATH"] = tools.path()
     if arguments == ["--long"]:
-        steps = [*compiled(), together(LONG, "long"), waiting("long"), alone(LONG, "long")]
+        steps = [*compiled(), *together(LONG, "long"), alone(LONG, "long")]
     elif arguments == ["--all"]:
         steps = everything("not contained", "long")
     elif arguments:
@@ -53,29 +52,31 @@ def main(arguments: list[str]) -> int:
 def everything(markers: str, profile: str) -> list[Step]:
     """Runs all checks of the sources and the tests with these markers.
 
-    mypy needs most of a minute of one processor, beside the other checks and the tests. In a long run it has only the
-    time that these leave. The tests that wait leave enough.
+    mypy needs most of a minute of one processor, beside the other checks and the tests.
     """
     steps = [run("type stubs", *STUBS)]
     with ThreadPoolExecutor(2) as pool:
-        types = pool.submit(mypy, "19" if profile == "long" else "5")
+        types = pool.submit(captured, "mypy", 5 if profile == "short" else 15, "-m", "mypy")
         ready = pool.submit(compiled)
         steps += [run(title, *command) for title, command in CHECKS.items()]
-        steps += [*ready.result(), together(markers, profile)]
-        if profile == "long":
-            steps.append(waiting(profile))
-        step, output = types.result()
-    print(f"\n== {step.title}\n{output}", end="", flush=True)
-    return [*steps, step, alone(markers, profile)]
+        steps += [*ready.result(), *together(markers, profile)]
+        steps.append(shown(types.result()))
+    return [*steps, alone(markers, profile)]
 
 
-def mypy(niceness: str) -> tuple[Step, str]:
-    """Checks the types; the tests come first. Returns the output, too."""
+def captured(title: str, niceness: int, *args: str) -> tuple[Step, str]:
+    """Runs the environment's Python beside other work. Returns the output, too."""
     started = time.perf_counter()
-    nice = ("nice", "-n", niceness) if shutil.which("nice") else ()
-    command = (*nice, str(PYTHON), "-m", "mypy")
+    command = (*nice(niceness), str(PYTHON), *args)
     done = subprocess.run(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, check=False)
-    return Step("mypy", done.returncode, time.perf_counter() - started), done.stdout
+    return Step(title, done.returncode, time.perf_counter() - started), done.stdout
+
+
+def shown(done: tuple[Step, str]) -> Step:
+    """Prints the output of a step. Returns the step."""
+    step, output = done
+    print(f"\n== {step.title}\n{output}", end="", flush=True)
+    return step
 
 
 def compiled() -> list[Step]:
@@ -98,17 +99,19 @@ def compiled() -> list[Step]:
     return [Step("compiled tests", 0, time.perf_counter() - started)]
 
 
-def together(markers: str, profile: str) -> Step:
-    """Runs several tests at a time, because many of them wait: two cores are busy all the time then."""
-    return run("tests", *pytest(markers, "not waiting and not alone", profile), "-n", "4", *BALANCED)
+def together(markers: str, profile: str) -> list[Step]:
+    """Runs several tests at a time, because many of them wait: two cores are busy all the time then.
 
-
-def waiting(profile: str) -> Step:
-    """Runs tests that wait most of the time, and that a busy machine disturbs. All are long ones.
-
-    They take the processor for a quarter of their time, so four of them leave enough of two cores.
+    Some long tests wait most of the time, and a busy machine disturbs them. They run beside the others, two at a time,
+    and come before them wherever both want the processor.
     """
-    return run("tests that wait", *pytest("", "waiting", profile), "-n", "4", *BALANCED, *files("waiting"))
+    command = (*pytest(markers, "not waiting and not alone", profile), "-n", "4", *BALANCED)
+    if profile == "short":
+        return [run("tests", *command)]
+    with ThreadPoolExecutor(1) as pool:
+        waiting = (*pytest("", "waiting", profile), "-n", "2", *BALANCED, *files("waiting"))
+        beside = pool.submit(captured, "tests that wait", 0, *waiting)
+        return [run("tests", *command, niceness=10), shown(beside.result())]
 
 
 def alone(markers: str, profile: str) -> Step:

@@ -1,7 +1,9 @@
-"""The first start of a server and the first join of a client without a prebuilt kernel.
+"""The first start of a server and the first join of a client without a prebuilt kernel; and no index is out of bounds.
 
-Numba takes long to compile a kernel, so one compilation serves both: the start of the server fills the cache, the
-client compiles what has been removed from it, and the result is compared with the prebuilt kernel.
+Numba takes long to compile a kernel, so one compilation serves all: the start of the server fills the cache, the client
+compiles what has been removed from it, and the result is compared with the prebuilt kernel. The compiled functions
+check every index, and tests of the physics and of the server run again with them: code that writes outside an array
+damages the process without an error, and some of it reads data from peers.
 """
 
 import json
@@ -46,12 +48,36 @@ with Client.connect(sys.argv[1], name="Ann") as client:
 """
 
 
-def test_a_start_that_compiles_says_so_and_a_client_plays_meanwhile_with_equal_results(tmp_path: Path) -> None:
+OUT_OF_BOUNDS = """
+import numpy as np
+from shared import kernels
+few, many = np.zeros(12, np.int64), np.zeros(24, np.int64)
+kernels.get(True).alike(few, 2, many, 2, 1, 1, few)  # two states in an array with room for one
+"""
+WORK = (
+    "tests/shared/test_alike.py",
+    "tests/shared/test_copies.py",
+    "tests/shared/test_follow.py",
+    "tests/shared/test_hard_cases_air.py",
+    "tests/shared/test_hard_cases_world.py",
+    "tests/shared/test_placing.py",
+    "tests/shared/test_snapshot.py",
+    "tests/shared/test_waking.py",
+    "tests/server/test_replication.py",
+    "tests/server/test_rewind.py",
+)
+
+
+def test_a_start_that_compiles_says_so_and_a_client_plays_meanwhile_with_equal_results(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("NUMBA_BOUNDSCHECK", "1")
     first_start_and_later_ones(tmp_path)
     remove(tmp_path, "step")  # the client has to compile it
     first_join(tmp_path)
     other = chains.elsewhere("hills", chains.TICKS, kernels.NUMBA, NUMBA_CACHE_DIR=str(tmp_path))
     assert other == f"{kernels.NUMBA} {chains.chain('hills', chains.TICKS, compiled=True)}"
+    no_index_is_out_of_bounds(tmp_path)
 
 
 def first_start_and_later_ones(cache: Path) -> None:
@@ -64,6 +90,19 @@ def first_start_and_later_ones(cache: Path) -> None:
     remove(cache, "read_turns")
     assert in_a_log(cache) == [COMPILING]
     assert in_a_log(cache) == []
+
+
+def no_index_is_out_of_bounds(cache: Path) -> None:
+    """Runs other tests with the compiled functions. First, checks that a wrong index is an error."""
+    environment = os.environ | {kernels.VARIABLE: kernels.NUMBA, "NUMBA_CACHE_DIR": str(cache)}
+
+    def python(*arguments: str) -> subprocess.CompletedProcess[str]:
+        command = (sys.executable, *arguments)
+        return subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, check=False)
+
+    assert "IndexError: index is out of bounds" in python("-c", OUT_OF_BOUNDS).stderr
+    done = python("-m", "pytest", "-q", "-p", "no:cacheprovider", "-k", "not plain", *WORK)
+    assert done.returncode == 0, done.stdout + done.stderr
 
 
 def first_join(cache: Path) -> None:
