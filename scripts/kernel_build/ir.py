@@ -20,7 +20,7 @@ import llvmlite.binding as llvm
 from shared import exports, kernels
 
 FAILED = -(1 << 31)
-"""Result of a function that found an index out of bounds, in a build that checks indices."""
+"""Result of a function that ends with an error of Numba's. There is none as long as the sources raise nothing."""
 SPEED_LEVEL = 3
 FLOATS_USED = "_fltused"
 """Symbol that code with floats needs on Windows; otherwise it comes with the C library."""
@@ -28,23 +28,18 @@ FLOATS_USED = "_fltused"
 
 @dataclass(frozen=True)
 class Machine:
-    """The machine that LLVM makes code for; the fields are those of `llvm::TargetMachine`.
-
-    Attributes:
-        speed: the level of optimisation, from 0 to 3.
-    """
+    """The machine that LLVM makes code for; the fields are those of `llvm::TargetMachine`."""
 
     triple: str
     cpu: str
     features: str = ""
     reloc: str = "pic"
-    speed: int = SPEED_LEVEL
 
     def target_machine(self) -> Any:
         """Returns a new target machine of LLVM."""
         target = llvm.Target.from_triple(self.triple)
         return target.create_target_machine(
-            cpu=self.cpu, features=self.features, opt=self.speed, reloc=self.reloc, codemodel="small"
+            cpu=self.cpu, features=self.features, opt=SPEED_LEVEL, reloc=self.reloc, codemodel="small"
         )
 
 
@@ -57,13 +52,10 @@ class Source:
     text: str
 
 
-def numba_sources(root: Path, *, bounds: bool = False) -> list[Source]:
+def numba_sources(root: Path) -> list[Source]:
     """Compiles every exported function of the sources in `root`/shared, without optimisation.
 
     Call it only once in a process, with NUMBA_OPT=0 and NUMBA_CPU_NAME=generic in the environment.
-
-    Args:
-        bounds: whether to check indices; a function that finds one out of bounds returns `FAILED`.
     """
     import numba
     from numba import types
@@ -73,7 +65,6 @@ def numba_sources(root: Path, *, bounds: bool = False) -> list[Source]:
     _without_machine_code()
     _flags_compare_fast()
     options: dict[str, Any] = {name: value for name, value in jit.OPTIONS.items() if name != "cache"}
-    options["boundscheck"] = bounds
     jit.OPTIONS.clear()
     jit.OPTIONS.update(options)
     of_word, of_array = _intrinsics()
@@ -256,7 +247,7 @@ def linked(
         if not function.is_declaration and any(name in function.name for name in exports.SMALL):
             function.add_function_attribute("optsize")
     whole.verify()
-    builder = llvm.create_pass_builder(target_machine, llvm.create_pipeline_tuning_options(speed_level=machine.speed))
+    builder = llvm.create_pass_builder(target_machine, llvm.create_pipeline_tuning_options(speed_level=SPEED_LEVEL))
     builder.getModulePassManager().run(whole, builder)
     return whole, target_machine
 
