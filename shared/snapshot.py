@@ -210,16 +210,16 @@ class TickEncoder:
         due = self._due[1 : 1 + self._due[0]].tolist()
         return deltas, {(due[i], due[i + 1], due[i + 2]) for i in range(0, len(due), 3)}
 
-    def rows_in(self, segment: Cell) -> tuple[list[int], bytes]:
-        """Returns the ids of all entities in a loaded segment, ascending, and the entities packed as rows."""
+    def rows_in(self, segment: Cell) -> tuple[bytes, bytes]:
+        """Returns the keys of all entities in a loaded segment, ascending by id, and the entities packed as rows.
+
+        A key is an i64 with the id of an entity and its place in memory, as in `bulk.muster`.
+        """
         world, w = self._world, self._world.arrays
         if len(w.changed) >= len(self._ids):
             self._allocate(len(w.changed))
         end = world.kernel.muster(w.entities, w.heads, self._ids, self._packed, world.blocks.rows[segment])
-        if not end:
-            return [], b""
-        keys = self._ids[: end // ROW_BYTES].tolist()
-        return [key >> bulk.ID_BITS for key in keys], self._packed[:end].tobytes()
+        return self._ids[: end // ROW_BYTES].tobytes(), self._packed[:end].tobytes()
 
     def _allocate(self, room: int) -> None:
         """Makes room for `room` entities."""

@@ -8,11 +8,11 @@ keyframe of it. Nothing is computed per entity and client.
 """
 
 from collections import defaultdict
-from collections.abc import Collection, Mapping
-from itertools import accumulate
+from collections.abc import Mapping
 from typing import Any
 
 from server.observability.errors import FaultReporter
+from server.replication.labels import Labels, ids_of, keys_of
 from shared import messages
 from shared.blocks import offset_of, pack, segment_of
 from shared.bounds import bounds, in_ticks
@@ -27,11 +27,6 @@ from shared.world import World
 PACKS_PER_TICK = 8
 """Maximum number of segments whose blocks are packed anew in one tick, at 0.25 to 0.7 ms each. A client that joins in
 an unvisited area waits for its terrain; the tick does not wait."""
-ATTRIBUTE_BYTES = 32 * 1024
-"""Maximum bytes of attributes in one segment delta, so that no message gets too long. Others follow a tick later."""
-FEW_ENTITIES, ENTITY_BYTES = 3, 9
-"""Number of entities whose attributes always fit into `ATTRIBUTE_BYTES`, and bytes that count for the number of an
-entity. The latter is more than a number takes, which bounds the length of the list, too."""
 CHECK_S = 1.0
 """Seconds between two checksums of a segment in which something changes."""
 NO_CHANGES = (b"", b"")
@@ -99,26 +94,6 @@ class DeltaCache(dict[Cell, bytes]):
             parts = [part for segment in segments if segment in self.changed and (part := self[segment])]
             made = self._together[segments[0]] = segments, len(parts), b"".join(parts)
         return made[1], made[2]
-
-
-class Labels(dict[int, bytes]):
-    """The number and the attributes of each entity, encoded when they are first used; empty: it has none.
-
-    Args:
-        attributes: the attributes by entity.
-        named: entities that have had attributes, which a client may still know.
-    """
-
-    def __init__(self, attributes: Mapping[int, Mapping[str, Any]], named: Collection[int]) -> None:
-        self._attributes, self._named = attributes, named
-
-    def __missing__(self, entity: int) -> bytes:
-        values = self._attributes.get(entity)
-        label = b""
-        if values is not None or entity in self._named:
-            label = messages.pack(entity) + messages.pack(values or {})
-        self[entity] = label
-        return label
 
 
 class ChangeLog:
@@ -190,7 +165,7 @@ class ChangeLog:
     def note_removal(self, entity: int) -> None:
         """Notes that an entity was removed before the coming step."""
         self._latest = None
-        self._labels.pop(entity, None)
+        self._labels.forget(entity)
         home = self._home.pop(entity, None)
         if home is not None:
             self._now.gone[home].append(entity)
@@ -237,7 +212,7 @@ class ChangeLog:
                     if entity in self._attributes or (home is None and entity in self._named):
                         now.attributes[segment].add(entity)
         for entity in self._attributes_changed:
-            self._labels.pop(entity, None)
+            self._labels.forget(entity)
         for entity in self._attributes_changed & homes.keys():
             now.attributes[homes[entity]].add(entity)
             if self._world.extras.spawns:
@@ -277,14 +252,19 @@ class ChangeLog:
         """
         parts = self._parts.get(since)
         if parts is None:
-            newest = self._world.tick
-            assert since == KEYFRAME or newest - since <= self.history, "lost track"
-            first = (newest if since == KEYFRAME else since) + 1  # a keyframe needs no changes
-            ticks = [tick for at in range(first, newest + 1) if (tick := self._ticks.get(at)) is not None]
-            more = ticks[0].more() if len(ticks) == 1 else set().union(*(tick.more() for tick in ticks))
-            changed = more.union(self._due, *(tick.changed for tick in ticks))
-            parts = self._parts[since] = DeltaCache(self, since, ticks, changed, more)
+            parts = self._parts[since] = self._deltas(since)
         return parts
+
+    def _deltas(self, since: int) -> DeltaCache:
+        """Returns an empty cache of the deltas since a tick."""
+        if since == KEYFRAME:  # it needs no changes
+            return DeltaCache(self, since, [], self._due, NOWHERE)
+        newest = self._world.tick
+        assert newest - since <= self.history, "lost track"
+        ticks = [tick for at in range(since + 1, newest + 1) if (tick := self._ticks.get(at)) is not None]
+        more = ticks[0].more() if len(ticks) == 1 else set().union(*(tick.more() for tick in ticks))
+        changed = more.union(self._due, *(tick.changed for tick in ticks))
+        return DeltaCache(self, since, ticks, changed, more)
 
     def encode(self, segment: Cell, since: int) -> bytes:
         """Encodes the delta of a segment since a tick. `since(tick)[segment]` returns the shared copy instead."""
@@ -307,16 +287,21 @@ class ChangeLog:
     def _keyframe(self, segment: Cell) -> bytes:
         world = self._world
         if segment in world.blocks.rows:
-            ids, packed = self._encoder.rows_in(segment)
+            keys, packed = self._encoder.rows_in(segment)
         else:
             ids = sorted(entity for entity, home in self._home.items() if home == segment)
-            packed = encode_rows(world.rows(ids))
-        if not ids:
+            keys, packed = keys_of(ids), encode_rows(world.rows(ids))
+        if not keys:
             return messages.pack((*segment, KEYFRAME))
-        if (lately := self._placed_lately()) and (placed := lately.intersection(ids)):
-            packed = encode_rows(world.rows(ids), placed=placed)
-        fields = b"".join(map(self._fields_of, ids)) if world.extras.count else b""
-        return join_part(segment, KEYFRAME, (b"", packed), attributes=self._of(ids), extra=fields)
+        attributes, others = self._labels.of_segment(segment, keys)
+        self._attributes_changed.update(others)
+        fields = b""
+        if (lately := self._placed_lately()) or world.extras.count:
+            ids = list(ids_of(keys))
+            if placed := lately.intersection(ids):
+                packed = encode_rows(world.rows(ids), placed=placed)
+            fields = b"".join(map(self._fields_of, ids)) if world.extras.count else b""
+        return join_part(segment, KEYFRAME, (b"", packed), attributes=attributes, extra=fields)
 
     def _placed_lately(self) -> set[int]:
         """Returns the entities placed in the last `history` ticks. A client may still know their former positions."""
@@ -363,22 +348,10 @@ class ChangeLog:
         return b"".join(records)
 
     def _of(self, entities: list[int]) -> bytes:
-        """Returns the field `attributes` of entities, encoded; empty if they have none.
-
-        The attributes beyond `ATTRIBUTE_BYTES` wait for the next tick.
-        """
-        labels = list(filter(None, map(self._labels.__getitem__, entities)))
-        packed = b"".join(labels)
-        if len(labels) > FEW_ENTITIES and len(packed) + ENTITY_BYTES * len(labels) > ATTRIBUTE_BYTES:
-            named = [entity for entity in entities if self._labels[entity]]
-            numbers = map(len, map(messages.pack, named))
-            sizes = (len(label) - number for label, number in zip(labels, numbers, strict=True))
-            ends = accumulate(size + ENTITY_BYTES for size in sizes)
-            fits = max(sum(end <= ATTRIBUTE_BYTES for end in ends), 1)
-            self._attributes_changed.update(named[fits:])
-            del labels[fits:]
-            packed = b"".join(labels)
-        return messages.array_head(2 * len(labels)) + packed if labels else b""
+        """Returns the field `attributes` of entities, encoded. Those that do not fit wait for the next tick."""
+        field, others = self._labels.of(entities)
+        self._attributes_changed.update(others)
+        return field
 
     def _packed_since(self, segment: Cell, since: int, ticks: list[_Tick]) -> tuple[bytes, bytes]:
         """Returns the packed changes (turns, rows) of the entities that changed and are still in the segment."""

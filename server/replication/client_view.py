@@ -131,7 +131,7 @@ class ClientView:
             self._fresh = {segment: since for segment, since in self._fresh.items() if segment not in parts}
             self.drops = []
         self._behind = (
-            {segment: since for segment, since in due.items() if segment not in parts and since != KEYFRAME}
+            {segment: since for segment, since in due.items() if since != KEYFRAME and segment not in parts}
             if len(parts) < len(due)
             else {}
         )
