@@ -29,7 +29,7 @@ FOLDERS = ("client_sdk", "server", "shared")
 ALIAS = "_checkout.py"
 """The file in the folder `PACKAGE` that is of use in a checkout only."""
 
-KERNEL_SOURCES = ("kernel.py", "bulk.py", "traffic.py", "delivery.py", "pacing.py")
+KERNEL_SOURCES = ("kernel.py", "bulk.py", "traffic.py", "delivery.py", "pacing.py", "places.py")
 """The files in shared/ of which shared/prebuilt is made."""
 BROWSER, RUNTIME = Path("build/browser"), Path("server/play/runtime")
 """Folder of Python for browsers, if `scripts/browser` has made it, and its place in the wheel."""

@@ -45,12 +45,13 @@ EXPORTS = {
         "due_rows": "QdQd",
         "measure_rows": "QDqqnd",
     },
+    "places": {"mark_near": "qdiB"},
 }
 """Argument kinds of each function, by source: one letter per argument. A function returns nothing, a truth value, or a
 whole number that fits into 32 bits."""
-SERVER_SOURCES = frozenset({"traffic", "delivery", "pacing"})
+SERVER_SOURCES = frozenset({"traffic", "delivery", "pacing", "places"})
 """Sources that only servers use. The libraries for browsers do not have their functions."""
-SMALL = SERVER_SOURCES | {"news"}
+SMALL = SERVER_SOURCES | {"news", "muster", "mark_near"}
 """Sources and functions that are compiled to be small rather than fast: they are not the physics."""
 
 FIELDS = {name: {"solid": "u", "heads": "i"}.get(name, "q") for name in Arrays._fields}

@@ -50,12 +50,7 @@ def taken(world: WorldState, row: int, kind: int, box: list[int]) -> bool:
     """Returns whether a block or a solid entity is in the way of a template's box, without the row `row` (-1: none)."""
     if world.kernel.blocks_in(world.bound, *box):
         return True
-    return _meets(world, kind) and next(_overlaps(world, row, box), None) is not None
-
-
-def _meets(world: WorldState, kind: int) -> bool:
-    """Returns whether solid entities stop the entities of a template."""
-    return bool(world.parameters[layout.PAIRS] and world.templates[kind, layout.SOLID])
+    return world.meets[kind] and next(_overlaps(world, row, box), None) is not None
 
 
 def free_place(world: WorldState, row: int, kind: int, position: object, push: bool) -> list[int]:
@@ -103,7 +98,7 @@ def _stops(world: WorldState, row: int, kind: int, box: list[int], axis: int, si
     face = box[axis] if sign > 0 else box[axis + 3]
     first = -(-face // BLOCK) if sign > 0 else face // BLOCK
     faces = [first * BLOCK, (first + sign) * BLOCK]
-    if _meets(world, kind):
+    if world.meets[kind]:
         reach = list(box)
         reach[axis + 3 if sign > 0 else axis] += sign * BLOCK
         near = _near(world, row, reach)

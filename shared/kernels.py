@@ -25,7 +25,7 @@ from pathlib import Path
 from types import ModuleType, SimpleNamespace
 from typing import Any
 
-from shared import bulk, delivery, exports, freshness, kernel, numba_kernel, pacing, traffic, wasm_kernel
+from shared import bulk, delivery, exports, freshness, kernel, numba_kernel, pacing, places, traffic, wasm_kernel
 
 VARIABLE = "SOVEREIGN_KERNEL"
 """Name of the environment variable that forces a form."""
@@ -35,7 +35,7 @@ AUTO = "auto"
 """Setting that takes the first form that is available."""
 CHOICES = (AUTO, *FORMS)
 """Values of the setting."""
-SOURCES: tuple[ModuleType, ...] = (kernel, bulk, traffic, delivery, pacing)
+SOURCES: tuple[ModuleType, ...] = (kernel, bulk, traffic, delivery, pacing, places)
 """Modules that the kernel is made from."""
 LIBRARIES = Path(__file__).parent / "prebuilt"
 """Folder of the prebuilt libraries."""
@@ -256,8 +256,8 @@ def _library() -> ModuleType:
     built: Callable[[int], int] = module.built_from
     if built(CONSTANTS_CRC) != constants_crc() or not _made_from_the_sources(built(CODE_CRC), known):
         raise ImportError(
-            "the prebuilt kernel was not made from the present shared/kernel.py, bulk.py, traffic.py, delivery.py and "
-            "pacing.py; run scripts/kernels"
+            "the prebuilt kernel was not made from the present shared/kernel.py, bulk.py, traffic.py, delivery.py, "
+            "pacing.py and places.py; run scripts/kernels"
         )
     return module
 

@@ -52,6 +52,8 @@ class WorldState:
         self.templates, self._walk, self.parameters = scene.kernel_tables()
         self.boxes = [tuple(row[layout.LO_X : layout.LO_X + 6]) for row in self.templates.tolist()]
         """Low corner and size of each template's box, in grid steps."""
+        self.meets = [bool(self.parameters[layout.PAIRS] and row[layout.SOLID]) for row in self.templates.tolist()]
+        """Whether solid entities stop the entities of each template."""
         self.extras = scene.extras
         """The extra columns of the scene's states."""
         self._row_of: dict[int, int] = {}

@@ -48,8 +48,10 @@ class Connections:
     @property
     def others(self) -> list[Session]:
         """The sessions that are not on the fast path, in the order in which they opened. A copy."""
+        if len(self._others) < 2:
+            return [*self._others]
         if self.mostly_fast:
-            return sorted(self._others, key=_number) if len(self._others) > 1 else [*self._others]
+            return sorted(self._others, key=_number)
         return [session for session in self.sessions if session.row < 0]
 
     def open(self, link: Transport, now: float) -> Session:

@@ -16,6 +16,10 @@ if TYPE_CHECKING:
     from server.worlds.seats import Seat
 
 
+NO_INPUTS = InputQueue()
+"""Input queue of a session without a player. It stays empty."""
+
+
 class Session:
     """One connection, from the handshake to its end.
 
@@ -44,7 +48,7 @@ class Session:
         self.player: Player | None = None
         self.entity = 0
         """Number of the player's entity; 0 before the client has joined."""
-        self._inputs = InputQueue()
+        self._inputs = NO_INPUTS
         self.loading = False
         """Whether `Rules.load_player` runs for the client."""
         self.loaded: Any = None
@@ -115,7 +119,7 @@ class Session:
         self.recall()
         if self.player is not None:
             self.player.session = None
-        self.player, self.entity, self._inputs = None, 0, InputQueue()
+        self.player, self.entity, self._inputs = None, 0, NO_INPUTS
 
     def send(self, message: bytes) -> None:
         """Hands a message to the link. A session on the fast path stays there."""

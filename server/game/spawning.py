@@ -2,19 +2,14 @@
 
 from collections.abc import Iterator
 
-import numpy as np
-import numpy.typing as npt
-
+from server.game.fast_rows import Arguments
 from shared.checks import Vec
 from shared.free_places import box_at, taken
-from shared.layout import FLOOR, ID, TEMPLATE, X, Y
+from shared.layout import FLOOR, TEMPLATE
+from shared.places import APART, RINGS
 from shared.units import BLOCK, BLOCK_SHIFT, to_position
 from shared.world import World
 
-RINGS = 24
-"""Number of rings of places that are tried around a spawn point, including the point itself."""
-APART = 2
-"""Distance of neighbouring places and rings, in blocks."""
 OFFSETS = tuple(
     (i, j)
     for ring in range(1, RINGS)
@@ -23,15 +18,14 @@ OFFSETS = tuple(
     if max(abs(i), abs(j)) == ring
 )
 """Offsets of the places around a spawn point in steps of `APART` blocks, the nearest rings first."""
-SIDE = 2 * RINGS + 1
-"""Number of places along each axis, with one more at each end, which stands for all that are further away."""
-ORDER = np.full(SIDE * SIDE, len(OFFSETS))
-"""Number of each of `OFFSETS` (i, j), at the index i * `SIDE` + j. Other places have the number after the last."""
-ORDER[[i * SIDE + j for i, j in OFFSETS]] = range(len(OFFSETS))
-ALONG = np.array((SIDE, 1.0))
-"""Factors of an offset (i, j) in this index."""
-
-Bools = npt.NDArray[np.bool_]
+NO_PLACE = len(OFFSETS)
+"""Number in place of that of a place: the spawn point itself, and everything beyond the rings."""
+NUMBERS = {offset: number for number, offset in enumerate(OFFSETS)}
+"""Number of each place, by its offset."""
+ORDER = [NUMBERS.get((i, j), NO_PLACE) for i in range(-RINGS, RINGS + 1) for j in range(-RINGS, RINGS + 1)]
+"""Number of the place at each offset, as `places.mark_near` takes them."""
+NOTHING_NEAR = bytes(NO_PLACE + 1)
+"""Marks of the places, and of `NO_PLACE`, if there is no entity."""
 
 
 class Spawns:
@@ -41,6 +35,11 @@ class Spawns:
         self._world = world
         self._turn = 0
         self._full: tuple[int, int, int] | None = None
+        self._floor = int(world.parameters[FLOOR])
+        self._points = [in_steps(spawn) for spawn in world.scene.spawns]
+        self._spawn = Arguments(world.kernel, "d", 2)
+        self._order = Arguments(world.kernel, "i", values=ORDER)
+        self._near = Arguments(world.kernel, "B", len(NOTHING_NEAR))
 
     def spawn(self) -> int | None:
         """Adds the entity of a new player and returns its number; None: there is no room."""
@@ -76,14 +75,14 @@ class Spawns:
         if now == self._full:
             return
         self._turn += 1
-        spawns = world.scene.spawns
-        turn = self._turn % len(spawns)
-        for spawn in spawns[turn:] + spawns[:turn]:
-            place = in_steps(spawn)
+        points = self._points
+        turn = self._turn % len(points)
+        for at in range(turn, turn + len(points)):
+            place = points[at % len(points)]
             if not taken(world, row, kind, box_at(world, kind, place)):
                 yield place
-        x, y, z = spawns[turn]
-        occupied = self._taken(x, y).tobytes()
+        x, y, z = world.scene.spawns[turn]
+        occupied = self._occupied(x, y)
         for near in (b"\0", b"\1"):
             at = occupied.find(near)
             while at >= 0:
@@ -98,23 +97,16 @@ class Spawns:
     def _built(self, box: list[int]) -> bool:
         """Returns whether a block, or a segment that is not loaded, is in the way of a box."""
         world = self._world
-        below = (box[5] - 1) >> BLOCK_SHIFT < world.parameters[FLOOR]
-        return bool(below or world.kernel.blocks_in(world.bound, *box))
+        below = (box[5] - 1) >> BLOCK_SHIFT < self._floor
+        return below or bool(world.kernel.blocks_in(world.bound, *box))
 
-    def _taken(self, x: float, y: float) -> Bools:
-        """Returns which of the places `OFFSETS` around a spawn point have an entity nearby, at any height."""
-        world = self._world
-        matrix = world.matrix
-        if len(matrix) > len(world):
-            matrix = matrix[matrix[:, ID] != 0]
-        steps = matrix.T[X : Y + 1] - np.array(((x * BLOCK,), (y * BLOCK,)))
-        steps /= APART * BLOCK
-        np.rint(steps, out=steps)
-        np.maximum(steps, -RINGS, out=steps)
-        np.minimum(steps, RINGS, out=steps)
-        near = np.zeros(len(OFFSETS) + 1, bool)
-        near[ORDER[(ALONG @ steps).astype(np.int64)]] = True
-        return near[:-1]
+    def _occupied(self, x: float, y: float) -> bytes:
+        """Returns for each of the places `OFFSETS` around a spawn point whether an entity is near it, at any height."""
+        world, spawn, near = self._world, self._spawn.values, self._near
+        spawn[0], spawn[1] = x * BLOCK, y * BLOCK
+        near.values[:] = NOTHING_NEAR
+        world.kernel.mark_near(world.arrays.entities, self._spawn.lent, self._order.lent, near.lent)
+        return near.values[:NO_PLACE].tobytes()
 
 
 def in_steps(place: Vec) -> list[int]:

@@ -62,8 +62,8 @@ def test_the_prebuilt_one_is_the_first_choice_and_needs_no_numba() -> None:
 
 
 STALE = (
-    "the prebuilt kernel was not made from the present shared/kernel.py, bulk.py, traffic.py, delivery.py and "
-    "pacing.py; run scripts/kernels"
+    "the prebuilt kernel was not made from the present shared/kernel.py, bulk.py, traffic.py, delivery.py, "
+    "pacing.py and places.py; run scripts/kernels"
 )
 REFUSED = "from shared import kernels; print([kernels.chosen(), kernels.trouble(), kernels.describe()])"
 

@@ -22,7 +22,7 @@ def test_fresh_ones_are_taken_and_a_comment_does_not_matter(root: Path) -> None:
     refuse_stale_kernels(root)
 
 
-@pytest.mark.parametrize("name", ["kernel.py", "bulk.py", "traffic.py", "delivery.py", "pacing.py"])
+@pytest.mark.parametrize("name", ["kernel.py", "bulk.py", "traffic.py", "delivery.py", "pacing.py", "places.py"])
 def test_a_changed_source_is_refused(root: Path, name: str) -> None:
     source = root / "shared" / name
     source.write_text(source.read_text("utf-8") + "MORE = 1\n", "utf-8")

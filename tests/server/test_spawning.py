@@ -93,7 +93,7 @@ def test_places_near_an_entity_are_those_that_round_to_it_at_any_height() -> Non
     assert len(where) > 20
     for x, y in ((0.0, 0.0), (1.5, -0.75), (20.0, -31.0)):
         near = {(np.rint((ex - x) / APART), np.rint((ey - y) / APART)) for ex, ey, _ in where}
-        assert Spawns(world)._taken(x, y).tolist() == [offset in near for offset in OFFSETS]
+        assert list(Spawns(world)._occupied(x, y)) == [offset in near for offset in OFFSETS]
 
 
 def test_a_spawn_point_below_the_world_is_the_only_place_there() -> None:
