@@ -41,7 +41,9 @@ def overlapping(world: WorldState, but: int, box: list[int]) -> list[int]:
 def _overlaps(world: WorldState, but: int, box: list[int]) -> Iterator[int]:
     """Yields the rows of the solid entities that overlap a box, without the row `but` (-1: none)."""
     x0, y0, z0, x1, y1, z1 = box
-    for low_x, low_y, low_z, high_x, high_y, high_z, row in _near(world, but, box).tolist():
+    end = world.kernel.gather(world.bound, but, True, *box)
+    found = iter(world.candidates_flat[:end].tolist())
+    for low_x, low_y, low_z, high_x, high_y, high_z, row in zip(*[found] * layout.CANDIDATE, strict=True):
         if low_x < x1 and low_y < y1 and low_z < z1 and high_x > x0 and high_y > y0 and high_z > z0:
             yield row
 

@@ -5,6 +5,7 @@ each change and of each step: a recording consists of these calls. A change that
 an entity aside) is not reported by itself.
 """
 
+from array import array
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Protocol
 
@@ -20,9 +21,7 @@ from shared.states import ID_MAX, STATES
 from shared.units import BLOCK, SEGMENT
 from shared.world_state import WorldState
 
-LISTS = (
-    ("_awake", layout.N_AWAKE), ("_woken", layout.N_WOKEN), ("_changed", layout.N_CHANGED), ("_fell", layout.N_FELL),
-)  # fmt: skip
+LISTS = ("_awake", layout.N_AWAKE), ("_woken", layout.N_WOKEN), ("_changed", layout.N_CHANGED), ("_fell", layout.N_FELL)
 """Names of the lists that a world keeps between two steps, with the place of each list's length in `_lengths`."""
 
 
@@ -48,7 +47,7 @@ class Observer(Protocol):
         """Is called after blocks of a segment were written."""
 
     def put(self, states: Int64s) -> None:
-        """Is called before states ([n, 12]) are written, and after `spawn_many`."""
+        """Is called before states ([n, 12]) are written, and after `spawn_many`. The array may be used again later."""
 
     def removed(self, entity: int) -> None:
         """Is called after an entity was removed."""
@@ -177,11 +176,8 @@ class UncheckedWorld(WorldState):
     def _put(self, states: Iterable[tuple[int, ...]] | Int64s) -> None:
         """Writes states; ids that are not known become new entities."""
         new = np.asarray(states if isinstance(states, np.ndarray) else list(states), np.int64)
-        extras = self.extras
-        if extras.count:
-            new = extras.widened(new.reshape(-1, new.shape[-1] if new.size else STATES))
-        else:
-            new = new.reshape(-1, STATES)
+        width = new.shape[-1] if self.extras.count and new.size else STATES
+        new = self.extras.widened(new.reshape(-1, width))
         if self.observer is not None:
             self.observer.put(new)
         self._store(new)
@@ -204,11 +200,18 @@ class UncheckedWorld(WorldState):
 
     def add(self, template: int, position: Iterable[int], velocity: Sequence[int] = (0, 0, 0)) -> int:
         """Adds an entity at a place that is free, in grid steps and velocity steps, and returns its id."""
-        entity, extras = self._next_id, self.extras
+        entity, extras, observer = self._next_id, self.extras, self.observer
         if entity + extras.blocks[template] > ID_MAX:
             raise SceneError("ids: used up")
         state = entity, template, self._thrown(template, velocity[2]), *position, *velocity, 0, 0, 0
-        self._put([(*state, *extras.new[template].tolist())])
+        if extras.count:
+            self._put([(*state, *extras.new[template].tolist())])
+            return entity
+        self._one_state[:] = array("q", state)
+        if observer is not None:
+            observer.put(self._one)
+        self._one_row[0] = self._row(entity)
+        self.kernel.store(self.bound, *self._adding, 1, self.tick + 1)
         return entity
 
     def _settle(self, template: int, positions: Int64s) -> int:

@@ -10,11 +10,12 @@ name it until then.
 
 import hashlib
 import struct
+from array import array
 from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any
 
 from shared import blocks, kernels, layout
-from shared.arrays import Uint8s, grown, np
+from shared.arrays import Uint8s, flat, grown, np
 from shared.behaviours import Field
 from shared.checks import Cell, MissingError, SceneError, is_whole, shown, whole
 from shared.layout import FALLING, FLAGS, ID, NEXT, TEMPLATE, VX, Arrays, X
@@ -30,6 +31,8 @@ HASH_BYTES = 20
 COLLECT_MAX = 1024
 """Number of rows up to which the kernel sorts the states, by insertion: 1 us for about ten rows instead of numpy's
 9."""
+NEW_ROW = array("q", (-(column == layout.CELL) for column in range(len(layout.COLUMNS))))
+"""Row of an entity that has no state yet, and is in no cell."""
 
 
 class WorldState:
@@ -77,13 +80,14 @@ class WorldState:
         self.fields_set: dict[int, int] = {}
         """Entities whose extra columns alone were set in the latest step, with a mask of these columns."""
         self._inputs = np.zeros(32, np.int64)
+        self._one, self._one_row = np.zeros((1, STATES), np.int64), np.zeros(1, np.int64)  # an entity that is added
+        self._one_state = flat(self._one)
         self._extra = np.zeros((0, self.extras.count), np.int64)
         self._entities = np.zeros((0, len(layout.COLUMNS)), np.int64)
         self._awake = self._next_awake = self._woken = self._later = np.zeros(0, np.int64)
         self._changed = self._fell = np.zeros(0, np.int64)
         self._allocate(8)
-        self._bind()
-        self._told = self.kernel.lent(self._inputs)
+        self.use(self.kernel)
 
     def __len__(self) -> int:
         return len(self._row_of)
@@ -320,17 +324,19 @@ class WorldState:
     def use(self, kernel: kernels.Kernel) -> None:
         """Replaces the kernel; the state of the world stays the same."""
         self.kernel = kernel
-        self._told = kernel.lent(self._inputs)
+        self._told, self._adding = kernel.lent(self._inputs), (kernel.lent(self._one_row), kernel.lent(self._one))
         self._bind()
 
     def _allocate(self, rows: int) -> None:
         """Makes room for `rows` entities, and keeps the present ones."""
         self._entities = grown(self._entities, 0, rows)
+        self._flat = flat(self._entities)
         if self.extras.count:
             self._extra = grown(self._extra, 0, rows)
         for name in ("_awake", "_next_awake", "_woken", "_later", "_changed", "_fell"):
             setattr(self, name, grown(getattr(self, name), 0, rows + 1))
         self.candidates = np.zeros((rows + 1, layout.CANDIDATE), np.int64)
+        self.candidates_flat = flat(self.candidates)
         self._riders = np.zeros((rows + 1, layout.RIDER), np.int64)
 
     def _bind(self) -> None:
@@ -368,8 +374,7 @@ class WorldState:
                     self._allocate(2 * row)
                     self._bind()
                 self._rows += 1
-            self._entities[row] = 0
-            self._entities[row, layout.CELL] = -1
+            self._flat[row << layout.WIDTH_SHIFT : row + 1 << layout.WIDTH_SHIFT] = NEW_ROW
             self._row_of[entity] = row
             self._ordered = None
             self._next_id = max(self._next_id, entity + 1)

@@ -81,13 +81,14 @@ class Spawns:
             place = points[at % len(points)]
             if not taken(world, row, kind, box_at(world, kind, place)):
                 yield place
-        x, y, z = world.scene.spawns[turn]
+        x, y, _ = world.scene.spawns[turn]
+        height = points[turn][2]
         occupied = self._occupied(x, y)
         for near in (b"\0", b"\1"):
             at = occupied.find(near)
             while at >= 0:
                 i, j = OFFSETS[at]
-                place = in_steps((x + APART * i, y + APART * j, z))
+                place = [to_position(x + APART * i, "spawn"), to_position(y + APART * j, "spawn"), height]
                 box = box_at(world, kind, place)
                 if not (self._built(box) or taken(world, row, kind, box)):
                     yield place

@@ -43,11 +43,14 @@ class ClientView:
         Returns:
             The segments that are new in the view, nearest first, and those that were dropped from it.
         """
-        added, dropped = interest.update(self.sees, near, keep)
         self.near = near
-        self._fresh.update(
-            dict.fromkeys(added, tick if self.sees else -1)
-        )  # -1: until these are sent, `complete_tick` precedes all
+        if not self.sees:
+            self.sees.update(near)
+            self._fresh = dict.fromkeys(near, -1)  # until these are sent, `complete_tick` precedes all
+            self._rest, self.drops = (), sorted(self._knows - self.sees)
+            return [*near], []
+        added, dropped = interest.update(self.sees, near, keep)
+        self._fresh.update(dict.fromkeys(added, tick))
         self.sees.difference_update(dropped)
         for segment in dropped:
             self._fresh.pop(segment, None)
