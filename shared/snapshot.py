@@ -219,6 +219,8 @@ class TickEncoder:
         if len(w.changed) >= len(self._ids):
             self._allocate(len(w.changed))
         end = world.kernel.muster(w.entities, w.heads, self._ids, self._packed, world.blocks.rows[segment])
+        if not end:
+            return b"", b""
         return self._ids[: end // ROW_BYTES].tobytes(), self._packed[:end].tobytes()
 
     def _allocate(self, room: int) -> None:

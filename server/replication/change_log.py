@@ -294,11 +294,12 @@ class ChangeLog:
         if not keys:
             return messages.pack((*segment, KEYFRAME))
         attributes, others = self._labels.of_segment(segment, keys)
-        self._attributes_changed.update(others)
-        fields = b""
-        if (lately := self._placed_lately()) or world.extras.count:
+        if others:
+            self._attributes_changed.update(others)
+        fields, lately = b"", world.tick - self._placed_at < self.history
+        if lately or world.extras.count:
             ids = list(ids_of(keys))
-            if placed := lately.intersection(ids):
+            if lately and (placed := self._placed_lately().intersection(ids)):
                 packed = encode_rows(world.rows(ids), placed=placed)
             fields = b"".join(map(self._fields_of, ids)) if world.extras.count else b""
         return join_part(segment, KEYFRAME, (b"", packed), attributes=attributes, extra=fields)
@@ -306,8 +307,6 @@ class ChangeLog:
     def _placed_lately(self) -> set[int]:
         """Returns the entities placed in the last `history` ticks. A client may still know their former positions."""
         newest = self._world.tick
-        if newest - self._placed_at >= self.history:
-            return set()
         ticks = map(self._ticks.get, range(newest - self.history + 1, newest + 1))
         return set().union(*(tick.placed for tick in ticks if tick is not None))
 

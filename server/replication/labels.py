@@ -28,8 +28,8 @@ class Labels(dict[int, bytes]):
 
     def __init__(self, attributes: Mapping[int, Mapping[str, Any]], named: Collection[int]) -> None:
         self._attributes, self._named = attributes, named
-        self._joined: dict[Cell, tuple[bytes, int, bytes]] = {}
-        """Keys of the entities of each segment, number of their labels, and the labels, joined."""
+        self._fields: dict[Cell, tuple[bytes, int, bytes]] = {}
+        """Keys of the entities of each segment, number of their labels, and the field with these."""
 
     def __missing__(self, entity: int) -> bytes:
         values = self._attributes.get(entity)
@@ -42,7 +42,7 @@ class Labels(dict[int, bytes]):
     def forget(self, entity: int) -> None:
         """Forgets the label of an entity that was removed, or whose attributes have changed."""
         if self.pop(entity, None) is not None:
-            self._joined.clear()
+            self._fields.clear()
 
     def of(self, entities: list[int]) -> tuple[bytes, list[int]]:
         """Returns the field `attributes` of entities, encoded, and the entities whose labels do not fit.
@@ -70,14 +70,19 @@ class Labels(dict[int, bytes]):
             segment: the segment.
             keys: the keys of its entities (`snapshot.TickEncoder.rows_in`).
         """
-        known, n, packed = self._joined.get(segment, NONE)
-        if keys != known:
-            if not keys.startswith(known):
-                known, n, packed = NONE
-            labels = list(filter(None, map(self.__getitem__, ids_of(keys[len(known) :]))))
-            n, packed = n + len(labels), packed + b"".join(labels)
-            self._joined[segment] = keys, n, packed
-        return (field(n, packed), []) if fit(n, packed) else self.of(list(ids_of(keys)))
+        known, n, made = self._fields.get(segment, NONE)
+        if keys == known:
+            return made, []
+        if not keys.startswith(known):
+            known, n, made = NONE
+        labels = list(filter(None, map(self.__getitem__, ids_of(keys[len(known) :]))))
+        packed = made[len(field(n, b"")) :] + b"".join(labels)
+        n += len(labels)
+        if not fit(n, packed):
+            return self.of(list(ids_of(keys)))
+        made = field(n, packed)
+        self._fields[segment] = keys, n, made
+        return made, []
 
 
 def keys_of(ids: Iterable[int]) -> bytes:
