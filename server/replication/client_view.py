@@ -125,10 +125,14 @@ class ClientView:
             if len(plain) <= room:
                 self.tick = tick
                 return n, plain
-        due = self._behind | dict.fromkeys(self._fresh, KEYFRAME)
-        if len(due) < len(self.sees):
-            due |= {segment: self.tick for segment in self.sees - due.keys() if deltas[segment]}
-        parts = self._urgent(log, due, tick, room)
+        due: dict[Cell, int] = {}
+        if tuple(self._fresh) == self.near and len(self._fresh) == len(self.sees):
+            parts = self._nearest(log, room)
+        else:
+            due = self._behind | dict.fromkeys(self._fresh, KEYFRAME)
+            if len(due) < len(self.sees):
+                due |= {segment: self.tick for segment in self.sees - due.keys() if deltas[segment]}
+            parts = self._urgent(log, due, tick, room)
         if self._fresh or self.drops:
             self._knows = self._knows.difference(self.drops) | (self._fresh.keys() & parts.keys())
             self._fresh = {segment: since for segment, since in self._fresh.items() if segment not in parts}
@@ -140,6 +144,17 @@ class ClientView:
         )
         self.tick = tick
         return len(parts), b"".join(parts.values())
+
+    def _nearest(self, log: ChangeLog, room: int) -> dict[Cell, bytes]:
+        """Returns the result of `_urgent` if all segments wait for their keyframes, the nearest first."""
+        keyframes, chosen = log.since(KEYFRAME), dict[Cell, bytes]()
+        for segment in self._fresh:
+            if part := keyframes[segment]:
+                room -= len(part)
+                if len(chosen) > 1 and room < 0:
+                    break
+                chosen[segment] = part
+        return chosen
 
     def _urgent(self, log: ChangeLog, due: dict[Cell, int], tick: int, room: int) -> dict[Cell, bytes]:
         """Returns the most urgent deltas that fit into the room, but at least the own segment and one more.
@@ -158,10 +173,9 @@ class ClientView:
             waits = tick - due[segment] if due[segment] != KEYFRAME else history
             return segment != centre, -waits / (1 + 3 * distance(segment, centre))
 
-        new = tuple(self._fresh) == self.near == tuple(due)  # the nearest first already, and all wait for as long
         deltas = {since: log.since(since) for since in {*due.values()}}
         chosen: dict[Cell, bytes] = {}
-        for segment in due if new else sorted(due, key=rank):
+        for segment in sorted(due, key=rank):
             if part := deltas[due[segment]][segment]:
                 room -= len(part)
                 if len(chosen) > 1 and room < 0:
