@@ -20,10 +20,12 @@ from server.replication.change_log import ChangeLog
 from server.replication.client_stream import ClientStream
 from shared import fields, messages
 from shared.checks import Cell
-from shared.messages import Terrain, encode
+from shared.messages import Terrain, encode, head_of, pack
 from shared.snapshot import VERDICT
 from shared.world import World
 
+TERRAIN = head_of(Terrain)[1]
+"""First value of each message `Terrain`."""
 GAPS_S = 2.0
 """Seconds for which gaps between a client's snapshots are kept: longer than lag compensation can look back."""
 EVENT_BYTES = 128
@@ -183,7 +185,7 @@ class Sender:
                 stream.terrain_now = (segment, blocks, 0)
             segment, packed, offset = stream.terrain_now
             chunk = packed[offset : offset + most]
-            stream.send(encode(Terrain(*segment, offset, len(packed), chunk)))
+            stream.send(pack((TERRAIN, *segment, offset, len(packed), chunk)))
             offset += len(chunk)
             stream.terrain_now = (segment, packed, offset) if offset < len(packed) else None
             room -= len(chunk)
