@@ -1,8 +1,9 @@
 """Spawning: finds free places at and around the spawn points for players that join and entities that fell out."""
 
+from array import array
 from collections.abc import Iterator
 
-from server.game.fast_rows import Arguments
+from server.game.fast_rows import Arguments, lent
 from shared.checks import Vec
 from shared.free_places import box_at, taken
 from shared.layout import FLOOR, TEMPLATE
@@ -19,10 +20,11 @@ OFFSETS = tuple(
 )
 """Offsets of the places around a spawn point in steps of `APART` blocks, the nearest rings first."""
 NO_PLACE = len(OFFSETS)
-"""Number in place of that of a place: the spawn point itself, and everything beyond the rings."""
+"""Number that stands for the spawn point itself, and for everything beyond the rings."""
 NUMBERS = {offset: number for number, offset in enumerate(OFFSETS)}
 """Number of each place, by its offset."""
-ORDER = [NUMBERS.get((i, j), NO_PLACE) for i in range(-RINGS, RINGS + 1) for j in range(-RINGS, RINGS + 1)]
+_ACROSS = range(-RINGS, RINGS + 1)
+ORDER = array("i", (NUMBERS.get((i, j), NO_PLACE) for i in _ACROSS for j in _ACROSS))
 """Number of the place at each offset, as `places.mark_near` takes them."""
 NOTHING_NEAR = bytes(NO_PLACE + 1)
 """Marks of the places, and of `NO_PLACE`, if there is no entity."""
@@ -38,7 +40,7 @@ class Spawns:
         self._floor = int(world.parameters[FLOOR])
         self._points = [in_steps(spawn) for spawn in world.scene.spawns]
         self._spawn = Arguments(world.kernel, "d", 2)
-        self._order = Arguments(world.kernel, "i", values=ORDER)
+        self._order = lent(world.kernel, ORDER, "i")
         self._near = Arguments(world.kernel, "B", len(NOTHING_NEAR))
 
     def spawn(self) -> int | None:
@@ -106,8 +108,8 @@ class Spawns:
         world, spawn, near = self._world, self._spawn.values, self._near
         spawn[0], spawn[1] = x * BLOCK, y * BLOCK
         near.values[:] = NOTHING_NEAR
-        world.kernel.mark_near(world.arrays.entities, self._spawn.lent, self._order.lent, near.lent)
-        return near.values[:NO_PLACE].tobytes()
+        world.kernel.mark_near(world.arrays.entities, self._spawn.lent, self._order, near.lent)
+        return bytes(near.values[:NO_PLACE])
 
 
 def in_steps(place: Vec) -> list[int]:

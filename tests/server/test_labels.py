@@ -35,7 +35,7 @@ def assert_same(labels: Labels, attributes: dict[int, dict[str, Any]], here: lis
     keys = keys_of(here)
     assert list(ids_of(keys)) == here
     parts = [part for entity in here if entity in attributes for part in (entity, attributes[entity])]
-    expected = (messages.pack(parts) if parts else b""), []
+    expected: tuple[bytes, list[int]] = (messages.pack(parts) if parts else b""), []
     assert labels.of_segment(SEGMENT, keys) == labels.of_segment(SEGMENT, keys) == expected
 
 

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from server.game import spawning
-from server.game.spawning import APART, OFFSETS, Spawns
+from server.game.spawning import OFFSETS, Spawns
 from shared.free_places import box_at, taken
+from shared.places import APART
 from shared.world import OverlapError, World
 from tests.worlds import build, floor
 

@@ -5,7 +5,7 @@ import random
 import numpy as np
 import pytest
 
-from server.game.fast_rows import Arguments
+from server.game.fast_rows import Arguments, lent
 from server.game.spawning import NO_PLACE, OFFSETS, ORDER
 from shared import kernels
 from shared.layout import COLUMNS, ID, Int64s, X, Y
@@ -21,7 +21,7 @@ def test_a_place_is_near_an_entity_if_the_distance_rounds_to_its_offset(form: st
     for _ in range(60):
         entities, x, y = rows(rng), point(rng), point(rng)
         spawn, near = Arguments(kernel, "d", values=(x, y)), Arguments(kernel, "B", NO_PLACE + 1)
-        kernel.mark_near(kernel.lent(entities), spawn.lent, Arguments(kernel, "i", values=ORDER).lent, near.lent)
+        kernel.mark_near(kernel.lent(entities), spawn.lent, lent(kernel, ORDER, "i"), near.lent)
         assert near.values.tolist()[:NO_PLACE] == expected(entities, x, y)
 
 
