@@ -7,6 +7,8 @@ import math
 from bisect import bisect_left, bisect_right
 from collections.abc import Iterable, Mapping, Sequence
 from functools import partial
+from itertools import compress
+from operator import itemgetter, ne
 from typing import Any
 
 from client_sdk.interpolation import Interpolation
@@ -17,7 +19,7 @@ from client_sdk.timing.server_clock import ServerClock
 from client_sdk.timing.timeline import Timeline
 from client_sdk.view import NO_VALUES, EntityView, View
 from shared.checks import Vec
-from shared.layout import CELL, ID, MOVE_X, TEMPLATE, VX, VY, VZ, X, Y, Z
+from shared.layout import CELL, ID, MOVE_X, MOVE_Y, TEMPLATE, VX, VY, VZ, X, Y, Z
 from shared.scene import Scene
 from shared.units import BLOCK, SPEED
 
@@ -52,7 +54,8 @@ class ViewBuilder:
         self._own = slice(0)  # rows of the own ones
         self._unsure: list[int] = []  # rows of those that may be drawn as predicted
         self._ahead_rows: set[int] = set()  # both
-        self._looks: list[list[int]] = []  # states from the velocity on
+        self._look = itemgetter(VX, VY, MOVE_X, MOVE_Y, *range(CELL, CELL + scene.extras.count))
+        self._looks: list[tuple[int, ...]] = []  # of each state, what its fields and its direction depend on
         self._labelled = -1  # state of the attributes in `_labels`
         self._delay = 0.0  # the input delay of the latest view, in ticks
         self._viewed = -math.inf  # the timeline's tick of the latest view
@@ -103,17 +106,17 @@ class ViewBuilder:
     def _follow(self, drawn: Entry) -> None:
         """Takes the states of another snapshot, from which on the others are drawn."""
         self._drawn, rows = drawn, drawn.rows
+        self._velocities = [(row[VX] / SPEED, row[VY] / SPEED, row[VZ] / SPEED) for row in rows]
         layout, before = (drawn.ids, [row[TEMPLATE] for row in rows]), self._looks
-        self._looks = [row[VX:] for row in rows]
+        self._looks = list(map(self._look, rows))
         fresh: Iterable[int] = range(len(rows))
         if layout == self._layout:
-            fresh = [row for row, (old, new) in enumerate(zip(before, self._looks, strict=True)) if old != new]
+            fresh = compress(fresh, map(ne, before, self._looks))
         else:
             self._arrange(*layout)
         fields_of = self._prediction.predicted.fields_of
         for row in fresh:
             state = rows[row]
-            self._velocities[row] = (state[VX] / SPEED, state[VY] / SPEED, state[VZ] / SPEED)
             if self._extras.count:
                 self._fields[row] = fields_of(state[TEMPLATE], state[CELL:])
             if row not in self._ahead_rows:
@@ -128,7 +131,6 @@ class ViewBuilder:
         self._unsure = [row for row, kind in enumerate(templates) if kind in self._predicted and row not in own]
         self._ahead_rows = {*own, *self._unsure}
         self._names = [self._templates[template] for template in templates]
-        self._velocities = [(0.0, 0.0, 0.0)] * len(ids)
         self._fields, self._directions = [NO_VALUES] * len(ids), [EAST] * len(ids)
         self._label()
         if len(self._facings) > 2 * len(ids) + FACINGS_MIN:

@@ -16,7 +16,7 @@ from typing import Self
 
 from shared.arrays import np
 from shared.checks import Vec
-from shared.layout import CELL, ID, VX, Int64s
+from shared.layout import CELL, ID, VX, VY, VZ, Int64s, X, Y, Z
 from shared.units import BLOCK, SPEED
 
 KEPT_S, KEPT_MIN = 3.0, 16
@@ -33,12 +33,9 @@ LONG_FALL, LONG_SHARE, LONG_CALM_S, FALL_MAX = 0.05, 0.5, 1.0, 1.0
 """Fall of a delay above `LONG_S`: it begins after `LONG_CALM_S` seconds without a late snapshot. Its speed in seconds
 per second is `LONG_FALL` plus `LONG_SHARE` times the seconds above `LONG_S`, at most `FALL_MAX`."""
 
-Move = tuple[float, float, float, float, float, float]
-"""A position and a way from it, in blocks."""
-
 
 class Entry:
-    """A snapshot in the history. Once it is drawn (`listed`), it has lists, in which Python finds numbers faster.
+    """A snapshot in the history. While it is drawn (`listed`), it has lists, in which Python finds numbers faster.
 
     Args:
         tick: its tick.
@@ -60,8 +57,12 @@ class Entry:
         if not self.rows:
             self.rows = self.states.tolist()
             self.ids = [row[ID] for row in self.rows]
-            self.places = [(x / BLOCK, y / BLOCK, z / BLOCK) for _, _, _, x, y, z, *_ in self.rows]
+            self.places = [(row[X] / BLOCK, row[Y] / BLOCK, row[Z] / BLOCK) for row in self.rows]
         return self
+
+    def unlisted(self) -> None:
+        """Forgets the lists."""
+        self.rows, self.ids, self.places = [], [], []
 
 
 NO_ENTRY = Entry(0, np.zeros((0, CELL), np.int64))
@@ -136,8 +137,12 @@ class Interpolation:
             if entry.tick <= at:
                 break
             after = entry
-        if self._way is None or self._way.before is not before or self._way.after is not after:
-            self._way = Way(before, after, self._rate)
+        old = self._way
+        if old is not None and old.before is before and old.after is after:
+            return old
+        if old is not None and old.before not in (before, after):
+            old.before.unlisted()
+        self._way = Way(before, after, self._rate)
         return self._way
 
 
@@ -155,18 +160,19 @@ class Way:
     def __init__(self, before: Entry, after: Entry, rate: float) -> None:
         self.before, self.after = before.listed(), after.listed()
         self._ticks = after.tick - before.tick or rate  # after these, the entities have gone the whole way
-        self._moves: list[Move]
-        if after is before:
-            speeds = ((u / SPEED, v / SPEED, w / SPEED) for u, v, w in (row[VX : VX + 3] for row in before.rows))
-            self._moves = [(*start, *speed) for start, speed in zip(before.places, speeds, strict=True)]
-        else:
-            ends = zip(before.places, _ends(before, after), strict=True)
-            self._moves = [(x, y, z, u - x, v - y, w - z) for (x, y, z), (u, v, w) in ends]
+        self._ends = _ends(before, after)
 
     def places(self, at: float) -> list[Vec]:
         """Returns where the entities are drawn at the tick `at`, in blocks, in the order of `before`."""
-        share = (at - self.before.tick) / self._ticks
-        return [(x + u * share, y + v * share, z + w * share) for x, y, z, u, v, w in self._moves]
+        before = self.before
+        share = (at - before.tick) / self._ticks
+        if before is self.after:
+            return [
+                (x + row[VX] / SPEED * share, y + row[VY] / SPEED * share, z + row[VZ] / SPEED * share)
+                for (x, y, z), row in zip(before.places, before.rows, strict=True)
+            ]
+        ways = zip(before.places, self._ends, strict=True)
+        return [(x + (u - x) * share, y + (v - y) * share, z + (w - z) * share) for (x, y, z), (u, v, w) in ways]
 
 
 def _ends(before: Entry, after: Entry) -> list[Vec]:
