@@ -13,8 +13,12 @@ from shared.layout import CELL, ID, TEMPLATE, Int64s, X, Y, Z
 from shared.units import BLOCK
 from shared.world import World
 
-MEET_BLOCKS = 12
+MEET_BLOCKS = 12.0
 """Distance in blocks beyond which another entity cannot be met before the next replay, at walking speeds."""
+TOUCH_BLOCKS, APPROACH, NEXT_S = 2.0, 10.0, 0.25
+"""Where other entities matter for the motion of the own one alone, that distance is shorter if the prediction is only a
+short time ahead: room for two entities that touch, in blocks, and the way of two that walk towards each other, in
+blocks/s, in that time and in the seconds until the next replay. (A snapshot may be late.)"""
 
 State = tuple[int, ...]
 
@@ -42,13 +46,23 @@ class Comparison:
         own: Int64s = states[bisect_left(ids, self.entity) : bisect_right(ids, self.last_own)]
         return own
 
-    def near_equal(self, predicted: Int64s, confirmed: Int64s) -> bool:
-        """Returns whether all entities are as predicted that could meet the own one, or are drawn as predicted."""
+    def near_equal(self, predicted: Int64s, confirmed: Int64s, ahead_s: float) -> bool:
+        """Returns whether all entities are as predicted that could meet the own one, or are drawn as predicted.
+
+        Args:
+            predicted, confirmed: the states at one tick.
+            ahead_s: time from that tick to the newest predicted one, in seconds; `inf`: others count up to
+                `MEET_BLOCKS`.
+        """
         if predicted.tobytes() == confirmed.tobytes():
             return True
+        meet = MEET_BLOCKS
+        if not (self._others_ahead or self._world.extras.count):
+            meet = min(TOUCH_BLOCKS + APPROACH * (ahead_s + NEXT_S), MEET_BLOCKS)
+        reach = int(meet * BLOCK)
         if self._world.extras.count:
-            return bool(np.array_equal(self._counting(predicted), self._counting(confirmed)))
-        kernel, reach = self._world.kernel, MEET_BLOCKS * BLOCK
+            return bool(np.array_equal(self._counting(predicted, reach), self._counting(confirmed, reach)))
+        kernel = self._world.kernel
         a, b, always = map(kernel.lent, (predicted, confirmed, self._shown_ahead))
         return bool(kernel.alike(a, len(predicted), b, len(confirmed), self.entity, reach, always))
 
@@ -77,7 +91,7 @@ class Comparison:
                 offsets[state[ID]] = (x, y, z)
         return offsets
 
-    def _counting(self, states: Int64s) -> Int64s:
+    def _counting(self, states: Int64s, reach: int) -> Int64s:
         """Returns the states that count in a comparison, as `bulk.alike` chooses them, with their extra columns.
 
         The aim of others does not count: it changes in every tick, and what it leads to is compared.
@@ -86,7 +100,7 @@ class Comparison:
         if not len(own):
             return states
         ways = abs(states[:, X : X + 3] - own[0, X : X + 3])
-        near = (ways < MEET_BLOCKS * BLOCK).all(axis=1)
+        near = (ways < reach).all(axis=1)
         ids = states[:, ID]
         mine = (ids >= self.entity) & (ids <= self.last_own)
         counts = near | mine | (self._shown_ahead[states[:, TEMPLATE]] != 0)

@@ -85,6 +85,7 @@ class Prediction:
         self.attributes = confirmed_copy.attributes
         """Attributes of the entities that the client sees, by entity and name."""
         self.begun = False
+        self._rate = scene.tick_rate
         limits = self._bounds = bounds(scene.tick_rate)
         self._inputs: Ring[Input] = Ring(limits.predicted)
         self._states: Ring[Int64s] = Ring(limits.predicted)
@@ -206,7 +207,9 @@ class Prediction:
             return Reconciled(None, False, 0, {}, acted, placed) if placed else NOTHING
         predicted, confirmed = self._states.get(tick), self._confirmed_states()
         changed = confirmed_copy.terrain_changed or self._refused
-        if predicted is not None and not changed and self._comparison.near_equal(predicted, confirmed):
+        # An entity that cannot be met may be in the way of an edit.
+        ahead_s = math.inf if self._edits else (self.predicted.tick - tick) / self._rate
+        if predicted is not None and not changed and self._comparison.near_equal(predicted, confirmed, ahead_s):
             return NOTHING
         correction = None
         if predicted is not None and (mine := self._comparison.difference(predicted, confirmed)):

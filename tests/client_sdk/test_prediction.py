@@ -19,7 +19,7 @@ from shared.messages import ProtocolError, Snapshot
 from shared.scene import Scene
 from shared.snapshot import checksum, encode_part
 from shared.world import World
-from tests.worlds import EAST, NORTH, scene
+from tests.worlds import EAST, NORTH, WEST, scene
 
 ME, OTHER = 1, 2
 HERE, BESIDE = (0, 0, 0), (1, 0, 0)
@@ -173,6 +173,45 @@ def test_a_new_input_of_another_entity_is_a_reprediction_and_no_correction(shown
     assert (done.correction, done.repredicted, done.replayed, set(done.offsets)) == (None, True, 2, drawn_ahead)
     pair.act(EAST, EAST, others=NORTH)
     assert pair.client.predicted.state_hash() == pair.server.state_hash()
+
+
+@pytest.mark.parametrize(
+    ("blocks", "ahead", "shown", "edits", "counts"),
+    [
+        (4, 3, "interpolated", False, True),
+        (8, 3, "interpolated", False, False),
+        (8, 30, "interpolated", False, True),
+        (8, 3, "predicted", False, True),
+        (8, 3, "interpolated", True, True),
+        (14, 99, "interpolated", False, False),
+    ],
+)
+def test_another_entity_counts_if_it_can_be_met_before_the_next_replay(
+    blocks: int, ahead: int, shown: str, edits: bool, counts: bool
+) -> None:
+    """It also counts if it may be in the way of an edit, or is drawn as predicted."""
+    pair = Pair((16 + blocks, 16, 1), shown=shown)
+    if edits:
+        pair.client.edit(1, ahead + 99, Edit(20, 16, 1, 4))
+    pair.ahead(*[NEUTRAL] * ahead)
+    pair.act(NEUTRAL, others=NORTH)
+    pair.tell()
+    assert pair.reconcile().repredicted == counts
+
+
+def test_what_was_too_far_away_to_count_does_so_once_it_comes_near() -> None:
+    pair = Pair((22, 16, 1))
+    replays, ticks = [], 64
+    for tick in range(ticks):
+        pair.ahead(*[EAST] * (4 if tick == 0 else 1))
+        pair.act(EAST, others=WEST if tick > 2 else NEUTRAL)
+        pair.tell()
+        done = pair.reconcile()
+        assert done.correction is None
+        replays += [tick] * done.repredicted
+    (replay,) = replays
+    assert 3 < replay < ticks - 1
+    assert pair.server.position(OTHER)[0] - pair.server.position(ME)[0] == 5 / 8  # they have met
 
 
 def test_a_correction_by_another_entity_has_that_cause() -> None:
