@@ -8,18 +8,18 @@ from bisect import bisect_left, bisect_right
 from collections.abc import Iterable, Mapping, Sequence
 from functools import partial
 from itertools import compress
-from operator import itemgetter, ne
+from operator import ne
 from typing import Any
 
 from client_sdk.interpolation import Interpolation
-from client_sdk.interpolation.interpolation import NO_ENTRY, Entry
+from client_sdk.interpolation.interpolation import NO_ENTRY, Entry, Look
 from client_sdk.interpolation.smoothing import Smoothing
 from client_sdk.prediction.prediction import Prediction, Reconciled
 from client_sdk.timing.server_clock import ServerClock
 from client_sdk.timing.timeline import Timeline
 from client_sdk.view import NO_VALUES, EntityView, View
 from shared.checks import Vec
-from shared.layout import CELL, ID, MOVE_X, MOVE_Y, TEMPLATE, VX, VY, VZ, X, Y, Z
+from shared.layout import CELL, ID, MOVE_X, TEMPLATE, VX, X, Y, Z
 from shared.scene import Scene
 from shared.units import BLOCK, SPEED
 
@@ -47,15 +47,13 @@ class ViewBuilder:
         self._drawn = NO_ENTRY  # the snapshot from which on the others are drawn
         self._layout: tuple[list[int], list[int]] = [], []  # numbers and templates of its entities; then in that order:
         self._names: list[str] = []
-        self._velocities: list[Vec] = []
         self._labels: list[Mapping[str, Any]] = []
         self._fields: list[Mapping[str, int]] = []
         self._directions: list[Facing] = []
         self._own = slice(0)  # rows of the own ones
         self._unsure: list[int] = []  # rows of those that may be drawn as predicted
         self._ahead_rows: set[int] = set()  # both
-        self._look = itemgetter(VX, VY, MOVE_X, MOVE_Y, *range(CELL, CELL + scene.extras.count))
-        self._looks: list[tuple[int, ...]] = []  # of each state, what its fields and its direction depend on
+        self._looks: list[Look] = []  # of its states
         self._labelled = -1  # state of the attributes in `_labels`
         self._delay = 0.0  # the input delay of the latest view, in ticks
         self._viewed = -math.inf  # the timeline's tick of the latest view
@@ -92,11 +90,11 @@ class ViewBuilder:
             self._follow(way.before)
         if self._labelled != prediction.confirmed_copy.attribute_changes:
             self._label()
-        looks = self._velocities, self._labels, self._fields, self._directions
+        looks = self._drawn.velocities, self._labels, self._fields, self._directions
         others = list(map(_entity_view, zip(way.before.ids, self._names, way.places(seen), *looks, strict=True)))
         for row in self._unsure:
             ahead = self._ahead(self._drawn.ids[row], tick, now)
-            others[row] = ahead or others[row]._replace(facing=self._facing(self._drawn.rows[row]))
+            others[row] = ahead or others[row]._replace(facing=self._facing(self._drawn.states[row].tolist()))
         del others[self._own]
         if prediction.last_own > prediction.entity:  # what the own entity has spawned: predicted, like itself
             own = (self._ahead(entity, tick, now) for entity in prediction.spawned())
@@ -105,18 +103,16 @@ class ViewBuilder:
 
     def _follow(self, drawn: Entry) -> None:
         """Takes the states of another snapshot, from which on the others are drawn."""
-        self._drawn, rows = drawn, drawn.rows
-        self._velocities = [(row[VX] / SPEED, row[VY] / SPEED, row[VZ] / SPEED) for row in rows]
-        layout, before = (drawn.ids, [row[TEMPLATE] for row in rows]), self._looks
-        self._looks = list(map(self._look, rows))
-        fresh: Iterable[int] = range(len(rows))
+        layout, before = (drawn.ids, drawn.templates), self._looks
+        self._drawn, self._looks = drawn, drawn.looks
+        fresh: Iterable[int] = range(len(drawn.ids))
         if layout == self._layout:
             fresh = compress(fresh, map(ne, before, self._looks))
         else:
             self._arrange(*layout)
         fields_of = self._prediction.predicted.fields_of
         for row in fresh:
-            state = rows[row]
+            state = drawn.states[row].tolist()
             if self._extras.count:
                 self._fields[row] = fields_of(state[TEMPLATE], state[CELL:])
             if row not in self._ahead_rows:

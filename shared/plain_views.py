@@ -277,6 +277,12 @@ class Matrix(ndarray):
         """Returns the elements by row."""
         return [row.tolist() for row in self._rows()]
 
+    @property
+    def T(self) -> "Matrix":  # noqa: N802 - numpy's name
+        """A copy with rows and columns exchanged."""
+        columns = [self._column(slice(None), column).tobytes() for column in range(self.shape[1])]
+        return joined(columns, self.shape[0], self.dtype, self.shape[1])
+
     def all(self, axis: int) -> Vector:
         """Returns for each row whether all elements are true."""
         assert axis == 1

@@ -16,7 +16,7 @@ from typing import Self
 
 from shared.arrays import np
 from shared.checks import Vec
-from shared.layout import CELL, ID, VX, VY, VZ, Int64s, X, Y, Z
+from shared.layout import CELL, Int64s
 from shared.units import BLOCK, SPEED
 
 KEPT_S, KEPT_MIN = 3.0, 16
@@ -33,6 +33,11 @@ LONG_FALL, LONG_SHARE, LONG_CALM_S, FALL_MAX = 0.05, 0.5, 1.0, 1.0
 """Fall of a delay above `LONG_S`: it begins after `LONG_CALM_S` seconds without a late snapshot. Its speed in seconds
 per second is `LONG_FALL` plus `LONG_SHARE` times the seconds above `LONG_S`, at most `FALL_MAX`."""
 
+Move = tuple[float, float, float, float, float, float]
+"""A position and a way from it, in blocks."""
+Look = tuple[int, ...]
+"""The part of a state on which the facing and the fields of an entity depend."""
+
 
 class Entry:
     """A snapshot in the history. While it is drawn (`listed`), it has lists, in which Python finds numbers faster.
@@ -45,24 +50,29 @@ class Entry:
 
     def __init__(self, tick: int, states: Int64s, placed: frozenset[int] = frozenset()) -> None:
         self.tick, self.states, self.placed = tick, states, placed
-        self.rows: list[list[int]] = []
-        """The states."""
-        self.ids: list[int] = []
-        """The numbers of the entities."""
-        self.places: list[Vec] = []
-        """The positions of the entities in blocks."""
+        self.unlisted()
 
     def listed(self) -> Self:
         """Returns this entry with its lists."""
-        if not self.rows:
-            self.rows = self.states.tolist()
-            self.ids = [row[ID] for row in self.rows]
-            self.places = [(row[X] / BLOCK, row[Y] / BLOCK, row[Z] / BLOCK) for row in self.rows]
+        if not self.ids and len(self.states):
+            self.ids, self.templates, _, xs, ys, zs, us, vs, ws, *rest = self.states.T.tolist()
+            self.places = [(x / BLOCK, y / BLOCK, z / BLOCK) for x, y, z in zip(xs, ys, zs, strict=True)]
+            self.velocities = [(u / SPEED, v / SPEED, w / SPEED) for u, v, w in zip(us, vs, ws, strict=True)]
+            self.looks = list(zip(us, vs, *rest, strict=True))
         return self
 
     def unlisted(self) -> None:
         """Forgets the lists."""
-        self.rows, self.ids, self.places = [], [], []
+        self.ids: list[int] = []
+        """The numbers of the entities."""
+        self.templates: list[int] = []
+        """The templates of the entities."""
+        self.places: list[Vec] = []
+        """The positions of the entities in blocks."""
+        self.velocities: list[Vec] = []
+        """The velocities of the entities in blocks/s."""
+        self.looks: list[Look] = []
+        """The parts of the states on which facings and fields depend."""
 
 
 NO_ENTRY = Entry(0, np.zeros((0, CELL), np.int64))
@@ -160,19 +170,18 @@ class Way:
     def __init__(self, before: Entry, after: Entry, rate: float) -> None:
         self.before, self.after = before.listed(), after.listed()
         self._ticks = after.tick - before.tick or rate  # after these, the entities have gone the whole way
-        self._ends = _ends(before, after)
+        self._moves: list[Move]
+        if after is before:
+            ways = zip(before.places, before.velocities, strict=True)
+            self._moves = [(*start, *speed) for start, speed in ways]
+        else:
+            ways = zip(before.places, _ends(before, after), strict=True)
+            self._moves = [(x, y, z, u - x, v - y, w - z) for (x, y, z), (u, v, w) in ways]
 
     def places(self, at: float) -> list[Vec]:
         """Returns where the entities are drawn at the tick `at`, in blocks, in the order of `before`."""
-        before = self.before
-        share = (at - before.tick) / self._ticks
-        if before is self.after:
-            return [
-                (x + row[VX] / SPEED * share, y + row[VY] / SPEED * share, z + row[VZ] / SPEED * share)
-                for (x, y, z), row in zip(before.places, before.rows, strict=True)
-            ]
-        ways = zip(before.places, self._ends, strict=True)
-        return [(x + (u - x) * share, y + (v - y) * share, z + (w - z) * share) for (x, y, z), (u, v, w) in ways]
+        share = (at - self.before.tick) / self._ticks
+        return [(x + u * share, y + v * share, z + w * share) for x, y, z, u, v, w in self._moves]
 
 
 def _ends(before: Entry, after: Entry) -> list[Vec]:

@@ -62,6 +62,7 @@ READS: dict[str, Callable[[Any, Any], Any]] = {
     "a column by an array": lambda a, np_: a[np_.array([2, 0], np_.int64), 1],
     "columns by an array": lambda a, np_: a[np_.array([2, 0], np_.int64), 1:3],
     "columns by a mask": lambda a, _: a[a[:, 0] > 1][:, (0, 2)],
+    "columns as rows": lambda a, _: a[:, 1:4].T,
     "taken": lambda a, np_: a.take(np_.array([1, 1], np_.int64), 0),
     "flat": lambda a, _: a.reshape(-1),
     "another shape": lambda a, _: a.reshape(-1, 3),
