@@ -172,9 +172,10 @@ class InputLoop:
         alarm = False
         if online:
             alarm = self._reconcile(now)
-            shown = world.view_builder.advance(server_tick, now)
+            interpolation = world.view_builder.interpolation
+            interpolation.advance(server_tick, now)
             if not self._draws:
-                self.seen = shown
+                self.seen = interpolation.shown(server_tick)
         messages = self._predict(now, controls)
         self._tell()
         stats.snapshot_age_s = max(server_tick - world.prediction.confirmed.tick, 0.0) / clock.rate

@@ -6,7 +6,7 @@ Other entities are drawn as predicted, too, if their template is shown so (`show
 import math
 from bisect import bisect_left, bisect_right
 from collections.abc import Iterable, Mapping, Sequence
-from functools import partial
+from functools import lru_cache, partial
 from itertools import compress
 from operator import ne
 from typing import Any
@@ -57,11 +57,6 @@ class ViewBuilder:
         self._labelled = -1  # state of the attributes in `_labels`
         self._delay = 0.0  # the input delay of the latest view, in ticks
         self._viewed = -math.inf  # the timeline's tick of the latest view
-
-    def advance(self, server_tick: float, now: float) -> float:
-        """Adapts the interpolation delay of the others. Returns the tick at which they are drawn."""
-        self.interpolation.advance(server_tick, now)
-        return self.interpolation.shown(server_tick)
 
     def smooth(self, done: Reconciled, now: float) -> None:
         """Starts to fade out the jumps that a replay made. Entities that the rules acted on jump at once."""
@@ -168,12 +163,17 @@ class ViewBuilder:
         """Returns the direction in which an entity looks, and keeps it for when it stands still."""
         aims = self._extras.aims and (state[CELL] or state[CELL + 1])
         for part in (CELL if aims else MOVE_X, VX):
-            east, north = state[part], state[part + 1]
-            if east or north:
-                length = math.hypot(east, north)
-                self._facings[state[ID]] = east / length, north / length
+            if state[part] or state[part + 1]:
+                self._facings[state[ID]] = _toward(state[part], state[part + 1])
                 break
         return self._facings.get(state[ID], EAST)
+
+
+@lru_cache(256)
+def _toward(east: int, north: int) -> Facing:
+    """Returns a direction of length 1. Entities that walk share few of them, so a view touches less memory."""
+    length = math.hypot(east, north)
+    return east / length, north / length
 
 
 def place_of(state: Sequence[int]) -> Vec:

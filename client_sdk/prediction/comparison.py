@@ -110,8 +110,14 @@ class Comparison:
         return counting
 
 
-def state_in(states: Int64s, entity: int) -> State | None:
-    """Returns the state of an entity; None if it is not there."""
+def row_in(states: Int64s, entity: int) -> int | None:
+    """Returns the row of an entity; None if it is not there."""
     ids = states[:, ID].tolist()
     row = bisect_left(ids, entity)
-    return tuple(states[row].tolist()) if row < len(ids) and ids[row] == entity else None
+    return row if row < len(ids) and ids[row] == entity else None
+
+
+def state_in(states: Int64s, entity: int) -> State | None:
+    """Returns the state of an entity; None if it is not there."""
+    row = row_in(states, entity)
+    return None if row is None else tuple(states[row].tolist())

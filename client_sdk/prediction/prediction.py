@@ -24,7 +24,7 @@ from dataclasses import dataclass
 from client_sdk.controls import Controls
 from client_sdk.events import Corrected
 from client_sdk.prediction.announcements import Announcements
-from client_sdk.prediction.comparison import Comparison, State, state_in
+from client_sdk.prediction.comparison import Comparison, State, row_in
 from client_sdk.prediction.confirmed import Confirmed
 from shared import edits
 from shared.bounds import bounds
@@ -96,6 +96,7 @@ class Prediction:
         self._edits: dict[int, tuple[int, Edit]] = {}  # edits without a verdict, with their ticks, by number
         self._refused = False  # whether an edit that the last replay applied was refused since
         self._compared = -1
+        self._row = 0  # row of the entity that `_state` was asked for last
         self._failed: set[tuple[int, int]] = set()  # ticks and entities of failed turns that the program knows
         self._acts_differ = False  # whether the server did other acts since the last replay than predicted
 
@@ -198,7 +199,7 @@ class Prediction:
             return NOTHING
         skipped = tick - self._compared > 1
         acted = confirmed_copy.take_acted()
-        placed = self._placed(self._compared, tick)
+        placed = frozenset().union(*self._placed(self._compared, tick))
         self._compared = tick
         if not self.begun:
             return NOTHING
@@ -253,7 +254,7 @@ class Prediction:
             last, after = newest, self.predicted.state(entity)
         for first in range(tick, tick - LOOK_BACK, -1):
             if (before := self._state(entity, first)) is not None:
-                if entity in self._placed(first, last):
+                if any(entity in placed for placed in self._placed(first, last)):
                     return before, before, 0.0
                 return before, after, min(max((at - first) / (last - first), 0.0), 1.0)
         return after, after, 0.0
@@ -262,16 +263,24 @@ class Prediction:
         """Returns the predicted entities that the own one has spawned, in ascending order."""
         return [entity for entity in range(self.entity + 1, self.last_own + 1) if entity in self.predicted]
 
-    def _placed(self, since: int, to: int) -> frozenset[int]:
-        """Returns the entities that the server's rules placed after the tick `since`, up to `to`."""
+    def _placed(self, since: int, to: int) -> list[frozenset[int]]:
+        """Returns the entities that the server's rules placed in the snapshots after the tick `since`, up to `to`."""
         placed = self.confirmed_copy.placed
         ticks = range(max(since, to - self.confirmed_copy.follow_max) + 1, to + 1)
-        return frozenset().union(*[ids for tick in ticks if (ids := placed.get(tick))])
+        return [ids for tick in ticks if (ids := placed.get(tick))]
 
     def _state(self, entity: int, tick: int) -> State | None:
         """Returns the kept state of an entity at the end of a tick; None if none is kept."""
         states = self._states.get(tick)
-        return None if states is None else state_in(states, entity)
+        if states is None:
+            return None
+        row = self._row  # looks there first, because the rows of few entities change from tick to tick
+        if row >= len(states) or states.item(row, ID) != entity:
+            row = row_in(states, entity)
+            if row is None:
+                return None
+            self._row = row
+        return tuple(states[row].tolist())
 
     def sync_test(self) -> tuple[int, Int64s, Int64s] | None:
         """Runs the sync test: replays everything since the confirmed world. Changes nothing unless state is hidden.
