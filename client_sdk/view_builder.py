@@ -6,8 +6,8 @@ Other entities are drawn as predicted, too, if their template is shown so (`show
 import math
 from bisect import bisect_left, bisect_right
 from collections.abc import Iterable, Mapping, Sequence
-from functools import lru_cache, partial
-from itertools import compress
+from functools import lru_cache
+from itertools import compress, repeat
 from operator import ne
 from typing import Any
 
@@ -29,8 +29,6 @@ EAST: Facing = (1.0, 0.0)
 """The facing of an entity that has not moved yet."""
 FACINGS_MIN = 64
 """Number of kept directions up to which those of entities out of view are not dropped."""
-_entity_view = partial(tuple.__new__, EntityView)
-"""Makes an `EntityView` of a tuple. (`EntityView._make` takes several times as long.)"""
 
 
 class ViewBuilder:
@@ -86,7 +84,8 @@ class ViewBuilder:
         if self._labelled != prediction.confirmed_copy.attribute_changes:
             self._label()
         looks = self._drawn.velocities, self._labels, self._fields, self._directions
-        others = list(map(_entity_view, zip(way.before.ids, self._names, way.places(seen), *looks, strict=True)))
+        values = zip(way.before.ids, self._names, way.places(seen), *looks, strict=True)
+        others = list(map(tuple.__new__, repeat(EntityView), values))  # `EntityView._make` takes several times as long
         for row in self._unsure:
             ahead = self._ahead(self._drawn.ids[row], tick, now)
             others[row] = ahead or others[row]._replace(facing=self._facing(self._drawn.states[row].tolist()))

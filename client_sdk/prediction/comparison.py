@@ -56,12 +56,12 @@ class Comparison:
         """
         if predicted.tobytes() == confirmed.tobytes():
             return True
-        meet = MEET_BLOCKS
-        if not (self._others_ahead or self._world.extras.count):
-            meet = min(TOUCH_BLOCKS + APPROACH * (ahead_s + NEXT_S), MEET_BLOCKS)
-        reach = int(meet * BLOCK)
         if self._world.extras.count:
-            return bool(np.array_equal(self._counting(predicted, reach), self._counting(confirmed, reach)))
+            return bool(np.array_equal(self._counting(predicted), self._counting(confirmed)))
+        meet = MEET_BLOCKS
+        if not self._others_ahead:
+            meet = min(TOUCH_BLOCKS + APPROACH * (ahead_s + NEXT_S), meet)
+        reach = int(meet * BLOCK)
         kernel = self._world.kernel
         a, b, always = map(kernel.lent, (predicted, confirmed, self._shown_ahead))
         return bool(kernel.alike(a, len(predicted), b, len(confirmed), self.entity, reach, always))
@@ -91,7 +91,7 @@ class Comparison:
                 offsets[state[ID]] = (x, y, z)
         return offsets
 
-    def _counting(self, states: Int64s, reach: int) -> Int64s:
+    def _counting(self, states: Int64s) -> Int64s:
         """Returns the states that count in a comparison, as `bulk.alike` chooses them, with their extra columns.
 
         The aim of others does not count: it changes in every tick, and what it leads to is compared.
@@ -100,7 +100,7 @@ class Comparison:
         if not len(own):
             return states
         ways = abs(states[:, X : X + 3] - own[0, X : X + 3])
-        near = (ways < reach).all(axis=1)
+        near = (ways < MEET_BLOCKS * BLOCK).all(axis=1)
         ids = states[:, ID]
         mine = (ids >= self.entity) & (ids <= self.last_own)
         counts = near | mine | (self._shown_ahead[states[:, TEMPLATE]] != 0)

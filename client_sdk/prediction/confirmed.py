@@ -162,9 +162,11 @@ class Confirmed:
             drops: segments that the client no longer sees.
             here: entities whose states the snapshot contains; these stay.
         """
-        segments = (self.states[:, X : X + 3] >> TO_SEGMENT).tolist()
         whole = drops | {part.segment for part in parts if part.ago == KEYFRAME}
-        gone = {(part.segment, entity) for part in parts for entity in part.gone}
+        gone = {(part.segment, entity) for part in parts for entity in part.gone if entity not in here}
+        if not (whole or gone):
+            return
+        segments = (self.states[:, X : X + 3] >> TO_SEGMENT).tolist()
         for entity, (x, y, z) in zip(self.states[:, ID].tolist(), segments, strict=True):
             home = (x, y, z)
             if entity not in here and (home in whole or (home, entity) in gone):
