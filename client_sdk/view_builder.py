@@ -12,14 +12,14 @@ from operator import ne
 from typing import Any
 
 from client_sdk.interpolation import Interpolation
-from client_sdk.interpolation.interpolation import NO_ENTRY, Entry, Look
+from client_sdk.interpolation.interpolation import LOOK_EXTRA, LOOK_MOVE, NO_ENTRY, Entry, Look
 from client_sdk.interpolation.smoothing import Smoothing
 from client_sdk.prediction.prediction import Prediction, Reconciled
 from client_sdk.timing.server_clock import ServerClock
 from client_sdk.timing.timeline import Timeline
 from client_sdk.view import NO_VALUES, EntityView, View
 from shared.checks import Vec
-from shared.layout import CELL, ID, MOVE_X, TEMPLATE, VX, X, Y, Z
+from shared.layout import CELL, ID, MOVE_X, TEMPLATE, VX, VZ, X, Y, Z
 from shared.scene import Scene
 from shared.units import BLOCK, SPEED
 
@@ -87,8 +87,8 @@ class ViewBuilder:
         values = zip(way.before.ids, self._names, way.places(seen), *looks, strict=True)
         others = list(map(tuple.__new__, repeat(EntityView), values))  # `EntityView._make` takes several times as long
         for row in self._unsure:
-            ahead = self._ahead(self._drawn.ids[row], tick, now)
-            others[row] = ahead or others[row]._replace(facing=self._facing(self._drawn.states[row].tolist()))
+            entity, look = self._drawn.ids[row], self._drawn.looks[row]
+            others[row] = self._ahead(entity, tick, now) or others[row]._replace(facing=self._facing(entity, look))
         del others[self._own]
         if prediction.last_own > prediction.entity:  # what the own entity has spawned: predicted, like itself
             own = (self._ahead(entity, tick, now) for entity in prediction.spawned())
@@ -106,11 +106,11 @@ class ViewBuilder:
             self._arrange(*layout)
         fields_of = self._prediction.predicted.fields_of
         for row in fresh:
-            state = drawn.states[row].tolist()
+            look = drawn.looks[row]
             if self._extras.count:
-                self._fields[row] = fields_of(state[TEMPLATE], state[CELL:])
+                self._fields[row] = fields_of(drawn.templates[row], look[LOOK_EXTRA:])
             if row not in self._ahead_rows:
-                self._directions[row] = self._facing(state)
+                self._directions[row] = self._facing(drawn.ids[row], look)
 
     def _arrange(self, ids: list[int], templates: list[int]) -> None:
         """Takes other entities or templates than those in the snapshot before."""
@@ -146,7 +146,7 @@ class ViewBuilder:
         offset = smoothing.offset(now) if smoothing else (0.0, 0.0, 0.0)
         (x, y, z), (u, v, w), (i, j, k) = place_of(before), place_of(after), offset
         place = x + (u - x) * share + i, y + (v - y) * share + j, z + (w - z) * share + k
-        return self._figure(after, place, self._facing(after))
+        return self._figure(after, place, self._facing(entity, (*after[VX:VZ], *after[MOVE_X:])))
 
     def _figure(self, state: Sequence[int], place: Vec, facing: Facing) -> EntityView:
         """Returns the view of an entity that is drawn at `place` (in blocks)."""
@@ -155,17 +155,17 @@ class ViewBuilder:
         attributes = self._prediction.attributes.get(state[ID], NO_VALUES)
         fields: Mapping[str, int] = NO_VALUES
         if self._extras.count:
-            fields = self._prediction.predicted.fields_of(template, list(state[CELL:]))
+            fields = self._prediction.predicted.fields_of(template, state[CELL:])
         return EntityView(state[ID], self._templates[template], place, velocity, attributes, fields, facing)
 
-    def _facing(self, state: Sequence[int]) -> Facing:
+    def _facing(self, entity: int, look: Look) -> Facing:
         """Returns the direction in which an entity looks, and keeps it for when it stands still."""
-        aims = self._extras.aims and (state[CELL] or state[CELL + 1])
-        for part in (CELL if aims else MOVE_X, VX):
-            if state[part] or state[part + 1]:
-                self._facings[state[ID]] = _toward(state[part], state[part + 1])
+        aims = self._extras.aims and (look[LOOK_EXTRA] or look[LOOK_EXTRA + 1])
+        for part in (LOOK_EXTRA if aims else LOOK_MOVE, 0):
+            if look[part] or look[part + 1]:
+                self._facings[entity] = _toward(look[part], look[part + 1])
                 break
-        return self._facings.get(state[ID], EAST)
+        return self._facings.get(entity, EAST)
 
 
 @lru_cache(256)

@@ -11,7 +11,7 @@ name it until then.
 import hashlib
 import struct
 from array import array
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, Any
 
 from shared import blocks, kernels, layout
@@ -182,7 +182,7 @@ class WorldState:
         row = self._row_at(entity)
         return self.fields_of(int(self._entities[row, TEMPLATE]), self._extra[row].tolist())
 
-    def fields_of(self, kind: int, extra: list[int]) -> dict[str, int]:
+    def fields_of(self, kind: int, extra: Sequence[int]) -> dict[str, int]:
         """Returns the fields of a template's behaviour by name, from the extra columns of an entity."""
         behaviour = self.extras.behaviour_of[kind]
         if behaviour < 0:

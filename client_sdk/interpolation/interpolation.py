@@ -16,7 +16,7 @@ from typing import Self
 
 from shared.arrays import np
 from shared.checks import Vec
-from shared.layout import CELL, Int64s
+from shared.layout import CELL, MOVE_X, Int64s
 from shared.units import BLOCK, SPEED
 
 KEPT_S, KEPT_MIN = 3.0, 16
@@ -36,7 +36,9 @@ per second is `LONG_FALL` plus `LONG_SHARE` times the seconds above `LONG_S`, at
 Move = tuple[float, float, float, float, float, float]
 """A position and a way from it, in blocks."""
 Look = tuple[int, ...]
-"""The part of a state on which the facing and the fields of an entity depend."""
+"""What the facing and the fields of an entity depend on: vx, vy, and all columns of its state from move_x on."""
+LOOK_MOVE, LOOK_EXTRA = 2, 2 + CELL - MOVE_X
+"""Places in a `Look`: move_x, and the first extra column."""
 
 
 class Entry:
@@ -47,6 +49,16 @@ class Entry:
         states: the states at the end of that tick, [n, 12], ascending by id.
         placed: the entities that the rules placed since the snapshot before.
     """
+
+    ids: list[int]
+    """The numbers of the entities."""
+    templates: list[int]
+    """The templates of the entities."""
+    places: list[Vec]
+    """The positions of the entities in blocks."""
+    velocities: list[Vec]
+    """The velocities of the entities in blocks/s."""
+    looks: list[Look]
 
     def __init__(self, tick: int, states: Int64s, placed: frozenset[int] = frozenset()) -> None:
         self.tick, self.states, self.placed = tick, states, placed
@@ -63,16 +75,7 @@ class Entry:
 
     def unlisted(self) -> None:
         """Forgets the lists."""
-        self.ids: list[int] = []
-        """The numbers of the entities."""
-        self.templates: list[int] = []
-        """The templates of the entities."""
-        self.places: list[Vec] = []
-        """The positions of the entities in blocks."""
-        self.velocities: list[Vec] = []
-        """The velocities of the entities in blocks/s."""
-        self.looks: list[Look] = []
-        """The parts of the states on which facings and fields depend."""
+        self.ids, self.templates, self.places, self.velocities, self.looks = [], [], [], [], []
 
 
 NO_ENTRY = Entry(0, np.zeros((0, CELL), np.int64))

@@ -2,6 +2,8 @@
 
 HALF_LIFE_S = 0.1
 """Time in which the visual offset halves, in seconds."""
+FADED_S = 6.0
+"""Time after which nothing of an offset is left: less than 2^-57 blocks, in seconds."""
 TELEPORT_BLOCKS = 4.0
 """Longest offset that is smoothed, in blocks; a longer one is shown as a jump."""
 
@@ -24,6 +26,9 @@ class Smoothing:
 
     def offset(self, now: float) -> Offset:
         """Returns the offset to add to the simulated position, in blocks."""
-        left = 0.5 ** (max(now - self._since, 0.0) / HALF_LIFE_S)
+        since = max(now - self._since, 0.0)
+        if since > FADED_S:
+            return 0.0, 0.0, 0.0
+        left = 0.5 ** (since / HALF_LIFE_S)
         x, y, z = self._offset
         return x * left, y * left, z * left

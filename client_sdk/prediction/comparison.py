@@ -110,8 +110,10 @@ class Comparison:
         return counting
 
 
-def row_in(states: Int64s, entity: int) -> int | None:
-    """Returns the row of an entity; None if it is not there."""
+def row_in(states: Int64s, entity: int, guess: int = 0) -> int | None:
+    """Returns the row of an entity; None if it is not there. Looks at the row `guess` first."""
+    if guess < len(states) and states.item(guess, ID) == entity:
+        return guess
     ids = states[:, ID].tolist()
     row = bisect_left(ids, entity)
     return row if row < len(ids) and ids[row] == entity else None

@@ -274,12 +274,10 @@ class Prediction:
         states = self._states.get(tick)
         if states is None:
             return None
-        row = self._row  # looks there first, because the rows of few entities change from tick to tick
-        if row >= len(states) or states.item(row, ID) != entity:
-            row = row_in(states, entity)
-            if row is None:
-                return None
-            self._row = row
+        row = row_in(states, entity, self._row)
+        if row is None:
+            return None
+        self._row = row
         return tuple(states[row].tolist())
 
     def sync_test(self) -> tuple[int, Int64s, Int64s] | None:
