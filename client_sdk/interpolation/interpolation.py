@@ -36,7 +36,7 @@ per second is `LONG_FALL` plus `LONG_SHARE` times the seconds above `LONG_S`, at
 Move = tuple[float, float, float, float, float, float]
 """A position and a way from it, in blocks."""
 Look = tuple[int, ...]
-"""What the facing and the fields of an entity depend on: vx, vy, and all columns of its state from move_x on."""
+"""The part of a state on which facing and fields depend: vx, vy, and all columns from move_x on."""
 LOOK_MOVE, LOOK_EXTRA = 2, 2 + CELL - MOVE_X
 """Places in a `Look`: move_x, and the first extra column."""
 

@@ -16,9 +16,9 @@ from shared.world import World
 MEET_BLOCKS = 12.0
 """Distance in blocks beyond which another entity cannot be met before the next replay, at walking speeds."""
 TOUCH_BLOCKS, APPROACH, NEXT_S = 2.0, 10.0, 0.25
-"""Where other entities matter for the motion of the own one alone, that distance is shorter if the prediction is only a
-short time ahead: room for two entities that touch, in blocks, and the way of two that walk towards each other, in
-blocks/s, in that time and in the seconds until the next replay. (A snapshot may be late.)"""
+"""Parts of a shorter distance that holds where others matter only because the own entity could meet them: room for two
+that touch, in blocks; and the way of two that walk towards each other, in blocks/s, during the time that is predicted
+ahead and the seconds until the next replay. (A snapshot may be late.)"""
 
 State = tuple[int, ...]
 
