@@ -16,9 +16,10 @@ from shared.world import World
 MEET_BLOCKS = 12.0
 """Distance in blocks beyond which another entity cannot be met before the next replay, at walking speeds."""
 TOUCH_BLOCKS, APPROACH, NEXT_S = 2.0, 10.0, 0.25
-"""Parts of a shorter distance that holds where others matter only because the own entity could meet them: room for two
-that touch, in blocks; and the way of two that walk towards each other, in blocks/s, during the time that is predicted
-ahead and the seconds until the next replay. (A snapshot may be late.)"""
+"""Where other entities matter for the motion of the own one alone, that distance is shorter if the prediction is only a
+short time ahead: room for two entities that touch, in blocks, and the way of two that come towards each other in that
+time and in the seconds until the next replay. (A snapshot may be late.) They come at twice the greatest walking speed
+of the scene, or at `APPROACH` blocks/s if that is less."""
 
 State = tuple[int, ...]
 
@@ -39,6 +40,7 @@ class Comparison:
         self._world = world
         self._shown_ahead = np.array([template.shown == "predicted" for template in scene.templates], np.int64)
         self._others_ahead = bool(self._shown_ahead.any())
+        self._approach = max(APPROACH, 2.0 * max(template.walk_speed for template in scene.templates))
 
     def own(self, states: Int64s) -> Int64s:
         """Returns the states of the own entity and of what it has spawned. A view."""
@@ -60,7 +62,7 @@ class Comparison:
             return bool(np.array_equal(self._counting(predicted), self._counting(confirmed)))
         meet = MEET_BLOCKS
         if not self._others_ahead:
-            meet = min(TOUCH_BLOCKS + APPROACH * (ahead_s + NEXT_S), meet)
+            meet = min(TOUCH_BLOCKS + self._approach * (ahead_s + NEXT_S), meet)
         reach = int(meet * BLOCK)
         kernel = self._world.kernel
         a, b, always = map(kernel.lent, (predicted, confirmed, self._shown_ahead))

@@ -33,13 +33,16 @@ def ground() -> Scene:
 class Pair:
     """A server's world, and the prediction of the client whose entity is `ME`."""
 
-    def __init__(self, *others: tuple[float, float, float], shown: str = "interpolated", **options: Any) -> None:
-        self.server = World(ground(), compiled=False)
+    def __init__(
+        self, *others: tuple[float, float, float], shown: str = "interpolated", walk_speed: float = 3.0, **options: Any
+    ) -> None:
+        walks = ground().with_changes("box", walk_speed=walk_speed)
+        self.server = World(walks, compiled=False)
         self.server.load_terrain()
         self.server.spawn("box", (16, 16, 1))
         for place in others:
             self.server.spawn("box", place)
-        self.confirmed_copy = Confirmed(ground().with_changes("box", shown=shown), ME, compiled=False)
+        self.confirmed_copy = Confirmed(walks.with_changes("box", shown=shown), ME, compiled=False)
         self.client = Prediction(self.confirmed_copy, **options)
         for segment in (HERE, BESIDE):
             self.confirmed_copy.load_segment(segment, self.server.blocks.segment(segment).reshape(-1))
@@ -176,21 +179,22 @@ def test_a_new_input_of_another_entity_is_a_reprediction_and_no_correction(shown
 
 
 @pytest.mark.parametrize(
-    ("blocks", "ahead", "shown", "edits", "counts"),
+    ("blocks", "ahead", "shown", "walk_speed", "edits", "counts"),
     [
-        (4, 3, "interpolated", False, True),
-        (8, 3, "interpolated", False, False),
-        (8, 30, "interpolated", False, True),
-        (8, 3, "predicted", False, True),
-        (8, 3, "interpolated", True, True),
-        (14, 99, "interpolated", False, False),
+        (4, 3, "interpolated", 3.0, False, True),
+        (8, 3, "interpolated", 3.0, False, False),
+        (8, 30, "interpolated", 3.0, False, True),
+        (8, 3, "interpolated", 12.0, False, True),
+        (8, 3, "predicted", 3.0, False, True),
+        (8, 3, "interpolated", 3.0, True, True),
+        (14, 99, "interpolated", 3.0, False, False),
     ],
 )
 def test_another_entity_counts_if_it_can_be_met_before_the_next_replay(
-    blocks: int, ahead: int, shown: str, edits: bool, counts: bool
+    blocks: int, ahead: int, shown: str, walk_speed: float, edits: bool, counts: bool
 ) -> None:
     """It also counts if it may be in the way of an edit, or is drawn as predicted."""
-    pair = Pair((16 + blocks, 16, 1), shown=shown)
+    pair = Pair((16 + blocks, 16, 1), shown=shown, walk_speed=walk_speed)
     if edits:
         pair.client.edit(1, ahead + 99, Edit(20, 16, 1, 4))
     pair.ahead(*[NEUTRAL] * ahead)
