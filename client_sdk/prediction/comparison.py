@@ -14,12 +14,13 @@ from shared.units import BLOCK
 from shared.world import World
 
 MEET_BLOCKS = 12.0
-"""Distance in blocks beyond which another entity cannot be met before the next replay, at walking speeds."""
-TOUCH_BLOCKS, APPROACH, NEXT_S = 2.0, 10.0, 0.25
-"""Where other entities matter for the motion of the own one alone, that distance is shorter if the prediction is only a
-short time ahead: room for two entities that touch, in blocks, and the way of two that come towards each other in that
-time and in the seconds until the next replay. (A snapshot may be late.) They come at twice the greatest walking speed
-of the scene, or at `APPROACH` blocks/s if that is less."""
+"""Greatest distance in blocks at which another entity counts. Beyond it, none is met before the next replay."""
+TOUCH_BLOCKS = 2.0
+"""Room for two entities that touch, in blocks."""
+APPROACH = 10.0
+"""Least speed at which two entities are expected to come towards each other, in blocks/s."""
+NEXT_S = 0.25
+"""Longest expected time until the next replay, in seconds. A snapshot may be late."""
 
 State = tuple[int, ...]
 
@@ -60,10 +61,7 @@ class Comparison:
             return True
         if self._world.extras.count:
             return bool(np.array_equal(self._counting(predicted), self._counting(confirmed)))
-        meet = MEET_BLOCKS
-        if not self._others_ahead:
-            meet = min(TOUCH_BLOCKS + self._approach * (ahead_s + NEXT_S), meet)
-        reach = int(meet * BLOCK)
+        reach = int(self._meet_blocks(ahead_s) * BLOCK)
         kernel = self._world.kernel
         a, b, always = map(kernel.lent, (predicted, confirmed, self._shown_ahead))
         return bool(kernel.alike(a, len(predicted), b, len(confirmed), self.entity, reach, always))
@@ -92,6 +90,15 @@ class Comparison:
             if x or y or z:
                 offsets[state[ID]] = (x, y, z)
         return offsets
+
+    def _meet_blocks(self, ahead_s: float) -> float:
+        """Returns the distance in blocks beyond which an entity cannot be met before the next replay.
+
+        The own motion alone depends on it. If others are drawn as predicted, they count at the greatest distance.
+        """
+        if self._others_ahead:
+            return MEET_BLOCKS
+        return min(TOUCH_BLOCKS + self._approach * (ahead_s + NEXT_S), MEET_BLOCKS)
 
     def _counting(self, states: Int64s) -> Int64s:
         """Returns the states that count in a comparison, as `bulk.alike` chooses them, with their extra columns.
