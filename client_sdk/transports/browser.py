@@ -326,6 +326,10 @@ def browser_socket(url: str, listener: Listener) -> Socket:
     return _JsSocket(socket, to_js)
 
 
+OPEN = 1
+"""Value of `readyState` while a WebSocket is connected."""
+
+
 class _JsSocket:
     """A JavaScript WebSocket as `Socket`."""
 
@@ -337,8 +341,9 @@ class _JsSocket:
         return int(self._socket.bufferedAmount)
 
     def send(self, data: bytes) -> None:
-        """Sends a binary message; the browser copies it."""
-        self._socket.send(self._to_js(data))
+        """Sends a binary message; the browser copies it. It is lost if the connection has just broken off."""
+        if self._socket.readyState == OPEN:
+            self._socket.send(self._to_js(data))
 
     def close(self, code: int, reason: str) -> None:
         """Closes the connection."""

@@ -24,6 +24,8 @@ CHECKS = {
 }
 LONG = "(slow or hypothesis) and not contained"
 """Markers of the tests that are longer in a long run."""
+WAIT = "e2e or waiting"
+"""Markers of the tests that wait for most of their time in a long run."""
 BALANCED = ("--dist", "worksteal")
 """Options of pytest with which an idle worker takes tests from another."""
 
@@ -102,20 +104,21 @@ def compiled() -> list[Step]:
 def together(markers: str, profile: str) -> list[Step]:
     """Runs several tests at a time.
 
-    Many short runs wait for a part of their time, so there are twice as many as processors. Four long ones take a fifth
-    more time of two processors than two, because each finds its memory less often in a cache.
-
-    Some long tests wait most of the time, and a busy machine disturbs them. They run beside the others, two at a time,
-    and come before them wherever both want the processor.
+    Many short runs wait for a part of their time, so there are twice as many as processors. Of the long ones, those end
+    to end wait, and a busy machine disturbs them. They run beside the others, and come before them wherever both want
+    the processor. No more than two of each run at a time: four tests that do not wait take a fifth more time of two
+    processors than two, because each finds less of its memory in a cache.
     """
-    workers = "4" if profile == "short" else "2"
-    command = (*pytest(markers, "not waiting and not alone", profile), "-n", workers, *BALANCED)
     if profile == "short":
-        return [run("tests", *command)]
+        return [run("tests", *pytest(markers, "not waiting and not alone", profile), "-n", "4", *BALANCED)]
+    two = ("-n", "2", *BALANCED)
     with ThreadPoolExecutor(1) as pool:
-        waiting = (*pytest("", "waiting", profile), "-n", "2", *BALANCED, *files("waiting"))
-        beside = pool.submit(captured, "tests that wait", 0, *waiting)
-        return [run("tests", *command, niceness=10), shown(beside.result())]
+        whole = (*pytest(markers, f"({WAIT}) and not alone", profile), *two)
+        beside = pool.submit(captured, "tests that wait", 0, *whole)
+        return [
+            run("tests", *pytest(markers, f"not ({WAIT}) and not alone", profile), *two, niceness=10),
+            shown(beside.result()),
+        ]
 
 
 def alone(markers: str, profile: str) -> Step:

@@ -1,6 +1,6 @@
 """Clients that come and go through the matchmaking of a real server by a seeded schedule, with `kill -9` in between.
 
-The clients are bytes over real sockets, without prediction, so that a thousand of them fit into one process.
+The clients are bytes over real sockets, without prediction, so that hundreds of them fit into one process.
 """
 
 import asyncio
@@ -164,7 +164,7 @@ def entries(url: str) -> list[dict[str, Any]]:
 
 
 @pytest.mark.longest
-@pytest.mark.parametrize(("clients", "at_once", "kills", "data"), long((1000, 200, 0, False), (200, 60, 3, True)))
+@pytest.mark.parametrize(("clients", "at_once", "kills", "data"), long((600, 200, 0, False), (200, 60, 3, True)))
 async def test_nobody_is_lost_in_matchmaking(
     clients: int, at_once: int, kills: int, data: bool, tmp_path: Path
 ) -> None:

@@ -66,7 +66,7 @@ def test_all_edges_encode_the_same_changes() -> None:
         1,
         2,
         pytest.param(3, marks=pytest.mark.slow),
-        *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(4, 11)),
+        *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(4, 8)),
     ],
 )
 def test_no_kill_loses_or_doubles_a_command(seed: int) -> None:
@@ -100,7 +100,7 @@ def test_late_batches_are_late_inputs_and_nothing_else(seed: int) -> None:
     hashes_agree(match)
 
 
-@pytest.mark.parametrize("seed", [1, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(2, 10))])
+@pytest.mark.parametrize("seed", [1, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(2, 7))])
 def test_a_player_who_is_alone_is_corrected_for_late_inputs_only_when_parts_are_killed(seed: int) -> None:
     match = ScaledMatch(load_scene("hills"), seed, edges=3, standbys=2, bus=ROUGH)
     player = match.join(edits, PATH)
@@ -287,7 +287,7 @@ def tour(match: ScaledMatch, player: Seat, seconds: float, every: float = 5.0) -
     return moves
 
 
-@pytest.mark.parametrize(("seed", "seconds"), [*contained((1, 30)), *long((2, 150))], ids=["short", "long"])
+@pytest.mark.parametrize(("seed", "seconds"), [*contained((1, 30)), *long((2, 100))], ids=["short", "long"])
 def test_a_lone_player_who_is_moved_between_edges_has_no_corrections(seed: int, seconds: float) -> None:
     match = ScaledMatch(load_scene("hills"), seed, edges=4)
     player = match.join(edits, Link(delay_s=0.03))  # without jitter, so that no input is late by itself
@@ -445,7 +445,7 @@ def test_clients_know_the_edges_that_live() -> None:
     hashes_agree(match)
 
 
-@pytest.mark.parametrize("seed", [1, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(2, 8))])
+@pytest.mark.parametrize("seed", [1, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(2, 6))])
 def test_events_and_commands_come_once_over_all_edges(seed: int) -> None:
     match = ScaledMatch(load_scene("meadow"), seed, edges=3, rules=Tally, bus=ROUGH)
     sent: Counter[str] = Counter()
@@ -464,7 +464,7 @@ def test_events_and_commands_come_once_over_all_edges(seed: int) -> None:
     hashes_agree(match)
 
 
-@pytest.mark.parametrize("seed", [1, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(2, 8))])
+@pytest.mark.parametrize("seed", [1, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(2, 6))])
 def test_kills_while_players_move_between_edges(seed: int) -> None:
     match = ScaledMatch(load_scene("meadow"), seed, edges=4, standbys=2, rules=Tally, bus=ROUGH)
     sent: Counter[str] = Counter()

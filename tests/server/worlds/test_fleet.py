@@ -235,7 +235,7 @@ def course(seed: int, seconds: float, *, saved: bool) -> Sim:
     return sim
 
 
-@pytest.mark.parametrize("seed", [*range(1, 4), *long(*range(4, 28))])
+@pytest.mark.parametrize("seed", [*range(1, 4), *long(*range(4, 20))])
 def test_any_course_of_events_leaves_everybody_in_one_world(seed: int) -> None:
     sim = course(seed, 40.0, saved=seed % 2 == 0)
     sim.run(30.0)
@@ -264,7 +264,7 @@ def test_any_course_of_events_leaves_everybody_in_one_world(seed: int) -> None:
         assert not process.worlds.fleet.worlds
 
 
-@pytest.mark.parametrize("seed", [2, *long(*range(10, 30, 2))])
+@pytest.mark.parametrize("seed", [2, *long(*range(10, 24, 2))])
 def test_every_edit_that_was_acknowledged_is_there_once(seed: int) -> None:
     sim = course(seed, 40.0, saved=True)
     sim.until(lambda: all(client.world for client in sim.clients if client.first), 60.0)
