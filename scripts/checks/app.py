@@ -106,19 +106,15 @@ def together(markers: str, profile: str) -> list[Step]:
 
     Many short runs wait for a part of their time, so there are twice as many as processors. Of the long ones, those end
     to end wait, and a busy machine disturbs them. They run beside the others, and come before them wherever both want
-    the processor. No more than two of each run at a time: four tests that do not wait take a fifth more time of two
-    processors than two, because each finds less of its memory in a cache.
+    the processor. Four of the others would take a fifth more processor time than two, because each finds less of its
+    memory in a cache; but some of them wait, too.
     """
     if profile == "short":
         return [run("tests", *pytest(markers, "not waiting and not alone", profile), "-n", "4", *BALANCED)]
-    two = ("-n", "2", *BALANCED)
+    wait, others = (pytest(markers, f"{which} ({WAIT}) and not alone", profile) for which in ("", "not"))
     with ThreadPoolExecutor(1) as pool:
-        whole = (*pytest(markers, f"({WAIT}) and not alone", profile), *two)
-        beside = pool.submit(captured, "tests that wait", 0, *whole)
-        return [
-            run("tests", *pytest(markers, f"not ({WAIT}) and not alone", profile), *two, niceness=10),
-            shown(beside.result()),
-        ]
+        beside = pool.submit(captured, "tests that wait", 0, *wait, "-n", "2", *BALANCED)
+        return [run("tests", *others, "-n", "3", *BALANCED, niceness=10), shown(beside.result())]
 
 
 def alone(markers: str, profile: str) -> Step:
