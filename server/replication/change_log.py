@@ -262,12 +262,8 @@ class ChangeLog:
         newest = self._world.tick
         assert newest - since <= self.history, "lost track"
         ticks = [tick for at in range(since + 1, newest + 1) if (tick := self._ticks.get(at)) is not None]
-        if len(ticks) == 1:
-            more = ticks[0].more()
-            changed = more.union(self._due, ticks[0].changed)
-        else:
-            more = set().union(*(tick.more() for tick in ticks))
-            changed = more.union(self._due, *(tick.changed for tick in ticks))
+        more = ticks[0].more() if len(ticks) == 1 else set().union(*(tick.more() for tick in ticks))
+        changed = more.union(self._due, *(tick.changed for tick in ticks))
         return DeltaCache(self, since, ticks, changed, more)
 
     def encode(self, segment: Cell, since: int) -> bytes:

@@ -16,6 +16,21 @@ from shared.checks import Cell
 from shared.snapshot import KEYFRAME
 
 
+def fitting(deltas: Iterable[tuple[Cell, bytes]], room: int) -> tuple[dict[Cell, bytes], bool]:
+    """Returns the first deltas that fit into the room in bytes, but at least two, and whether all fit.
+
+    Empty deltas are left out. Those after the first one that does not fit are not asked for.
+    """
+    chosen: dict[Cell, bytes] = {}
+    for segment, part in deltas:
+        if part:
+            room -= len(part)
+            if len(chosen) > 1 and room < 0:
+                break
+            chosen[segment] = part
+    return chosen, room >= 0
+
+
 class ClientView:
     """The segments that one client sees, with the tick of each that was sent last."""
 
@@ -127,7 +142,8 @@ class ClientView:
                 return n, plain
         due: dict[Cell, int] = {}
         if tuple(self._fresh) == self.near and len(self._fresh) == len(self.sees):
-            parts = self._nearest(log, room)
+            keyframes = log.since(KEYFRAME)  # all wait for theirs, the nearest first
+            parts, _ = fitting(((segment, keyframes[segment]) for segment in self._fresh), room)
         else:
             due = self._behind | dict.fromkeys(self._fresh, KEYFRAME)
             if len(due) < len(self.sees):
@@ -144,17 +160,6 @@ class ClientView:
         )
         self.tick = tick
         return len(parts), b"".join(parts.values())
-
-    def _nearest(self, log: ChangeLog, room: int) -> dict[Cell, bytes]:
-        """Returns the result of `_urgent` if all segments wait for their keyframes, the nearest first."""
-        keyframes, chosen = log.since(KEYFRAME), dict[Cell, bytes]()
-        for segment in self._fresh:
-            if part := keyframes[segment]:
-                room -= len(part)
-                if len(chosen) > 1 and room < 0:
-                    break
-                chosen[segment] = part
-        return chosen
 
     def _urgent(self, log: ChangeLog, due: dict[Cell, int], tick: int, room: int) -> dict[Cell, bytes]:
         """Returns the most urgent deltas that fit into the room, but at least the own segment and one more.
@@ -174,11 +179,5 @@ class ClientView:
             return segment != centre, -waits / (1 + 3 * distance(segment, centre))
 
         deltas = {since: log.since(since) for since in {*due.values()}}
-        chosen: dict[Cell, bytes] = {}
-        for segment in sorted(due, key=rank):
-            if part := deltas[due[segment]][segment]:
-                room -= len(part)
-                if len(chosen) > 1 and room < 0:
-                    break
-                chosen[segment] = part
-        return chosen if room < 0 else {segment: chosen[segment] for segment in due if segment in chosen}
+        chosen, all_fit = fitting(((each, deltas[due[each]][each]) for each in sorted(due, key=rank)), room)
+        return {segment: chosen[segment] for segment in due if segment in chosen} if all_fit else chosen

@@ -94,11 +94,10 @@ def first_start_and_later_ones(cache: Path) -> None:
 
 def no_index_is_out_of_bounds(cache: Path) -> None:
     """Runs other tests with the compiled functions. First, checks that a wrong index is an error."""
-    environment = os.environ | {kernels.VARIABLE: kernels.NUMBA, "NUMBA_CACHE_DIR": str(cache)}
 
     def python(*arguments: str) -> subprocess.CompletedProcess[str]:
         command = (sys.executable, *arguments)
-        return subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, check=False)
+        return subprocess.run(command, cwd=ROOT, env=compiling(cache), capture_output=True, text=True, check=False)
 
     assert "IndexError: index is out of bounds" in python("-c", OUT_OF_BOUNDS).stderr
     done = python("-m", "pytest", "-q", "-p", "no:cacheprovider", "-k", "not plain", *WORK)
@@ -110,11 +109,15 @@ def first_join(cache: Path) -> None:
     divergence."""
     with running("--port", "0", "--scene", "flat") as server:
         host, port = server.address()
-        environment = os.environ | {kernels.VARIABLE: kernels.NUMBA, "NUMBA_CACHE_DIR": str(cache)}
         command = (sys.executable, "-c", PROGRAM, f"ws://{host}:{port}")
-        done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, check=False)
+        done = subprocess.run(command, cwd=ROOT, env=compiling(cache), capture_output=True, text=True, check=False)
     assert done.stderr == ""
     assert done.stdout == "['plain for now', 'numba'] 0 0 True\n"
+
+
+def compiling(cache: Path) -> dict[str, str]:
+    """Returns the environment of a process that compiles the kernel, with Numba's cache in a folder."""
+    return os.environ | {kernels.VARIABLE: kernels.NUMBA, "NUMBA_CACHE_DIR": str(cache)}
 
 
 def remove(cache: Path, *functions: str) -> None:
@@ -131,8 +134,7 @@ def on_a_terminal(cache: Path) -> list[str]:
     """
     seen, its = os.openpty()
     command = [sys.executable, "-m", "server", "--port", "0", "--scene", "flat", "--log-level", "warning"]
-    environment = {**os.environ, "NUMBA_CACHE_DIR": str(cache), kernels.VARIABLE: kernels.NUMBA}
-    with subprocess.Popen(command, cwd=ROOT, env=environment, stdin=its, stdout=its, stderr=its) as process:
+    with subprocess.Popen(command, cwd=ROOT, env=compiling(cache), stdin=its, stdout=its, stderr=its) as process:
         os.close(its)
         try:
             shown = b""
