@@ -24,8 +24,6 @@ CHECKS = {
 }
 LONG = "(slow or hypothesis) and not contained"
 """Markers of the tests that are longer in a long run."""
-WAIT = "e2e or waiting"
-"""Markers of the tests that wait for most of their time in a long run."""
 BALANCED = ("--dist", "worksteal")
 """Options of pytest with which an idle worker takes tests from another."""
 
@@ -104,17 +102,17 @@ def compiled() -> list[Step]:
 def together(markers: str, profile: str) -> list[Step]:
     """Runs several tests at a time.
 
-    Many short runs wait for a part of their time, so there are twice as many as processors. Of the long ones, those end
-    to end wait, and a busy machine disturbs them. They run beside the others, and come before them wherever both want
-    the processor. Four of the others would take a fifth more processor time than two, because each finds less of its
-    memory in a cache; but some of them wait, too.
+    Many short runs wait for a part of their time, so there are twice as many as processors. Of the long ones, only those
+    end to end wait, and a busy machine disturbs them. They run beside the others, and come before them wherever both
+    want the processor. Four of the others would take a fifth more processor time than two, because each finds less of
+    its memory in a cache.
     """
     if profile == "short":
-        return [run("tests", *pytest(markers, "not waiting and not alone", profile), "-n", "4", *BALANCED)]
-    wait, others = (pytest(markers, f"{which} ({WAIT}) and not alone", profile) for which in ("", "not"))
+        return [run("tests", *pytest(markers, "not alone", profile), "-n", "4", *BALANCED)]
+    waiting, others = (pytest(markers, f"{which} and not alone", profile) for which in ("e2e", "not e2e"))
     with ThreadPoolExecutor(1) as pool:
-        beside = pool.submit(captured, "tests that wait", 0, *wait, "-n", "2", *BALANCED)
-        return [run("tests", *others, "-n", "3", *BALANCED, niceness=10), shown(beside.result())]
+        beside = pool.submit(captured, "tests end to end", 0, *waiting, "-n", "2", *BALANCED)
+        return [run("tests", *others, "-n", "2", *BALANCED, niceness=10), shown(beside.result())]
 
 
 def alone(markers: str, profile: str) -> Step:

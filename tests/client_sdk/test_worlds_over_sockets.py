@@ -16,6 +16,8 @@ from shared.messages import Bye, Go, decode_from_client, encode
 from tests.client_sdk.servers import Peer, accept, scripted_server, until_closed
 from tests.patience import PATIENCE_S
 
+pytestmark = pytest.mark.e2e
+
 Script = Callable[[socket.socket], object]
 REFUSED = b"there is no world 'arena-1'"
 

@@ -26,7 +26,6 @@ pytestmark = [
     pytest.mark.e2e,
     pytest.mark.usefixtures("python_for_browsers"),
     pytest.mark.slow,
-    pytest.mark.waiting,
     pytest.mark.longest,
     pytest.mark.skipif(BROWSER is None, reason="there is no Chromium on this machine"),
 ]

@@ -71,7 +71,6 @@ def test_it_takes_a_server_that_runs_already(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.waiting
 def test_a_game_is_played_with_its_behaviours_and_its_bots(tmp_path: Path) -> None:
     out = tmp_path / "out.json"
     game = "sovereign_netcode.examples.dodge:Dodge"
@@ -99,7 +98,6 @@ def test_policies_of_bots(name: str | None, rules: Rules, made: type) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.waiting
 def test_memory_of_the_server_is_flat_under_sixty_clients(tmp_path: Path) -> None:
     out = tmp_path / "out.json"
     done = loadtest("--clients", "60", "--seconds", "20", "--policy", "dig-and-place", "--json", str(out))

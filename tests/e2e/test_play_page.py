@@ -29,7 +29,6 @@ pytestmark = [
     pytest.mark.e2e,
     pytest.mark.usefixtures("python_for_browsers"),
     pytest.mark.slow,
-    pytest.mark.waiting,
     pytest.mark.skipif(BROWSER is None, reason="there is no Chromium on this machine"),
 ]
 ME = "globalThis.play?.view?.me"

@@ -9,7 +9,6 @@ pytestmark = [pytest.mark.e2e, pytest.mark.skipif(not binary(), reason="there is
 
 
 @pytest.mark.slow
-@pytest.mark.waiting
 @pytest.mark.parametrize("seed", [11])
 async def test_disturbances_lose_nothing(seed: int) -> None:
     lines: list[str] = []

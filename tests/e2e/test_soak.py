@@ -24,7 +24,6 @@ pytestmark = pytest.mark.e2e
 
 
 @pytest.mark.slow
-@pytest.mark.waiting
 @pytest.mark.skipif(sys.platform == "win32", reason="suspends processes")
 def test_everything_at_once_loses_no_edit_and_leaves_no_error_unexplained(tmp_path: Path) -> None:
     out = tmp_path / "out.json"

@@ -106,7 +106,6 @@ def test_a_variants_quantiles_are_of_all_its_rounds_together() -> None:
 @needs_linux
 @pytest.mark.slow
 @pytest.mark.e2e
-@pytest.mark.waiting
 @pytest.mark.longest
 def test_churn_over_sockets_leaves_nothing_behind(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(rss, "SETTLE_S", 18.0)  # a client without a goodbye is kept for 15 s

@@ -13,6 +13,7 @@ ROOT = Path(__file__).resolve().parent.parent.parent
 
 
 @pytest.mark.slow
+@pytest.mark.e2e
 @pytest.mark.skipif(not kernels.available(), reason="with plain Python it takes minutes")
 def test_it_measures_and_leaves_nothing_behind(tmp_path: Path) -> None:
     (tmp_path / "disk").mkdir()

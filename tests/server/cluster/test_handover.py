@@ -17,6 +17,8 @@ from server.rules import Rules
 from tests.patience import soon
 from tests.server.cluster.conftest import Cluster
 
+pytestmark = pytest.mark.e2e
+
 SLOW = Link(delay_s=0.02)
 
 

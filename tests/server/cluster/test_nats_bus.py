@@ -17,7 +17,7 @@ from server.scale.writer import EMPTY, Entry, LogWriter
 from tests.patience import soon
 from tests.server.cluster.conftest import Cluster
 
-pytestmark = pytest.mark.skipif(not binary(), reason="there is no nats-server here")
+pytestmark = [pytest.mark.e2e, pytest.mark.skipif(not binary(), reason="there is no nats-server here")]
 
 
 @pytest.fixture

@@ -20,6 +20,8 @@ from shared.scene import load_scene
 from tests.patience import PATIENCE_S, soon
 from tests.server.cluster.conftest import Cluster
 
+pytestmark = pytest.mark.e2e
+
 
 class DeafBus(LocalBus):
     """A bus that does not answer while `deaf` is set."""
