@@ -102,16 +102,15 @@ def compiled() -> list[Step]:
 def together(markers: str, profile: str) -> list[Step]:
     """Runs several tests at a time.
 
-    Many short runs wait for a part of their time, so there are twice as many as processors. Of the long ones, only those
-    end to end wait, and a busy machine disturbs them. They run beside the others, and come before them wherever both
-    want the processor. Four of the others would take a fifth more processor time than two, because each finds less of
-    its memory in a cache.
+    Many short runs wait for a part of their time, so there are twice as many as processors. Of the long ones, only
+    those end to end wait, and a busy machine disturbs them. They run beside the others, and come before them wherever
+    both want the processor.
     """
     if profile == "short":
         return [run("tests", *pytest(markers, "not alone", profile), "-n", "4", *BALANCED)]
     waiting, others = (pytest(markers, f"{which} and not alone", profile) for which in ("e2e", "not e2e"))
     with ThreadPoolExecutor(1) as pool:
-        beside = pool.submit(captured, "tests end to end", 0, *waiting, "-n", "2", *BALANCED)
+        beside = pool.submit(captured, "tests end to end", 0, *waiting, *files("e2e"), "-n", "2", *BALANCED)
         return [run("tests", *others, "-n", "2", *BALANCED, niceness=10), shown(beside.result())]
 
 

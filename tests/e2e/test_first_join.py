@@ -60,9 +60,11 @@ WORK = (
     "tests/shared/test_follow.py",
     "tests/shared/test_hard_cases_air.py",
     "tests/shared/test_hard_cases_world.py",
+    "tests/shared/test_places.py",
     "tests/shared/test_placing.py",
     "tests/shared/test_snapshot.py",
     "tests/shared/test_waking.py",
+    "tests/server/test_fast_path.py",
     "tests/server/test_replication.py",
     "tests/server/test_rewind.py",
 )
@@ -100,7 +102,7 @@ def no_index_is_out_of_bounds(cache: Path) -> None:
         return subprocess.run(command, cwd=ROOT, env=compiling(cache), capture_output=True, text=True, check=False)
 
     assert "IndexError: index is out of bounds" in python("-c", OUT_OF_BOUNDS).stderr
-    done = python("-m", "pytest", "-q", "-p", "no:cacheprovider", "-k", "not plain", *WORK)
+    done = python("-m", "pytest", "-q", "-p", "no:cacheprovider", "-m", "not slow", "-k", "not plain", *WORK)
     assert done.returncode == 0, done.stdout + done.stderr
 
 

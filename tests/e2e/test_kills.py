@@ -149,7 +149,7 @@ def looked_at(data: Path, scene: Scene, copy: Path, game: str = "") -> tuple[Wor
     return store.world, store.restored
 
 
-@pytest.mark.parametrize("kills", [*contained(5), pytest.param(50, marks=[pytest.mark.slow, pytest.mark.longest])])
+@pytest.mark.parametrize("kills", [*contained(5), pytest.param(35, marks=[pytest.mark.slow, pytest.mark.longest])])
 def test_no_acknowledged_edit_is_lost_in_kills(tmp_path: Path, kills: int) -> None:
     seed = 17
     rng, cells, scene = random.Random(seed), Cells(), load_scene("flat")

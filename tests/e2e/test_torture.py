@@ -28,7 +28,7 @@ pytestmark = [
 ]
 
 HONEST = 12
-WINDOW_S = 3.0
+WINDOW_S = 2.0
 WINDOWS = 3
 """Number of measured windows, one of which must be good."""
 SHARE_MIN = 0.9

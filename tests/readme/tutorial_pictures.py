@@ -75,8 +75,8 @@ def own_window(path: Path) -> None:
         client.poll(now)
         mind(client.core)
         client.update(now)
-        window.draw(screen, client, client.view(now))
         if good(client, now, last):
+            window.draw(screen, client, client.view(now))
             pygame.image.save(screen, str(path))
             return True
         return False

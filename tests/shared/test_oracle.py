@@ -6,10 +6,10 @@ import pytest
 from tests.lengths import long
 from tests.twins import Twins
 
-BLOCKS = 4
+BLOCKS = 3
 """Number of tests that share the seeds, so that a failure and the time it takes are easy to find.
 
-Twice as many took a minute and a half of a processor, and had no other kind of world.
+More of them have no other kind of world.
 """
 
 

@@ -3,7 +3,6 @@
 import random
 
 import numpy as np
-import pytest
 
 from server.game.fast_rows import Arguments, lent
 from server.game.spawning import NO_PLACE, OFFSETS, ORDER
@@ -13,11 +12,8 @@ from shared.places import APART
 from shared.units import BLOCK, RANGE_BLOCKS
 
 
-@pytest.mark.parametrize("form", kernels.FORMS)
-def test_a_place_is_near_an_entity_if_the_distance_rounds_to_its_offset(form: str) -> None:
-    if kernels.missing(form):
-        pytest.skip(kernels.missing(form))
-    kernel, rng = kernels._loaded(form), random.Random(5)
+def test_a_place_is_near_an_entity_if_the_distance_rounds_to_its_offset(compiled: bool) -> None:
+    kernel, rng = kernels.get(compiled), random.Random(5)
     for _ in range(60):
         entities, x, y = rows(rng), point(rng), point(rng)
         spawn, near = Arguments(kernel, "d", values=(x, y)), Arguments(kernel, "B", NO_PLACE + 1)

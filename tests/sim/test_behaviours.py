@@ -191,7 +191,7 @@ class Crowd(Presser):
         return input_
 
 
-@pytest.mark.parametrize(("players", "seconds", "seed"), [*contained((4, 4, 5)), *long((30, 2, 6), (12, 4, 7))])
+@pytest.mark.parametrize(("players", "seconds", "seed"), [*contained((4, 4, 5)), *long((20, 2, 6), (8, 4, 7))])
 def test_players_who_dash_into_each_other_are_corrected_for_each_other(players: int, seconds: int, seed: int) -> None:
     counts = {}
     for neighbours in (True, False):
@@ -208,7 +208,7 @@ def test_players_who_dash_into_each_other_are_corrected_for_each_other(players: 
 
 
 @pytest.mark.parametrize(
-    ("players", "seconds", "seed"), [*contained((3, 4, 1)), *long(*((6, 10, seed) for seed in range(2, 8)))]
+    ("players", "seconds", "seed"), [*contained((3, 4, 1)), *long(*((6, 10, seed) for seed in range(2, 6)))]
 )
 def test_boxes_and_blocks_put_into_each_other_make_nobody_diverge(players: int, seconds: int, seed: int) -> None:
     match = joined(Piles(), PRESETS["regional"], *(Presser(6) for _ in range(players)), seed=seed)

@@ -68,7 +68,7 @@ def ages(preset: str, seconds: float) -> list[float]:
     [
         ("regional", 8),
         *long(("outage", 8)),
-        *long(*((preset, 30) for preset in ("lan", "regional", "typical", "far", "wifi", "outage"))),
+        *long(*((preset, 20) for preset in ("lan", "regional", "typical", "far", "wifi", "outage"))),
     ],
 )
 def test_snapshots_are_as_fresh_as_the_link_delivers(

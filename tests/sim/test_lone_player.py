@@ -63,7 +63,7 @@ def play(scene: str, path: Link, ticks: int, seed: int = 1) -> tuple[Match, Play
 
 @pytest.mark.parametrize(
     ("latency_ms", "ticks", "least"),
-    [*contained((150, 4_000, 50)), *long(*((latency_ms, 10_000, 200) for latency_ms in (0, 50, 150, 300)))],
+    [*contained((150, 4_000, 50)), *long(*((latency_ms, 6_000, 100) for latency_ms in (0, 50, 150, 300)))],
 )
 def test_no_correction_under_latency_and_jitter(latency_ms: int, ticks: int, least: int) -> None:
     path = Link(delay_s=latency_ms / 2000, jitter_s=0.040)
@@ -90,7 +90,7 @@ def heavy(tick_rate: int = 32) -> Scene:
     ("preset", "tick_rate", "ticks"),
     [
         ("lan", 32, 400), ("far", 20, 300),
-        *long(*((preset, 32, ticks) for preset in PRESETS for ticks in (400, 5_000)), ("typical", 60, 2_000)),
+        *long(*((preset, 32, 4_000) for preset in PRESETS), ("typical", 60, 2_000)),
     ],
 )  # fmt: skip
 def test_a_player_with_acceleration_is_corrected_for_late_inputs_only(preset: str, tick_rate: int, ticks: int) -> None:

@@ -94,7 +94,7 @@ def test_every_tick_has_its_input_again_after_the_clients_clock_leapt(rate: int,
     causes(player)
 
 
-@pytest.mark.parametrize(("seed", "step_s"), long_but([(2, -4.0)], product(range(2, 6), (-4.0, -1.0, 1.0, 4.0))))
+@pytest.mark.parametrize(("seed", "step_s"), long_but([(2, -4.0)], product(range(2, 5), (-4.0, -1.0, 1.0, 4.0))))
 def test_a_step_on_a_bad_line_ends_in_no_more_late_inputs_than_before(seed: int, step_s: float) -> None:
     match, player = at(32, PRESETS["far"], seed)
     match.run(30)

@@ -68,7 +68,7 @@ def played(seed: int, *, fast: bool, seconds: float, bus: dict[str, Any], kills:
 
 @pytest.mark.parametrize("kills", [False, True])
 @pytest.mark.parametrize("bus", [{}, LATE], ids=["quiet", "late"])
-@pytest.mark.parametrize(("seed", "seconds"), [*contained((1, 6.0)), *long(*((seed, 9.0) for seed in range(1, 4)))])
+@pytest.mark.parametrize(("seed", "seconds"), [*contained((1, 6.0)), *long((1, 9.0), (2, 9.0))])
 def test_every_byte_is_the_same(seed: int, seconds: float, bus: dict[str, Any], kills: bool) -> None:
     fast, on = played(seed, fast=True, seconds=seconds, bus=bus, kills=kills)
     slow, never = played(seed, fast=False, seconds=seconds, bus=bus, kills=kills)

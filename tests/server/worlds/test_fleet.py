@@ -235,7 +235,7 @@ def course(seed: int, seconds: float, *, saved: bool) -> Sim:
     return sim
 
 
-@pytest.mark.parametrize("seed", [*range(1, 4), *long(*range(4, 20))])
+@pytest.mark.parametrize("seed", [*range(1, 4), *long(*range(4, 14))])
 def test_any_course_of_events_leaves_everybody_in_one_world(seed: int) -> None:
     sim = course(seed, 40.0, saved=seed % 2 == 0)
     sim.run(30.0)

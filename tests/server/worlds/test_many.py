@@ -53,7 +53,7 @@ class Visitor:
 
 
 @pytest.mark.parametrize(
-    ("clients", "seconds"), [(100, 6), pytest.param(600, 5, marks=[pytest.mark.slow, pytest.mark.longest])]
+    ("clients", "seconds"), [(100, 6), pytest.param(400, 5, marks=[pytest.mark.slow, pytest.mark.longest])]
 )
 def test_nobody_is_lost_and_no_seat_is_taken_twice(clients: int, seconds: int) -> None:
     chance = random.Random(7)
