@@ -4,6 +4,7 @@ A test that steps a world runs twice: with the compiled kernel of this machine, 
 Python. All worlds of a process share the terrain that is generated for them.
 """
 
+import gc
 import os
 import signal
 from collections.abc import Iterator, Mapping
@@ -61,6 +62,12 @@ def _terrain_once() -> Iterator[None]:
 def compiled(request: pytest.FixtureRequest) -> bool:
     """Whether the world of this test runs the compiled kernel."""
     return bool(request.param)
+
+
+def pytest_collection_finish() -> None:
+    """Excludes the tests and all modules from garbage collection, which takes 2 to 4 % of the time otherwise."""
+    gc.collect()
+    gc.freeze()
 
 
 @pytest.hookimpl(tryfirst=True, wrapper=True)

@@ -52,7 +52,7 @@ def told(player: Player) -> Counter[str]:
 
 @pytest.mark.parametrize(
     ("preset", "ticks"),
-    [*contained(("far", 200)), *long(*((preset, 3_000 if preset == "typical" else 1_200) for preset in PRESETS))],
+    [*contained(("far", 200)), *long(*((preset, 2_500) for preset in PRESETS))],
 )
 def test_a_lone_player_with_every_ability_is_corrected_for_late_inputs_only(preset: str, ticks: int) -> None:
     match = joined(Playground(), PRESETS[preset], Presser(), seed=11)
@@ -63,8 +63,7 @@ def test_a_lone_player_with_every_ability_is_corrected_for_late_inputs_only(pres
     match.game.world.record(file)
 
     def check() -> None:
-        if match.game.world.tick % 3 == 0:  # a replay has several ticks, so few are in none
-            assert prediction.sync_test() is None
+        assert prediction.sync_test() is None
         hashes.append(match.game.world.state_hash())
         turns = match.game.world.turns
         assert turns is not None
@@ -191,7 +190,7 @@ class Crowd(Presser):
         return input_
 
 
-@pytest.mark.parametrize(("players", "seconds", "seed"), [*contained((4, 4, 5)), *long((20, 2, 6), (8, 4, 7))])
+@pytest.mark.parametrize(("players", "seconds", "seed"), [*contained((4, 4, 5)), *long((30, 2, 6), (8, 4, 7))])
 def test_players_who_dash_into_each_other_are_corrected_for_each_other(players: int, seconds: int, seed: int) -> None:
     counts = {}
     for neighbours in (True, False):
