@@ -58,7 +58,7 @@ def test_the_last_line_is_the_cause_and_all_is_passed_on(
 
 def test_one_that_still_runs_is_not_waited_for() -> None:
     errors = Stderr()
-    command = [sys.executable, "-c", "input()"]
+    command = [sys.executable, "-c", "import sys; sys.stdin.read()"]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stderr=errors.pipe) as process:
         errors.started()
         assert errors.cause(process.poll()) == "it still runs, but does not answer"
@@ -97,7 +97,7 @@ def test_the_benchmark_names_what_is_missing(
     for name in ("benchmarks", "loadgen"):
         (scripts / name).mkdir(parents=True)
     (scripts / "__init__.py").touch()
-    listening = "print('listening on ws://127.0.0.1:1', flush=True)\ninput()\n"
+    listening = "print('listening on ws://127.0.0.1:1', flush=True)\nimport sys\nsys.stdin.read()\n"
     (scripts / "benchmarks" / "busy_server.py").write_text(listening)
     (scripts / broken).write_text(MISSING)
     monkeypatch.setattr(bench, "ROOT", tmp_path)
