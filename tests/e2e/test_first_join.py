@@ -95,7 +95,7 @@ def first_start_and_later_ones(cache: Path) -> None:
 
 
 def no_index_is_out_of_bounds(cache: Path) -> None:
-    """Runs other tests with the compiled functions. First, checks that a wrong index is an error."""
+    """Runs the short forms of other tests with the compiled functions. First, checks that a wrong index is an error."""
 
     def python(*arguments: str) -> subprocess.CompletedProcess[str]:
         command = (sys.executable, *arguments)
