@@ -16,7 +16,7 @@ from shared.messages import REPEATED, USED, Held, Inputs
 from shared.scene import load_scene
 from sovereign_netcode.playtest.log import FAILURES, Failure
 from sovereign_netcode.playtest.scaled import ScaledMatch, Seat
-from tests.lengths import contained
+from tests.lengths import contained, long
 from tests.scaling import PATH, ROUGH, Tally, asks, calm, causes, hashes_agree, played_right, roam, slow_walk, torment
 
 FAILS = (2.5, 2.0)
@@ -29,7 +29,7 @@ def heal(match: ScaledMatch) -> None:
     match.log.heal()
 
 
-@pytest.mark.parametrize("seconds", [0.2, pytest.param(0.9, marks=pytest.mark.slow), 3.0])
+@pytest.mark.parametrize("seconds", [0.2, *long(0.9), 3.0])
 @pytest.mark.parametrize("how", FAILURES)
 def test_a_log_that_fails_costs_time_and_nothing_else(how: Failure, seconds: float) -> None:
     match = ScaledMatch(load_scene("flat"), 1, edges=2, standbys=1, rules=Tally)
@@ -75,7 +75,7 @@ def test_of_a_sequencer_and_a_standby_one_goes_on_when_the_log_does() -> None:
 
 @pytest.mark.parametrize(
     ("seed", "seconds"),
-    [*contained((3, 4)), *(pytest.param(seed, 15, marks=pytest.mark.slow) for seed in (2, 24, 25, 44))],
+    [*contained((3, 4)), *long(*((seed, 15) for seed in (2, 24, 25, 44)))],
 )
 def test_nothing_is_lost_or_doubled_while_the_log_fails_and_parts_are_killed(seed: int, seconds: float) -> None:
     match = ScaledMatch(load_scene("meadow"), seed, edges=3, standbys=2, rules=Tally, bus=ROUGH, fails=FAILS)
@@ -92,9 +92,7 @@ def test_nothing_is_lost_or_doubled_while_the_log_fails_and_parts_are_killed(see
     played_right(match, sent)
 
 
-@pytest.mark.parametrize(
-    ("seed", "seconds"), [*contained((2, 4)), *(pytest.param(seed, 15, marks=pytest.mark.slow) for seed in (1, 11, 14))]
-)
+@pytest.mark.parametrize(("seed", "seconds"), [*contained((2, 4)), *long(*((seed, 15) for seed in (1, 11, 14)))])
 def test_a_player_who_is_alone_is_corrected_for_late_inputs_only_while_the_log_fails(seed: int, seconds: int) -> None:
     match = ScaledMatch(load_scene("hills"), seed, edges=2, standbys=2, bus=ROUGH, fails=FAILS)
     player = match.join(slow_walk, PATH)

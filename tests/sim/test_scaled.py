@@ -60,10 +60,7 @@ def test_all_edges_encode_the_same_changes() -> None:
     hashes_agree(match)
 
 
-@pytest.mark.parametrize(
-    "seed",
-    [1, 2, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(3, 7))],
-)
+@pytest.mark.parametrize("seed", [1, 2, *long(*range(3, 7))])
 def test_no_kill_loses_or_doubles_a_command(seed: int) -> None:
     match = ScaledMatch(load_scene("meadow"), seed, edges=4, standbys=2, rules=Tally, bus=ROUGH)
     sent: Counter[str] = Counter()
@@ -83,7 +80,7 @@ def test_no_kill_loses_or_doubles_a_command(seed: int) -> None:
     hashes_agree(match)
 
 
-@pytest.mark.parametrize("seed", [5, pytest.param(6, marks=pytest.mark.slow), pytest.param(7, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("seed", [5, *long(6, 7)])
 def test_late_batches_are_late_inputs_and_nothing_else(seed: int) -> None:
     match = ScaledMatch(load_scene("hills"), seed, edges=2, bus={"stop": (1.0, 0.15), "twice": 0.1})
     player = match.join(wander, PATH)
@@ -95,7 +92,7 @@ def test_late_batches_are_late_inputs_and_nothing_else(seed: int) -> None:
     hashes_agree(match)
 
 
-@pytest.mark.parametrize("seed", [1, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(2, 7))])
+@pytest.mark.parametrize("seed", [1, *long(*range(2, 7))])
 def test_a_player_who_is_alone_is_corrected_for_late_inputs_only_when_parts_are_killed(seed: int) -> None:
     match = ScaledMatch(load_scene("hills"), seed, edges=3, standbys=2, bus=ROUGH)
     player = match.join(edits, PATH)
@@ -162,7 +159,7 @@ def test_commands_wait_while_time_stands_still() -> None:
     hashes_agree(match)
 
 
-@pytest.mark.parametrize("seed", [1, pytest.param(2, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("seed", [1, *long(2)])
 def test_a_lost_batch_is_sent_again(seed: int) -> None:
     match = ScaledMatch(load_scene("meadow"), seed, edges=2, rules=Tally, bus={"lost": 0.01, "twice": 0.02})
     sent: Counter[str] = Counter()
@@ -178,7 +175,7 @@ def test_a_lost_batch_is_sent_again(seed: int) -> None:
     hashes_agree(match)
 
 
-@pytest.mark.parametrize("seed", [1, pytest.param(2, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("seed", [1, *long(2)])
 def test_a_replica_from_a_checkpoint_goes_on_as_the_others(seed: int) -> None:
     match = ScaledMatch(load_scene("hills"), seed, edges=1, rules=Tally)
     sent: Counter[str] = Counter()
@@ -297,7 +294,7 @@ def test_a_lone_player_who_is_moved_between_edges_has_no_corrections(seed: int, 
     hashes_agree(match)
 
 
-@pytest.mark.parametrize("seed", [1, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(2, 6))])
+@pytest.mark.parametrize("seed", [1, *long(*range(2, 6))])
 def test_a_change_while_batches_of_the_former_edge_are_late_is_exact(seed: int) -> None:
     match = ScaledMatch(load_scene("hills"), seed, edges=2, bus={"jitter_s": 0.002})
 
@@ -440,7 +437,7 @@ def test_clients_know_the_edges_that_live() -> None:
     hashes_agree(match)
 
 
-@pytest.mark.parametrize("seed", [1, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(2, 6))])
+@pytest.mark.parametrize("seed", [1, *long(*range(2, 6))])
 def test_events_and_commands_come_once_over_all_edges(seed: int) -> None:
     match = ScaledMatch(load_scene("meadow"), seed, edges=3, rules=Tally, bus=ROUGH)
     sent: Counter[str] = Counter()
@@ -459,7 +456,7 @@ def test_events_and_commands_come_once_over_all_edges(seed: int) -> None:
     hashes_agree(match)
 
 
-@pytest.mark.parametrize("seed", [1, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(2, 6))])
+@pytest.mark.parametrize("seed", [1, *long(*range(2, 6))])
 def test_kills_while_players_move_between_edges(seed: int) -> None:
     match = ScaledMatch(load_scene("meadow"), seed, edges=4, standbys=2, rules=Tally, bus=ROUGH)
     sent: Counter[str] = Counter()
@@ -482,7 +479,7 @@ def test_kills_while_players_move_between_edges(seed: int) -> None:
     hashes_agree(match)
 
 
-@pytest.mark.parametrize("seed", [4, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(5, 9))])
+@pytest.mark.parametrize("seed", [4, *long(*range(5, 9))])
 def test_a_client_knows_of_a_late_change_although_its_margin_comes_before_the_record_of_its_tick(seed: int) -> None:
     match = ScaledMatch(load_scene("hills"), seed, edges=1, standbys=0)
 
